@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
-from rigsim.mesh import Float32Array
+from rigsim.geometry.mesh import Float32Array
 
 FloatArray = NDArray[np.floating]
 

@@ -70,7 +70,7 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
 
 
 def _renderer() -> Finding:
-    from rigsim import variant
+    from rigsim.render import variant
 
     choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rigsim.scenes.probe import ProbeScene
-    from rigsim.suction import HeadState
+    from rigsim.scenes.probe.scene import ProbeScene
+    from rigsim.world.suction import HeadState
 
 GRADIENT_WIDTH_PX = 96
 """Pixels across the served camera of the gradient rig."""
@@ -74,7 +74,7 @@ def serve_rig(
     as_json
         Whether the addresses are one JSON document, with the next step.
     """
-    from rigsim.serve import serve
+    from rigsim.world.serve import serve
 
     if size not in SIZES:
         raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
@@ -143,8 +143,8 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
-    from rigsim import subject_file
-    from rigsim.scenes.flash import FlashScene
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.flash.scene import FlashScene
 
     scene = FlashScene(rig, subject_file.named(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
@@ -153,9 +153,9 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
-    from rigsim import subject_file
-    from rigsim.dome_build import build
-    from rigsim.scenes.dome import DomeScene
+    from rigsim.as_built.dome import build
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.dome.scene import DomeScene
 
     person = subject_file.named(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
@@ -163,9 +163,10 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
     from capture.plan.probe import PHANTOM, SITES
-    from rigsim import probe_tissue, subject_file
-    from rigsim.scenes.probe import ProbeScene
-    from rigsim.suction import HeadState
+    from rigsim.fiber import probe_tissue
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.probe.scene import ProbeScene
+    from rigsim.world.suction import HeadState
 
     try:
         tissue = subject_file.tissue(subject, seed=seed)

@@ -68,7 +68,7 @@ class MelaninBand:
     """A third of all skin by its melanin, with a typical person who stands for it."""
 
     preset: str
-    """Of `rigsim.pigment.MELANIN_PRESETS`: the simulated person."""
+    """Of `rigsim.subject.pigment.MELANIN_PRESETS`: the simulated person."""
     melanin: float
     """Volume fraction of that person's epidermis."""
     melanin_range: tuple[float, float]
@@ -102,7 +102,7 @@ MELANIN_BANDS: Final = {
     "medium": MelaninBand("IV", 0.047, (0.02, 0.07), 0.08, 1.2),
     "dark": MelaninBand("VI", 0.17, (0.07, 0.51), 0.3, 1.0),
 }
-"""From light to dark, in the units of `rigsim.pigment` (an epidermis of 0.25 mm)."""
+"""From light to dark, in the units of `rigsim.subject.pigment` (an epidermis of 0.25 mm)."""
 
 
 @cache

@@ -31,7 +31,7 @@ from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error
-from rigsim.scenes.flash import FlashScene
+from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
 from skinrig.simulating.flash import to_superpixels

@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from rigsim import skin_layers
-from rigsim.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL
-from rigsim.skin_table import c_hd_axis, c_m_axis
-from rigsim.tissue_mc import EscapePaths, escape_paths
+from rigsim.tissue import skin_layers
+from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL
+from rigsim.tissue.skin_table import c_hd_axis, c_m_axis
+from rigsim.tissue.tissue_mc import EscapePaths, escape_paths
 
 FloatArray = NDArray[np.float64]
 

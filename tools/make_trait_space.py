@@ -3,7 +3,7 @@
 Run from the repository root, ``python tools/make_trait_space.py`` (about 3 minutes of one core;
 see `main` for options).
 
-- People: the 87 of `rigsim.population.table_1`. A random half of them gets a tan (1.5 times the
+- People: the 87 of `rigsim.population.population.table_1`. A random half of them gets a tan (1.5 times the
   melanin); everybody gets one of normal (twice as often), cold, hot, sweat, lotion, makeup and
   powder instead of what they wore.
 - Surface: materials fitted to 2 % noisy light from 40 points of each face in 240 pairs of light
@@ -36,8 +36,8 @@ from model.traits import TraitSpace, cosine
 from model.traits.storage import PACKAGED, TraitLibrary, from_bytes
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
-from rigsim.population import Member, shifted, table_1
-from rigsim.skin_conditions import CONDITIONS
+from rigsim.population.conditions import CONDITIONS
+from rigsim.population.population import Member, shifted, table_1
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from rigsim.fibre_profile import Fibres, fibre_paths
-from rigsim.tissue_mc import Layer, LayerStack
-from rigsim.white_fibre import APERTURE, ETA, FILE, G, decay, disc_points, distance_axis
+from rigsim.fiber.profile import Fibres, fibre_paths
+from rigsim.fiber.white_fiber import APERTURE, ETA, FILE, G, decay, disc_points, distance_axis
+from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 FloatArray = NDArray[np.float64]
 

@@ -200,7 +200,7 @@ class HemoglobinRig:
         states
             The other states by name, (H, W) each, aligned to the neutral map (a few pixels,
             little against the radius, do not matter). A name is lower case, e.g. one of
-            `rigsim.perfusion.STATES`.
+            `rigsim.subject.perfusion.STATES`.
         radius_px
             Radius of the disc of eq. (1), px.
         valid

@@ -120,7 +120,7 @@ class CaliperUnit:
     stall
         Probability that a move's motor stalls on the way.
     home_missed, sensor_dead, interlock, interlock_after
-        See `rigsim.faults.Faults`.
+        See `rigsim.world.faults.Faults`.
     rng
         Where the jaws stand at first, and stalls.
     """

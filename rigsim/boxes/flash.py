@@ -92,7 +92,7 @@ class FlashUnit:
     slow_charge
         How many times longer than normal the capacitor takes.
     lamp_dead, heat, interlock
-        See `rigsim.faults.Faults`.
+        See `rigsim.world.faults.Faults`.
     rng
         Decides misfires.
     """

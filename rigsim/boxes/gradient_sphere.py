@@ -79,7 +79,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
     on_trigger
         Called with the world time in s and the mask of each release of cameras.
     dead, weak, heat, interlock
-        See `rigsim.faults.Faults`; dead and weak LEDs by number.
+        See `rigsim.world.faults.Faults`; dead and weak LEDs by number.
     """
 
     kind = "gradient_sphere"

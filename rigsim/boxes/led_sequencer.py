@@ -74,7 +74,7 @@ class LedSequencer(ABC, Generic[RowT]):
     on_trigger
         Called with the world time in s and the mask of each release of cameras.
     dead, weak, heat, interlock
-        See `rigsim.faults.Faults`; dead and weak LEDs by number.
+        See `rigsim.world.faults.Faults`; dead and weak LEDs by number.
     """
 
     kind: str

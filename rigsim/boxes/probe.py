@@ -61,7 +61,7 @@ class ProbeUnit:
     on_trigger
         Called with the world time in s when the camera's line is pulsed.
     shutter_stuck, shutter_jam, gauge_dead_after, interlock, interlock_after
-        See `rigsim.faults.Faults`.
+        See `rigsim.world.faults.Faults`.
     dead, weak
         The LED draws no current; it gives so much of a new one's light, which nobody notices.
     rng

@@ -167,7 +167,7 @@ def analyse_simulated(
     seed
         Of the population.
     """
-    from rigsim.population import table_1
+    from rigsim.population.population import table_1
     from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
 
     tell = progress or (lambda text: None)

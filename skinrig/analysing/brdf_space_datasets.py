@@ -19,11 +19,11 @@ from model import fresnel
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import space as brdf_space
-from rigsim import surface_brdf
-from rigsim.mesh import Float32Array
-from rigsim.population import HAIR_LIMIT, Member, table_1
-from rigsim.skin_conditions import CONDITIONS, conditioned_surface
-from rigsim.surface_brdf import SkinSurface
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light import surface_brdf
+from rigsim.light.surface_brdf import SkinSurface
+from rigsim.population.conditions import CONDITIONS, conditioned_surface
+from rigsim.population.population import HAIR_LIMIT, Member, table_1
 
 FloatArray = NDArray[np.float64]
 
@@ -233,7 +233,7 @@ def dataset_a(
     member
         Whose; None: `PERSON` of table 1.
     conditions
-        Of `rigsim.skin_conditions.CONDITIONS`, each of amount 1.
+        Of `rigsim.population.conditions.CONDITIONS`, each of amount 1.
     noise
         See `NOISE`.
     progress
@@ -268,7 +268,7 @@ def dataset_b(
     points
         How many of each.
     members
-        None: the 87 of `rigsim.population.table_1`.
+        None: the 87 of `rigsim.population.population.table_1`.
     noise
         See `NOISE`.
     progress

@@ -234,9 +234,9 @@ def _with_states(
     mesh: BlendShapeMesh, names: Sequence[str]
 ) -> tuple[BlendShapeMesh, tuple[str, ...]]:
     """Return the mesh with shapes for states that it lacks, and the names that it has itself."""
-    from rigsim.expressions import displacement_mm, moves
-    from rigsim.mesh import build_mesh
-    from rigsim.perfusion import STATES
+    from rigsim.geometry.mesh import build_mesh
+    from rigsim.subject.expressions import displacement_mm, moves
+    from rigsim.subject.perfusion import STATES
 
     own = tuple(name for name in names if name in mesh.shapes)
     unknown = [name for name in names if name not in mesh.shapes and name not in STATES]
@@ -278,7 +278,7 @@ def _noise(
     out: NDArray[np.float32] | None,
 ) -> NDArray[np.float32]:
     """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
-    from rigsim.atlas import spread, unwrap
+    from rigsim.geometry.atlas import spread, unwrap
 
     finest = NYQUIST_SHARE * 0.5e3 * size_px / float(np.median(scale_um))
     if finest <= LONGEST_PER_MM:
@@ -321,7 +321,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> NDArray[np.float64] 
     """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
         return None
-    from rigsim.face_regions import on_mean_head, region_masks
+    from rigsim.subject.face_regions import on_mean_head, region_masks
 
     unknown = [name for name in names if name not in SITE_REGIONS]
     if unknown:
@@ -338,12 +338,12 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> NDArray[np.float64] 
 
 
 def _atlas(mesh: BlendShapeMesh) -> Any:
-    from rigsim.atlas import unwrap
+    from rigsim.geometry.atlas import unwrap
 
     return unwrap(_face(mesh), REGION_PX)
 
 
 def _face(mesh: BlendShapeMesh) -> Any:
-    from rigsim.mesh import build_mesh
+    from rigsim.geometry.mesh import build_mesh
 
     return build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv)

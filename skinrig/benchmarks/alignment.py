@@ -118,7 +118,7 @@ def moved_face(
     displacement_px
         (N, N, 2): where each pixel goes. It must not fold.
     state
-        Of `rigsim.perfusion.STATES`.
+        Of `rigsim.subject.perfusion.STATES`.
     noise
         Relative standard deviation of each channel of each pixel.
     landmarks, landmark_noise_px

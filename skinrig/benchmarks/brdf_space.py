@@ -94,7 +94,7 @@ def space(*, toy: bool) -> StageBenchmark:
 
 
 def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
-    from rigsim.population import table_1
+    from rigsim.population.population import table_1
 
     rng = np.random.default_rng(72)
     if toy:

@@ -18,7 +18,7 @@ from capture.rig import Rig, load_rig
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 if TYPE_CHECKING:
-    from rigsim.scenes.dome_targets import TargetScene
+    from rigsim.scenes.dome.targets import TargetScene
 
 BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
 RADIUS_MM = 50.0
@@ -37,8 +37,8 @@ class _Pulse:
 
 def geometry(*, toy: bool) -> StageBenchmark:
     """Adjust cameras to 4 to 12 places of a simulated board."""
-    from rigsim.dome_build import Tolerances, build, image_of
-    from rigsim.scenes.dome_targets import target_scene
+    from rigsim.as_built.dome import Tolerances, build, image_of
+    from rigsim.scenes.dome.targets import target_scene
 
     views = ["C03", "C07", "C11", "C14"] if toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
     rig = load_rig("dome").subset(views=views).resized(324 if toy else 650)
@@ -87,8 +87,8 @@ def geometry(*, toy: bool) -> StageBenchmark:
 
 def lights(*, toy: bool) -> StageBenchmark:
     """Place lights by one to four places of a simulated mirror sphere."""
-    from rigsim.dome_build import build
-    from rigsim.scenes.dome_targets import target_scene
+    from rigsim.as_built.dome import build
+    from rigsim.scenes.dome.targets import target_scene
 
     views = ["C05", "C07", "C14"] if toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")

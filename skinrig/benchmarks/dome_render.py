@@ -12,7 +12,7 @@ from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.skin_bands import MELANIN_BANDS
 
 if TYPE_CHECKING:
-    from rigsim.scenes.dome_reference import Way
+    from rigsim.scenes.dome.reference import Way
 
 PATH_SPEED_UP = 10.0
 DIRECT_SPEED_UP = 5.0
@@ -24,7 +24,7 @@ def render(*, toy: bool) -> StageBenchmark:
     The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
     as even as our regular rays: with its default, independent ones it is twice as noisy.
     """
-    from rigsim.scenes.dome_reference import compare
+    from rigsim.scenes.dome.reference import compare
 
     width, lights = (64, 2) if toy else (1300, 4)
     points = []
@@ -85,7 +85,7 @@ def _error(way: Way) -> BandError:
 
 def _on_skin(preset: str, width: int, fine: int) -> BandError:
     """Return our error with 4 rays a pixel on a face of a preset's melanin, one light, %."""
-    from rigsim.scenes.dome_reference import PlainScene, plain_face, point_rig
+    from rigsim.scenes.dome.reference import PlainScene, plain_face, point_rig
 
     rig = point_rig(load_rig("dome").resized(width).subset(views=["C02"]))
     face = plain_face(preset, size=128 if width < 128 else 512)

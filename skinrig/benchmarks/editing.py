@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.correspondence.common_parameterization import Chart
-from rigsim.population import Member, table_1
+from rigsim.population.population import Member, table_1
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.editing import albedo as editing_albedo
 from skinrig.fitting import traits

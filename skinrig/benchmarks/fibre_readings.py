@@ -106,7 +106,7 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
 
 
 def _bench(*, draws: int) -> _Bench:
-    from rigsim.probe_build import ProbeTolerances, build_probe, unit_images
+    from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
     from rigsim.sensor import expose, fixed_pattern, sensor_of
 
     rig = load_rig("probe")

@@ -17,7 +17,8 @@ REFERENCE_RAYS = 144
 def render(*, toy: bool) -> StageBenchmark:
     """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
     from rigsim.render import Caster
-    from rigsim.scenes.polarizer_reference import (
+    from rigsim.render.variant import choose_variant
+    from rigsim.scenes.flash.polarizer_reference import (
         ANALYSER_DEG,
         closed_forms,
         mitsuba_image,
@@ -25,7 +26,6 @@ def render(*, toy: bool) -> StageBenchmark:
         reference_rig,
         sphere_mesh,
     )
-    from rigsim.variant import choose_variant
 
     efforts = ((1, 2), (2, 4)) if toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if toy else 256

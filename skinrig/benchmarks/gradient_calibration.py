@@ -22,8 +22,8 @@ MISALIGNMENT_SIGMAS = 4.0
 
 def sphere_lights(*, toy: bool) -> StageBenchmark:
     """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
-    from rigsim.scenes.gradient import GradientScene
-    from rigsim.sphere_build import build_sphere
+    from rigsim.as_built.sphere import build_sphere
+    from rigsim.scenes.gradient.scene import GradientScene
 
     points, last = [], (np.inf, np.inf, np.inf)
     for width_px in (192,) if toy else (512, 1024):
@@ -83,7 +83,7 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
 
 def _shots(scene: object, rig: Rig) -> list[Shot]:
     from rigsim.boxes.gradient_sphere import PatternLight
-    from rigsim.scenes.gradient import GradientScene
+    from rigsim.scenes.gradient.scene import GradientScene
     from rigsim.sensor import vignetting_map
 
     if not isinstance(scene, GradientScene):

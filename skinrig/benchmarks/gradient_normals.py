@@ -16,11 +16,11 @@ from capture.rig import Rig, load_rig
 from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from reconstruction.normal_maps import NormalMaps
-from rigsim.microrelief import make_micro_skin
-from rigsim.pigment import MELANIN_PRESETS
-from rigsim.scenes.gradient import GradientScene
-from rigsim.sphere_build import BuiltSphere, as_drawn
-from rigsim.taped_skin import GripState
+from rigsim.as_built.sphere import BuiltSphere, as_drawn
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.subject.pigment import MELANIN_PRESETS
+from rigsim.world.taped_skin import GripState
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS, MelaninBand
 

@@ -22,7 +22,8 @@ def render(*, toy: bool) -> StageBenchmark:
     processor time; ours are those of the table, which serves all states of a session, and of one
     state.
     """
-    from rigsim.scenes.gradient_reference import (
+    from rigsim.as_built.sphere import PATTERN_WEIGHTS
+    from rigsim.scenes.gradient.reference import (
         judge,
         picture,
         plain_scene,
@@ -30,7 +31,6 @@ def render(*, toy: bool) -> StageBenchmark:
         rendered,
         traced,
     )
-    from rigsim.sphere_build import PATTERN_WEIGHTS
 
     width = 48 if toy else 192
     skin = plain_skin(width * 0.006 + 0.9)

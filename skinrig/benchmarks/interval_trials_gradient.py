@@ -173,8 +173,8 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
     pixel_um : float
         Distance of the heights, um.
     """
-    from rigsim.microrelief import make_micro_skin
-    from rigsim.skin_stretch import deform
+    from rigsim.skin_patch.microrelief import make_micro_skin
+    from rigsim.skin_patch.stretch import deform
 
     skin = make_micro_skin(site, seed=seed, size_mm=SKIN_MM + EDGE_MM)
     strained = deform(skin, stretch=stretch, angle_deg=0.0)

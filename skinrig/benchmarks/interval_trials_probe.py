@@ -107,7 +107,7 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
     >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
     True
     """
-    from rigsim.probe_tissue import AS_MADE, phantom_certificate
+    from rigsim.fiber.probe_tissue import AS_MADE, phantom_certificate
 
     paper = dict(phantom_certificate())
     for name, made in zip(COEFFICIENTS, AS_MADE, strict=True):
@@ -125,7 +125,7 @@ def melanin_band_of(preset: str) -> str:
     >>> melanin_band_of("II"), melanin_band_of("VI")
     ('light', 'dark')
     """
-    from rigsim.pigment import MELANIN_PRESETS
+    from rigsim.subject.pigment import MELANIN_PRESETS
 
     return str(skin_bands.melanin_band(MELANIN_PRESETS[preset]))
 

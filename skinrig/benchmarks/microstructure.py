@@ -29,8 +29,8 @@ from model.microstructure.strain_fields import rasterize
 from reconstruction import kernel_fit, normal_histogram
 from reconstruction.kernel_fit import table as kernel_table
 from reconstruction.normal_histogram import relief_slopes
-from rigsim.microrelief import MicroSkin, make_micro_skin
-from rigsim.skin_stretch import StretchedSkin, deform
+from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 Floats = NDArray[np.float64]

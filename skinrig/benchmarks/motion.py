@@ -98,9 +98,9 @@ def simulate(
     from capture.calibration.geometry import CameraPose
     from capture.rig import load_rig
     from rigsim.boxes.dome import LedPulse
-    from rigsim.head_motion import head_motion as drawn
-    from rigsim.scenes.dome import DomeScene
+    from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
+    from rigsim.subject.head_motion import head_motion as drawn
 
     rig = load_rig("dome")
     leds = [light.name for light in rig.lights if light.position_mm[2] > 350.0][::6]

@@ -31,7 +31,7 @@ class Omission:
     subject: str
     effect: str
     verdict: str
-    """As the scene's rule has it, see `rigsim.scene_needs.Verdict`."""
+    """As the scene's rule has it, see `rigsim.needs.effects.Verdict`."""
     told: float | None
     """Largest change over noise as the rule told it."""
     found: float
@@ -78,7 +78,7 @@ def compare(
     scene
         As its needs decide.
     noise
-        Of the sensor, see `rigsim.scene_needs.Noise`.
+        Of the sensor, see `rigsim.needs.effects.Noise`.
     render
         Called with settings of the scene; returns pictures.
     switched
@@ -136,9 +136,9 @@ def flash_face(
         lights where they stand.
     """
     from capture.rig import load_rig
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.flash import FlashScene
-    from rigsim.scenes.flash_needs import FINER
+    from rigsim.needs.effects import Noise
+    from rigsim.needs.flash import FINER
+    from rigsim.scenes.flash.scene import FlashScene
     from rigsim.subject import make_subject
 
     rig = load_rig("flash").resized(width_px)
@@ -183,8 +183,8 @@ def _lit_from(rig: Any, angle_deg: float) -> Any:
 def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare pictures of a face in the dome under some lights, each exposed to full scale."""
     from capture.rig import load_rig
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.dome import DomeScene
+    from rigsim.needs.effects import Noise
+    from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
     from skinrig.simulating.dome import small_dome
 
@@ -215,8 +215,8 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
 def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare a face that has moved in the dome with and without shadows of its wrinkles."""
     from capture.rig import load_rig
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.dome import DomeScene
+    from rigsim.needs.effects import Noise
+    from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
     from skinrig.simulating.dome import small_dome
 
@@ -251,8 +251,8 @@ def _plainer(
         Returns the pictures of a subject, in full scales.
     """
     from model import spectra
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.flash_needs import BANDS, PIGMENT, RELIEF
+    from rigsim.needs.effects import Noise
+    from rigsim.needs.flash import BANDS, PIGMENT, RELIEF
 
     face, noise = scene.subject, Noise.of(scene.sensor())
     begin = time.process_time()
@@ -299,9 +299,9 @@ def changed(
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
     from capture.rig import load_rig
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.gradient import GradientScene
-    from rigsim.scenes.gradient_reference import NEUTRAL
+    from rigsim.needs.effects import Noise
+    from rigsim.scenes.gradient.reference import NEUTRAL
+    from rigsim.scenes.gradient.scene import GradientScene
     from skinrig.simulating.gradient import make_scene
 
     rig = load_rig("gradient").cropped(width_px)
@@ -324,12 +324,12 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
 def flat_targets() -> Iterator[Omission]:
     """Show that targets neither shade nor light themselves: rays between their own points."""
     from capture.rig import load_rig
-    from rigsim.effect_sizes import is_flat
+    from rigsim.light.interreflection import SkinBounce
+    from rigsim.needs.effect_sizes import is_flat
+    from rigsim.needs.effects import Noise
     from rigsim.render import Caster, visibility
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.dome import DomeScene
-    from rigsim.scenes.flash import FlashScene
-    from rigsim.skin_bounce import SkinBounce
+    from rigsim.scenes.dome.scene import DomeScene
+    from rigsim.scenes.flash.scene import FlashScene
     from rigsim.targets import make_target
     from skinrig.simulating.dome import small_dome
 

@@ -15,11 +15,11 @@ from skinrig.benchmarks.omission_cases import Omission, Pictures, changed
 def gray_tissue() -> Iterator[Omission]:
     """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
     from capture.rig import load_rig
-    from rigsim.probe_tissue import HomogeneousTissue
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.probe import ProbeScene
-    from rigsim.scenes.probe_needs import COLOR
-    from rigsim.suction import HeadState
+    from rigsim.fiber.probe_tissue import HomogeneousTissue
+    from rigsim.needs.effects import Noise
+    from rigsim.needs.probe import COLOR
+    from rigsim.scenes.probe.scene import ProbeScene
+    from rigsim.world.suction import HeadState
 
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
@@ -51,8 +51,8 @@ def gray_tissue() -> Iterator[Omission]:
 
 def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     """Compare the probe as built with one without cross-talk, wings, or dark current."""
-    from rigsim.scenes.probe import LONGEST_S, ProbeScene
-    from rigsim.scenes.probe_needs import CROSSTALK, DARK, WINGS
+    from rigsim.needs.probe import CROSSTALK, DARK, WINGS
+    from rigsim.scenes.probe.scene import LONGEST_S, ProbeScene
 
     profile = scene.profile(head)
     build = scene.build

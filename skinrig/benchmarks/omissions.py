@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rigsim.scenes.flash_needs import LATERAL
+from rigsim.needs.flash import LATERAL
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks import omission_cases, omission_probe
 from skinrig.benchmarks.omission_cases import Omission
 
 BOUND = 0.1
-"""Of a pixel's noise: what may be left out. Not `rigsim.scene_needs.ENOUGH` itself, so that a
+"""Of a pixel's noise: what may be left out. Not `rigsim.needs.effects.ENOUGH` itself, so that a
 rule that was loosened shows here."""
 
 NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"

@@ -16,7 +16,7 @@ from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.facial_color.perfusion_curves import FALSE_ALARM, transition
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
-from rigsim.perfusion_course import PromptedCourse
+from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.skin_bands import MELANIN_BANDS
 

@@ -79,7 +79,7 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     rng
         Of points, pairs of light and camera, and noise.
     """
-    from rigsim import surface_brdf
+    from rigsim.light import surface_brdf
     from rigsim.subject import make_subject
 
     rig = load_rig("dome")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capture.calibration.geometry import CameraPose
 from capture.rig import Rig, load_rig
 from rigsim.render import Caster
-from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.benchmarks.resampling import tiled_rms

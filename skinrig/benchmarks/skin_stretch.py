@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigsim.microrelief import SITES, MicroSkin, make_micro_skin
-from rigsim.skin_stretch import TOLERANCE, StretchedSkin, deform, size_for
+from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 STATES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)

@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from reconstruction.subsurface.models import Method
-from rigsim.fibre_profile import fibre_profile
-from rigsim.tissue_mc import Layer, LayerStack
+from rigsim.fiber.profile import fibre_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.skin_bands import MELANIN_BANDS, MelaninBand

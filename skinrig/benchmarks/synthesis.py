@@ -13,7 +13,7 @@ from scipy.special import ndtri
 from model.displacement_synthesis import growth as displacement_synthesis
 from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
-from rigsim.microrelief import make_micro_skin
+from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 
 Float32Array = NDArray[np.float32]

@@ -19,7 +19,7 @@ USUAL_SIZE = 64
 
 def layered_reflectance(*, toy: bool) -> StageBenchmark:
     """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
-    from rigsim.skin_table import SkinTable
+    from rigsim.tissue.skin_table import SkinTable
 
     rng = np.random.default_rng(0)
     truth = SkinTable.load()

@@ -15,7 +15,7 @@ from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
 from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
-from rigsim.population import Member, shifted, table_1
+from rigsim.population.population import Member, shifted, table_1
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks import resident_memory
 from skinrig.fitting import traits as fitting_traits

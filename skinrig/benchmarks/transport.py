@@ -94,8 +94,8 @@ def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  #
 
 def photon_transport(*, toy: bool) -> StageBenchmark:
     """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
-    from rigsim.fibre_profile import fibre_profile
-    from rigsim.tissue_mc import Layer, LayerStack, transport
+    from rigsim.fiber.profile import fibre_profile
+    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
     probe = load_rig("probe").probe
     if probe is None:
@@ -158,8 +158,8 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
 
 def _bands(radii: Floats, *, photons: int) -> dict[str, BandError]:
     """Return the error of as many photons in skin that absorbs little and much."""
-    from rigsim.fibre_profile import fibre_profile
-    from rigsim.tissue_mc import Layer, LayerStack
+    from rigsim.fiber.profile import fibre_profile
+    from rigsim.tissue.tissue_mc import Layer, LayerStack
 
     found = {}
     for name, band in MELANIN_BANDS.items():
@@ -206,7 +206,7 @@ def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
 
 
 def _one_percent(radii: Floats, stack: Any) -> tuple[Limit, ...]:
-    from rigsim.fibre_profile import fibre_profile
+    from rigsim.fiber.profile import fibre_profile
 
     seconds, run = _spent(
         lambda: fibre_profile(
@@ -222,9 +222,9 @@ def _one_percent(radii: Floats, stack: Any) -> tuple[Limit, ...]:
 
 def _against_volpath(radii: Floats) -> tuple[Limit, ...]:
     """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
-    from rigsim.fibre_profile import fibre_profile
+    from rigsim.fiber.profile import fibre_profile
     from rigsim.render import RenderError, radiance
-    from rigsim.tissue_mc import Layer, LayerStack
+    from rigsim.tissue.tissue_mc import Layer, LayerStack
 
     scene = volpath_scene(radii)
     try:
@@ -310,7 +310,7 @@ def volpath_scene(radii: Floats) -> dict[str, Any]:
 
 def _rates(medium: Any) -> tuple[Limit, ...]:
     """Compare photons a processor second with the plain walk's; R_d with MCML's."""
-    from rigsim.tissue_mc import transport
+    from rigsim.tissue.tissue_mc import transport
 
     edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
     plain_walk(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)

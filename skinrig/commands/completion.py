@@ -72,7 +72,7 @@ def states(incomplete: str) -> list[str]:
 
 def conditions(incomplete: str) -> list[str]:
     """Return conditions of a simulated face."""
-    from rigsim.skin_conditions import CONDITIONS
+    from rigsim.population.conditions import CONDITIONS
 
     return beginning(CONDITIONS, incomplete)
 

@@ -107,7 +107,7 @@ class Material:
         Raises
         ------
         model.skin_reflectance.SkinReflectanceError, skinrig.rendering.geometry.GeometryError,
-        rigsim.mesh.MeshError, ExportError
+        rigsim.geometry.mesh.MeshError, ExportError
             Naming the map or file that is missing or does not fit.
         """
         from skinrig.rendering.geometry import FittedSurface, own_mesh

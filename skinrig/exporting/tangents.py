@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigsim.mesh import Mesh
+from rigsim.geometry.mesh import Mesh
 from skinrig.exporting.udim import TiledMesh
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ class FramedMesh:
 
         Examples
         --------
-        >>> from rigsim.mesh import build_mesh
+        >>> from rigsim.geometry.mesh import build_mesh
         >>> flat = build_mesh([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]],
         ...                   [[0, 0], [1, 0], [0, 1]])
         >>> FramedMesh.of(flat).tangents[0].tolist()
@@ -103,7 +103,7 @@ class FramedMesh:
 
         Examples
         --------
-        >>> from rigsim.mesh import build_mesh
+        >>> from rigsim.geometry.mesh import build_mesh
         >>> square = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
         >>> flat = build_mesh(square, [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]])
         >>> FramedMesh.of(flat).holes()

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigsim.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
+from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
 from skinrig.exporting.options import FIRST_TILE
 from skinrig.exporting.sealing import ExportError
 
@@ -31,7 +31,7 @@ class TiledMesh:
     Attributes
     ----------
     vertices_mm, faces, uv, normals, shapes
-        As of :class:`rigsim.mesh.Mesh`, texture coordinates of any tile.
+        As of :class:`rigsim.geometry.mesh.Mesh`, texture coordinates of any tile.
     tile
         UDIM tile of each face, (F,).
     """
@@ -122,7 +122,7 @@ def read(path: Path) -> TiledMesh:
 
     Raises
     ------
-    rigsim.mesh.MeshError, skinrig.blend_shape_errors.BlendShapeError
+    rigsim.geometry.mesh.MeshError, skinrig.blend_shape_errors.BlendShapeError
         The file is missing, damaged, or no mesh that maps can be laid on.
     ExportError
         See `tiles_of`.

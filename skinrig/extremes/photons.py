@@ -15,7 +15,7 @@ Matter = tuple[float, float, float, float]
 
 def _walked(real: Real, *layers: Matter, eta: float = 1.4, photons: int = 40_000):  # type: ignore[no-untyped-def]
     """Return what becomes of photons in layers."""
-    from rigsim.tissue_mc import Layer, LayerStack, transport
+    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
     made = []
     for one in layers:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float = 1.0):  # type: ignore[no-untyped-def]
     """Return a square sheet facing +z as a mesh of the rig frame."""
-    from rigsim.mesh import build_mesh
+    from rigsim.geometry.mesh import build_mesh
 
     across = (np.arange(side) - (side - 1) / 2) * pitch_mm
     x, y = np.meshgrid(across, across)
@@ -92,7 +92,7 @@ def _light_behind(_: Real) -> str:
 
 
 def _zero_triangles(real: Real) -> str:
-    from rigsim.mesh import build_mesh, vertex_normals
+    from rigsim.geometry.mesh import build_mesh, vertex_normals
 
     points = as_real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]), real)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
@@ -103,7 +103,7 @@ def _zero_triangles(real: Real) -> str:
 
 
 def _wrong_unit(real: Real) -> str:
-    from rigsim.mesh import MeshError, build_mesh
+    from rigsim.geometry.mesh import MeshError, build_mesh
 
     points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
     return refused(
@@ -113,7 +113,7 @@ def _wrong_unit(real: Real) -> str:
 
 
 def _surface(direction: NDArray[np.float64], roughness: float, real: Real) -> tuple[float, float]:
-    from rigsim import surface_brdf
+    from rigsim.light import surface_brdf
 
     packed = as_real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0], real)
     up = np.array([0.0, 0.0, 1.0])
@@ -164,7 +164,7 @@ def _roughness_ends(real: Real) -> str:
 
 
 def _furnace(real: Real) -> str:
-    from rigsim import surface_brdf
+    from rigsim.light import surface_brdf
 
     rng = np.random.default_rng(7)
     count = 200_000

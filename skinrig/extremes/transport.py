@@ -245,7 +245,7 @@ def _profile_broken(real: Real) -> str:
 
 
 def _one_photon(real: Real) -> str:
-    from rigsim.tissue_mc import Layer, LayerStack, transport
+    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
     found = transport(stack, photons=1, rng=np.random.default_rng(0))

@@ -83,11 +83,11 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     points
         How many to look at; `POINTS` by default.
     """
-    from rigsim import subject_file
-    from rigsim.led_light import white_intensity
+    from rigsim.light.led_light import white_intensity
+    from rigsim.light.surface_brdf import skin_surface
+    from rigsim.population import files as subject_file
     from rigsim.render import OFFSET_MM, Caster
     from rigsim.sensor import sensor_of
-    from rigsim.surface_brdf import skin_surface
 
     points = POINTS if points is None else points
     face = subject_file.named(subject).face(seed=seed, size=TEXELS)
@@ -171,7 +171,7 @@ def _relative_variance(rate: Floats, full_well_e: float, read_noise_e: float) ->
 
 def _averaged(r_d: NDArray[np.floating], atlas: Any, sigma_mm: float) -> Floats:
     """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
-    from rigsim.lateral import spread_light
+    from rigsim.light.lateral import spread_light
 
     covered = atlas.covered[..., None]
     field = np.where(covered, r_d, 0.0).astype(np.float32)

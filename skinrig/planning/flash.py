@@ -108,8 +108,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     """
     from model import color_table
     from model.tissue_optics.layers import ANISOTROPY_SKIN
-    from rigsim import subject_file
-    from rigsim.scenes.flash import FlashScene
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.flash.scene import FlashScene
     from rigsim.sensor import sensor_of, vignetting_map
     from skinrig.simulating.flash import to_superpixels
 

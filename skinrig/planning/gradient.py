@@ -100,9 +100,9 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
         Pixels across.
     """
     from model.metrics import angular_error_rad
-    from rigsim import subject_file
-    from rigsim.scenes.gradient import GradientScene
-    from rigsim.sphere_build import as_drawn
+    from rigsim.as_built.sphere import as_drawn
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.gradient.scene import GradientScene
     from skinrig.benchmarks.gradient_normals import NEUTRAL, lights_of, pixel_geometry
 
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig

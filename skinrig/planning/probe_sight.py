@@ -51,14 +51,14 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     rig
         The probe's.
     subject, seed
-        The tissue, see `rigsim.probe_tissue.parse_subject`.
+        The tissue, see `rigsim.fiber.probe_tissue.parse_subject`.
     sites
         Where the head may be placed.
     """
-    from rigsim import subject_file
-    from rigsim.probe_build import SPOT_RADIUS_PX
-    from rigsim.probe_profile import Profiles
-    from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
+    from rigsim.as_built.probe import SPOT_RADIUS_PX
+    from rigsim.fiber.probe_profile import Profiles
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
     from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
     from skinrig.simulating.probe import PHOTONS

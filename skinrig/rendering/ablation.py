@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin_reflectance import SkinReflectance
-from rigsim.atlas import unwrap
-from rigsim.mesh import Mesh
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import Mesh
 
 Float = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capture.calibration.geometry import CameraPose
-from rigsim.mesh import Float32Array
+from rigsim.geometry.mesh import Float32Array
 
 Camera = CameraPose
 """Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s centre is (0, 0)."""

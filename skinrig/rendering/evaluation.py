@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from model import fresnel, store
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance, assemble
-from rigsim.atlas import sample
-from rigsim.mesh import Float32Array
+from rigsim.geometry.atlas import sample
+from rigsim.geometry.mesh import Float32Array
 from rigsim.render import Caster
 from skinrig.rendering import folder, photograph_errors
 from skinrig.rendering.ablation import without_parts

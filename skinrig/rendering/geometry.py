@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
-from rigsim.atlas import Atlas, spread, unwrap
-from rigsim.mesh import Float32Array, Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from rigsim.geometry.atlas import Atlas, spread, unwrap
+from rigsim.geometry.mesh import Float32Array, Mesh, MeshError, MeshFileError, build_mesh, load_mesh
 from skinrig.rendering.lookup_kernels import look_up
 
 BoolArray = NDArray[np.bool_]
@@ -236,7 +236,7 @@ def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32
     normals
         Unit normals in the frame of the resting surface, shape (N, N, 3).
     rest, moved
-        The same texture before and after, see `rigsim.atlas.unwrap`.
+        The same texture before and after, see `rigsim.geometry.atlas.unwrap`.
 
     Returns
     -------
@@ -245,7 +245,7 @@ def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32
 
     Examples
     --------
-    >>> from rigsim.mesh import build_mesh
+    >>> from rigsim.geometry.mesh import build_mesh
     >>> faces, uv = [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]]
     >>> flat = build_mesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], faces, uv)
     >>> turned = build_mesh([[0, 0, 0], [0, 0, -9], [0, 9, -9], [0, 9, 0]], faces, uv)
@@ -285,7 +285,7 @@ def own_mesh(appearance: SkinAppearance) -> Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh in mm with texture coordinates: .obj, .ply, or .npz of `rigsim.mesh`.
+    """Read a mesh in mm with texture coordinates: .obj, .ply, or .npz of `rigsim.geometry.mesh`.
 
     Raises
     ------

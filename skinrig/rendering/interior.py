@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from model.dipole import gather as dipole_gather
 from model.dipole.gather import SourceTree
 from model.skin_reflectance import transmitted
-from rigsim.atlas import unwrap
-from rigsim.mesh import Float32Array
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import Float32Array
 from rigsim.render import Caster, thread_count, visibility
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.lights import Light

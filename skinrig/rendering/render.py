@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from model.dipole.gather import TOLERANCE
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
-from rigsim.mesh import Float32Array, Mesh, build_mesh
+from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera

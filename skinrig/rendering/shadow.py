@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin_reflectance import SkinReflectance
-from rigsim.mesh import Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
-from rigsim import surface_brdf
-from rigsim.atlas import spread
-from rigsim.scenes.dome import DomeScene
+from rigsim.geometry.atlas import spread
+from rigsim.light import surface_brdf
+from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import Subject
 from skinrig.rendering.lights import Light
 

@@ -30,7 +30,7 @@ from skinrig.simulating.simulation import (
 )
 
 if TYPE_CHECKING:
-    from rigsim.population import Member
+    from rigsim.population.population import Member
 
 TEXELS = 512
 """Along one side of a face's maps."""
@@ -44,7 +44,7 @@ BEHIND = -0.3
 SCAN = "scan.ply"
 TRUE_MESH = "mesh.ply"
 BLEND_SHAPES = "expressions.npz"
-"""The face at rest with the movement of each expression, see `rigsim.mesh.load_mesh`."""
+"""The face at rest with the movement of each expression, see `rigsim.geometry.mesh.load_mesh`."""
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
@@ -129,7 +129,7 @@ def simulate_dome(order: Order) -> Simulated:
 
 def _state(order: Order) -> str:
     """Return the state of the one face that a session of the dome shows."""
-    from rigsim.perfusion import STATES
+    from rigsim.subject.perfusion import STATES
 
     if len(order.states) != 1:
         raise OptionsError(
@@ -147,7 +147,7 @@ def _state(order: Order) -> str:
 
 def _conditions(order: Order) -> dict[str, float]:
     """Return the conditions of the face, checked."""
-    from rigsim.skin_conditions import ConditionError, checked
+    from rigsim.population.conditions import ConditionError, checked
 
     if order.target is not None and order.conditions:
         raise OptionsError(f"condition: got {', '.join(order.conditions)}, but a target has none")
@@ -159,7 +159,7 @@ def _conditions(order: Order) -> dict[str, float]:
 
 def _member(order: Order) -> Member | None:
     """Return the member of the simulated population that is asked for; None: a preset is."""
-    from rigsim.population import PopulationError, member
+    from rigsim.population.population import PopulationError, member
 
     if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
         return None
@@ -173,7 +173,7 @@ def _member(order: Order) -> Member | None:
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
     """Return the true mesh, its expressions, and how it reflects where no light is."""
-    from rigsim.scan_flaws import binary_ply
+    from rigsim.scanner.flaws import binary_ply
 
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
@@ -300,7 +300,7 @@ def _rig(order: Order) -> Rig:
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-    from rigsim.scenes.dome_targets import PLACES, plate_normals
+    from rigsim.scenes.dome.targets import PLACES, plate_normals
 
     few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
     return dome_calibration_plan(
@@ -310,12 +310,12 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
-    from rigsim import subject_file
-    from rigsim.dome_build import build
-    from rigsim.head_motion import head_motion
-    from rigsim.scene_needs import longest_on_s
-    from rigsim.scenes.dome import DomeScene
-    from rigsim.scenes.dome_targets import target_scene
+    from rigsim.as_built.dome import build
+    from rigsim.needs.effects import longest_on_s
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.dome.scene import DomeScene
+    from rigsim.scenes.dome.targets import target_scene
+    from rigsim.subject.head_motion import head_motion
     from rigsim.targets import make_target
 
     built = build(rig, seed=order.seed)
@@ -354,8 +354,8 @@ def _light_of_skin(order: Order) -> dict[str, Any]:
 
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
-    from rigsim.perfusion import STATES
-    from rigsim.scanner import Scanner, scan_face, wrap_template
+    from rigsim.scanner.pods import Scanner, scan_face, wrap_template
+    from rigsim.subject.perfusion import STATES
 
     scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh

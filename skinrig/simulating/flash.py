@@ -41,7 +41,7 @@ def simulate_flash(order: Order) -> Simulated:
         sites=None, all_brackets=False, wrapped=False,
     )  # fmt: skip
     if target is None:
-        from rigsim.perfusion import STATES
+        from rigsim.subject.perfusion import STATES
 
         unknown = [state for state in states if state not in STATES]
         if unknown:
@@ -93,8 +93,9 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
 
 
 def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
-    from rigsim import subject_file, targets
-    from rigsim.scenes.flash import FlashScene
+    from rigsim import targets
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.flash.scene import FlashScene
 
     seed = order.seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]

@@ -143,12 +143,12 @@ def make_scene(
     without
         What of the skin is not built, see `skinrig.simulating.leaving_out`.
     """
-    from rigsim import subject_file
-    from rigsim.patch_motion import PatchMotion
-    from rigsim.scene_needs import longest_on_s
-    from rigsim.scenes.gradient import GradientScene
-    from rigsim.skin_stretch import size_for
-    from rigsim.sphere_build import build_sphere
+    from rigsim.as_built.sphere import build_sphere
+    from rigsim.needs.effects import longest_on_s
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.gradient.scene import GradientScene
+    from rigsim.skin_patch.motion import PatchMotion
+    from rigsim.skin_patch.stretch import size_for
 
     sphere = build_sphere(rig, seed=seed)
     if target is not None:
@@ -219,7 +219,7 @@ class GripLog:
 
     def grips(self, session: Session) -> list[Any]:
         """Return what was held in each state that the session has, in the plan's order."""
-        from rigsim.taped_skin import GripState
+        from rigsim.world.taped_skin import GripState
 
         entries = self._read()
         found = []

@@ -14,7 +14,7 @@ SWITCHES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "probe": (),
     }
 )
-"""By rig: what can be left out, by the ``switch`` of its effect, see `rigsim.scene_needs`."""
+"""By rig: what can be left out, by the ``switch`` of its effect, see `rigsim.needs.effects`."""
 
 SAME: Final = frozenset({"lateral", "subsurface"})
 """Names of light spreading sideways in skin: each rig's own, and the other's."""

@@ -106,7 +106,7 @@ def simulate_probe(order: Order) -> Simulated:
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
     """Raise where the tissue has no such site, before anything is captured."""
-    from rigsim.probe_tissue import TissueError
+    from rigsim.fiber.probe_tissue import TissueError
 
     suction_mbar = rig.probe.suction_mbar if rig.probe is not None else 0.0
     for site in sites:
@@ -155,10 +155,10 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim import subject_file
-    from rigsim.probe_tissue import PHANTOM as BLOCK
-    from rigsim.probe_tissue import TissueError
-    from rigsim.scenes.probe import ProbeScene
+    from rigsim.fiber.probe_tissue import PHANTOM as BLOCK
+    from rigsim.fiber.probe_tissue import TissueError
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.probe.scene import ProbeScene
 
     try:
         tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
@@ -221,7 +221,7 @@ class HeadLog:
 
     def probings(self, session: Session) -> list[Any]:
         """Return the placements that the session has series of, in the plan's order."""
-        from rigsim.probe_truth import Probing
+        from rigsim.scenes.probe.truth import Probing
 
         entries = self._read()
         by_run: dict[int, list[tuple[float, float]]] = {}

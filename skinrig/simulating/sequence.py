@@ -57,10 +57,10 @@ RESUMED_AFTER_S = 10.0
 
 def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     """Simulate a sequence with the flash rig; see `simulation.simulate_session`."""
-    from rigsim import subject_file
-    from rigsim.perfusion import STATES
-    from rigsim.perfusion_course import EventCourse, PromptedCourse
-    from rigsim.scenes.flash_course import FlashCourseScene, FlashTime
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
+    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 
     if sequence.state not in STATES or sequence.state == "neutral":
         expected = ", ".join(state for state in STATES if state != "neutral")

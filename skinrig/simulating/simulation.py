@@ -65,7 +65,7 @@ class Simulated:
     light: Mapping[str, float | str] = field(default_factory=dict)
     """Figures of the LEDs' light, see `skinrig.light_safety`; empty for the flash rig."""
     effects: tuple[Mapping[str, Any], ...] = ()
-    """What the scene built and what not, with reasons, see `rigsim.scene_needs.Effect`."""
+    """What the scene built and what not, with reasons, see `rigsim.needs.effects.Effect`."""
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
@@ -236,9 +236,9 @@ def simulate_session(
         Of the subject, the sensor and the boxes.
     subject
         Preset of the face, by skin type; of the dome also a member of the simulated population, P01
-        to P87 (`rigsim.population.table_1`), with what it wears; of the probe also
+        to P87 (`rigsim.population.population.table_1`), with what it wears; of the probe also
         "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm. Of every rig also a file NAME.toml, see
-        `rigsim.subject_file`.
+        `rigsim.population.files`.
     mesh
         A face mesh to wear the skin instead of the procedural head.
     target
@@ -284,12 +284,12 @@ def simulate_session(
     sequence
         A sequence in time before the flash rig instead of ``states``.
     relaxation_s
-        Time constant of its blood, s; None: of the state, see `rigsim.perfusion_course`.
+        Time constant of its blood, s; None: of the state, see `rigsim.subject.perfusion_course`.
     subsurface, interreflections
         True: light in the dome spreads sideways inside the skin, and goes from skin to skin, even
-        where that changes no pixel; False: where it does, see `rigsim.scene_needs`.
+        where that changes no pixel; False: where it does, see `rigsim.needs.effects`.
     conditions
-        Conditions of the face in the dome with their amounts, see `rigsim.skin_conditions`.
+        Conditions of the face in the dome with their amounts, see `rigsim.population.conditions`.
     plan
         What is captured of the subject instead of the rig's own plan; of the dome its lights and
         cameras are those of targets, too.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 SUFFIX = ".toml"
-"""Of a subject's file, see `rigsim.subject_file`."""
+"""Of a subject's file, see `rigsim.population.files`."""
 
 
 def pseudonym(subject: str, seed: int) -> str:
@@ -25,7 +25,7 @@ def pseudonym(subject: str, seed: int) -> str:
 
 def of_manifest(subject: str) -> str | dict[str, Any]:
     """Return a subject as a session's manifest holds it: a preset, or all that its file says."""
-    from rigsim import subject_file
+    from rigsim.population import files as subject_file
 
     return subject_file.record(subject)
 
@@ -42,7 +42,7 @@ def unseen(subject: str, rig: str, tell: Callable[[str], None] | None = None) ->
     tell
         Told of them, in one line, where there are any.
     """
-    from rigsim import subject_file
+    from rigsim.population import files as subject_file
 
     if not subject_file.is_file(subject):
         return ()
@@ -64,7 +64,7 @@ def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> 
     progress
         Told what the file says and the rig does not see.
     """
-    from rigsim import subject_file
+    from rigsim.population import files as subject_file
 
     if not subject_file.is_file(subject):
         return {}

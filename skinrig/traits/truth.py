@@ -24,8 +24,9 @@ from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.correspondence import common_parameterization
 from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
-from rigsim import skin_conditions, surface_brdf
-from rigsim.population import Member
+from rigsim.light import surface_brdf
+from rigsim.population import conditions as skin_conditions
+from rigsim.population.population import Member
 from skinrig.fitting.traits import AlbedoSample
 
 Floats = NDArray[np.float64]
@@ -57,7 +58,7 @@ def assigned(
     members
         The population.
     conditions
-        Of `rigsim.skin_conditions.CONDITIONS`; "normal" is nothing.
+        Of `rigsim.population.conditions.CONDITIONS`; "normal" is nothing.
     amounts
         Range of even draws.
     rng

@@ -129,7 +129,7 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
 
 def simulated(person: Subject, skin: FineSkin) -> FaceColor:
     """Return the chromophores of a simulated person, with a rig of all of its states."""
-    from rigsim.perfusion import STATES
+    from rigsim.subject.perfusion import STATES
 
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),

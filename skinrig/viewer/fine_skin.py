@@ -38,8 +38,8 @@ class FineSkin:
 
     def __init__(self, person: Subject, size: int) -> None:
         """Lay out the surface."""
-        from rigsim import face_regions
-        from rigsim.atlas import unwrap
+        from rigsim.geometry.atlas import unwrap
+        from rigsim.subject import face_regions
 
         self._person = person
         self._atlas = person.atlas if size == person.size else unwrap(person.mesh, size)
@@ -52,7 +52,7 @@ class FineSkin:
 
     def melanin(self) -> Floats:
         """Return the volume fraction of melanosomes in the epidermis, (N, N)."""
-        from rigsim import pigment
+        from rigsim.subject import pigment
 
         base = pigment.MELANIN_PRESETS[self._person.preset]
         return self._on_texture(
@@ -61,14 +61,14 @@ class FineSkin:
 
     def hemoglobin(self) -> Floats:
         """Return the volume fraction of blood in the dermis of the neutral state, (N, N)."""
-        from rigsim.perfusion import perfuse
+        from rigsim.subject.perfusion import perfuse
 
         found = perfuse(self._points, self._regions, seed=self._person.seed)
         return self._on_texture(found.blood("neutral"))
 
     def height_um(self) -> Floats:
         """Return pores and lines over the mesh, um, (N, N)."""
-        from rigsim import relief
+        from rigsim.subject import relief
 
         along_u, along_v = self._atlas.texel_mm()
         texel_mm = float(np.median(np.maximum(along_u, along_v)[self.covered]))

@@ -143,7 +143,7 @@ def _mesh(
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH in appearance.files:
-            from rigsim.mesh import load_mesh
+            from rigsim.geometry.mesh import load_mesh
 
             with tempfile.TemporaryDirectory() as folder:
                 copy = Path(folder) / MESH

@@ -65,7 +65,7 @@ def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
 
 def simulated_relief(seed: int, *, site: str = "forehead", pixel_um: float = 15.0) -> MicroRelief:
     """Return relief of the simulated skin of a site, `PATCH_PX` a side."""
-    from rigsim.microrelief import make_micro_skin
+    from rigsim.skin_patch.microrelief import make_micro_skin
 
     skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")

@@ -21,7 +21,7 @@ from skinrig.viewer.hole_closing import Patch
 from skinrig.viewer.scene import Texture, ViewerScene
 
 if TYPE_CHECKING:
-    from rigsim.mesh import Mesh
+    from rigsim.geometry.mesh import Mesh
 
 Floats = NDArray[np.float64]
 
@@ -124,8 +124,8 @@ def closed(mesh: Mesh) -> ClosedMesh:
     mesh
         Without blend shapes.
     """
-    from rigsim.atlas import unwrap
-    from rigsim.mesh import build_mesh
+    from rigsim.geometry.atlas import unwrap
+    from rigsim.geometry.mesh import build_mesh
 
     patches = hole_closing.patches(mesh.vertices_mm, mesh.faces)
     if not patches or mesh.shapes:

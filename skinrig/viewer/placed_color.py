@@ -40,7 +40,7 @@ def placed(source: SceneSource, subject: Subject) -> FaceColor:
     skinrig.viewer.placing.PlacingError
         The landmarks do not.
     """
-    from rigsim.atlas import unwrap
+    from rigsim.geometry.atlas import unwrap
     from skinrig.viewer.from_appearance import picture_landmarks
 
     appearance = source.appearances["dynamic"]

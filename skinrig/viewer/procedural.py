@@ -12,7 +12,7 @@ from skinrig.viewer.fine_skin import PERSON_SIZE, FineSkin
 from skinrig.viewer.scene import LARGEST_TEXTURE, SceneError, SceneSource, ViewerMesh, ViewerScene
 
 if TYPE_CHECKING:
-    from rigsim.mesh import Mesh
+    from rigsim.geometry.mesh import Mesh
     from rigsim.subject import Subject
 
 PRESET = "III"
@@ -42,7 +42,7 @@ def scene(
     ------
     SceneError
         For a size out of range.
-    rigsim.subject.SubjectError, rigsim.mesh.MeshError, skinrig.blend_shapes.BlendShapeError
+    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.BlendShapeError
         For a preset, seed or mesh that cannot be used.
     """
     check_size(size)
@@ -84,7 +84,7 @@ def load_mesh(path: Path) -> Mesh:
         .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.load`. The face
         looks towards +z, and its foremost vertex is the tip of the nose.
     """
-    from rigsim.mesh import build_mesh, centered
+    from rigsim.geometry.mesh import build_mesh, centered
     from skinrig import blend_shapes
 
     loaded = blend_shapes.load(path)

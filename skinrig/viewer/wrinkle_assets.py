@@ -70,8 +70,8 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     """
     from reconstruction.wrinkles.fit import fit
     from reconstruction.wrinkles.zones import amplitudes, fit_zones
-    from rigsim.expressions import EXPRESSIONS
     from rigsim.subject import make_subject
+    from rigsim.subject.expressions import EXPRESSIONS
 
     rest = subject if subject.rest is None else subject.rest
     if rest.size != size:

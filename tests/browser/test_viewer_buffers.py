@@ -104,8 +104,8 @@ def test_the_page_colors_skin_as_the_table_does(viewer):
 
 
 def test_the_page_moves_vertices_and_normals_as_the_simulation_does(viewer, scene):
-    from rigsim.expressions import moved
-    from rigsim.mesh import build_mesh
+    from rigsim.geometry.mesh import build_mesh
+    from rigsim.subject.expressions import moved
 
     weights = {"anger": 0.8, "happiness": 0.5}
     viewer.set(weights=weights)

@@ -19,7 +19,7 @@ from capture.devices.port import (
 )
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Controller
-from rigsim.serve import serve
+from rigsim.world.serve import serve
 
 # pops of a low power: the tube recovers in 12 ms, so that a second pop would not be refused
 POWER = 0.008

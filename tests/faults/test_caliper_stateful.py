@@ -22,8 +22,8 @@ from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes.caliper import CONTROL_S, CaliperUnit
 from rigsim.boxes.controller import Controller
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 SLOW = load_rig("gradient").cropped(16)
 RIG = dataclasses.replace(SLOW, caliper=dataclasses.replace(SLOW.caliper, speed_mm_per_s=8.0))

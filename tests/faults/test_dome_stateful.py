@@ -25,8 +25,8 @@ from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.dome import DomeUnit
 from rigsim.boxes.led_bank import LedBank
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 RIG = load_rig("dome").subset(views=["C00", "C05"]).resized(16)
 WEIGHTS = eye_light(RIG)

@@ -24,8 +24,8 @@ from rigsim.boxes.controller import Controller
 from rigsim.boxes.probe import ProbeUnit
 from rigsim.boxes.source_shutter import SourceShutter
 from rigsim.boxes.suction_pump import SuctionPump
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 SHIPPED = load_rig("probe")
 REST_S, MOST_S = 1.0, 3.0

@@ -8,9 +8,9 @@ import pytest
 from capture.devices.flash import FlashBox
 from capture.devices.port import LinkLost, Port, PortTimeout, WrongDevice
 from capture.rig import load_rig
-from rigsim.faults import CATALOGUE, Faults
-from rigsim.serve import serve
 from rigsim.world import World
+from rigsim.world.faults import CATALOGUE, Faults
+from rigsim.world.serve import serve
 
 RIG = load_rig("flash").resized(16)
 NAMES = (f"faults-{number}" for number in itertools.count())

@@ -11,7 +11,7 @@ import pytest
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.serve import serve
+from rigsim.world.serve import serve
 from skinrig.cli import main
 
 LEASE_S = 0.3

@@ -27,8 +27,8 @@ from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.flash import FlashUnit
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 RIG = load_rig("flash").resized(16)
 NAMES = (f"stateful-{number}" for number in itertools.count())

@@ -18,9 +18,9 @@ from capture.devices.flash import FlashBox
 from capture.devices.port import Port
 from capture.devices.wire import Code, Reply, Request
 from capture.rig import load_rig
-from rigsim.faults import Faults
-from rigsim.serve import serve
 from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.serve import serve
 
 NAMES = (f"protocol-{number}" for number in itertools.count())
 

@@ -10,9 +10,9 @@ from capture.devices import wire
 from capture.devices.wire import Code, Request
 from capture.rig import load_rig
 from rigsim.boxes.caliper import CONTROL_S, CaliperUnit
-from rigsim.faults import Faults
-from rigsim.taped_skin import TapedSkin, TapeMechanics
 from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.taped_skin import TapedSkin, TapeMechanics
 
 RIG = load_rig("gradient").cropped(16)
 SKIN = TapeMechanics(

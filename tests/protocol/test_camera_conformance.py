@@ -27,9 +27,9 @@ from capture.devices.cameras import camera_wire
 from capture.devices.cameras.remote_camera import RemoteCamera
 from capture.devices.port import LinkLost
 from capture.rig import load_rig
-from rigsim.faults import Faults
-from rigsim.serve import serve
 from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.serve import serve
 
 WANT = Exposure(0.008, 100)
 LIT, DARK = 10_512, 512

@@ -14,8 +14,8 @@ from capture.devices.port import Port
 from capture.plan.multiplexed import course_plan, multiplexed_plan, reorder
 from capture.rig import load_rig
 from capture.session import Session, Subject
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 RIG = load_rig("flash").resized(32)
 

@@ -8,8 +8,8 @@ import serial
 
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port
-from rigsim.serve import ServeError, serve
 from rigsim.world import World
+from rigsim.world.serve import ServeError, serve
 
 IDN = "RIGSIM,FLASH2,FL-0001,1.0"
 SCRIPT = """

@@ -10,7 +10,7 @@ from capture.devices.caliper import CaliperBox
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port, PortBusy, WrongDevice
 from capture.rig import load_rig
-from rigsim.serve import ServeError, serve
+from rigsim.world.serve import ServeError, serve
 from skinrig.addresses import addresses, require_addresses
 from skinrig.errors import UsageError
 

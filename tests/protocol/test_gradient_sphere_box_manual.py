@@ -12,8 +12,8 @@ from capture.devices.wire import Code, Request
 from capture.plan.steps import PATTERNS
 from capture.rig import load_rig
 from rigsim.boxes.pattern_table import PatternRow
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 RIG = load_rig("gradient").cropped(16)
 LEDS = len(RIG.lights)

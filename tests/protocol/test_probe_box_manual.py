@@ -10,8 +10,8 @@ from capture.devices.wire import Code, Request
 from capture.rig import load_rig
 from rigsim.boxes.probe import SourceLight
 from rigsim.boxes.suction_pump import CONTROL_S, REACH_S
-from rigsim.faults import Faults
 from rigsim.world import World
+from rigsim.world.faults import Faults
 
 RIG = load_rig("probe")
 PROBE = RIG.probe

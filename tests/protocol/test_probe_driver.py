@@ -15,9 +15,9 @@ from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes import source_shutter
 from rigsim.boxes.probe import ProbeUnit
-from rigsim.faults import Faults
-from rigsim.serve import serve
 from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.serve import serve
 
 SHIPPED = load_rig("probe")
 # a short rest, so that a suite in real time does not wait for it

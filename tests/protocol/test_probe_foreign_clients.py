@@ -8,7 +8,7 @@ import pytest
 from capture.devices.port import Port, PortBusy
 from capture.devices.probe import ProbeBox
 from capture.rig import load_rig
-from rigsim.serve import serve
+from rigsim.world.serve import serve
 from skinrig.addresses import require_addresses
 from skinrig.errors import UsageError
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
-from rigsim.atlas import unwrap
-from rigsim.mesh import build_mesh
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import build_mesh
+from rigsim.light.interreflection import SkinBounce
 from rigsim.render import Caster
-from rigsim.scenes import dome_reference
-from rigsim.scenes.dome import DomeScene
-from rigsim.scenes.dome_reference import MattScene
-from rigsim.skin_bounce import SkinBounce
+from rigsim.scenes.dome import reference as dome_reference
+from rigsim.scenes.dome.reference import MattScene
+from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 
 pytestmark = pytest.mark.render
@@ -111,7 +111,7 @@ def test_light_bleeds_into_shadow_redder_than_it_came(small, face):
 
 
 def test_the_plain_kernel_adds_the_same_light_from_inside(small, face):
-    from rigsim.variant import VariantChoice
+    from rigsim.render.variant import VariantChoice
 
     plain = VariantChoice("scalar_rgb", "asked for by the test", "")
     inside = {"interreflections": False, "subsurface": True}

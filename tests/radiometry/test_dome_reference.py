@@ -17,8 +17,8 @@ from scipy import stats
 
 from capture.rig import Rig, load_rig
 from rigsim.render import look_at
-from rigsim.scenes import dome_reference
-from rigsim.scenes.dome_reference import PlainScene
+from rigsim.scenes.dome import reference as dome_reference
+from rigsim.scenes.dome.reference import PlainScene
 
 pytestmark = [pytest.mark.render, pytest.mark.long]
 

@@ -14,9 +14,9 @@ SESSION = """
 import json, resource, sys, time
 from dataclasses import dataclass
 from capture.rig import load_rig
-from rigsim.head_motion import head_motion
-from rigsim.scenes.dome import DomeScene
-from rigsim.subject import make_subject
+from rigsim.subject.head_motion import head_motion
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.subject.person import make_subject
 
 @dataclass(frozen=True)
 class Pulse:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim.atlas import unwrap
-from rigsim.mesh import build_mesh
-from rigsim.patterned_tissue import patterned_reflectance
-from rigsim.scenes.skin_glow import SIGMAS_MM, spread_pattern
-from rigsim.skin_table import SkinTable
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import build_mesh
+from rigsim.light.subsurface_radiance import SIGMAS_MM, spread_pattern
+from rigsim.tissue.patterned_tissue import patterned_reflectance
+from rigsim.tissue.skin_table import SkinTable
 
 FALSE_ALARM = 1e-4  # per test
 

@@ -8,7 +8,7 @@ import pytest
 
 from rigsim import shading
 from rigsim.render import load
-from rigsim.variant import choose_variant
+from rigsim.render.variant import choose_variant
 
 pytestmark = pytest.mark.render
 

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from rigsim.render import Caster
-from rigsim.scenes import polarizer_reference as reference
-from rigsim.variant import choose_variant
+from rigsim.render.variant import choose_variant
+from rigsim.scenes.flash import polarizer_reference as reference
 
 pytestmark = pytest.mark.render
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigsim import shading
-from rigsim.furrow_light import hidden_share
-from rigsim.scenes.gradient_reference import NEUTRAL, picture, plain_scene, plain_skin, rendered
-from rigsim.skin_layers import ETA
+from rigsim.light.relief_interreflection import hidden_share
+from rigsim.scenes.gradient.reference import NEUTRAL, picture, plain_scene, plain_skin, rendered
+from rigsim.tissue.skin_layers import ETA
 
 pytestmark = pytest.mark.render
 

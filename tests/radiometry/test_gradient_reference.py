@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rigsim.scenes.gradient_reference import (
+from rigsim.as_built.sphere import PATTERN_WEIGHTS
+from rigsim.scenes.gradient.reference import (
     judge,
     picture,
     plain_scene,
@@ -11,7 +12,6 @@ from rigsim.scenes.gradient_reference import (
     rendered,
     traced,
 )
-from rigsim.sphere_build import PATTERN_WEIGHTS
 
 pytestmark = pytest.mark.render
 

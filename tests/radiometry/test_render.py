@@ -7,8 +7,8 @@ import pytest
 
 from capture.rig import View, load_rig
 from rigsim import render
-from rigsim.mesh import Mesh, MeshError, build_mesh
-from rigsim.variant import VariantChoice, choose_variant
+from rigsim.geometry.mesh import Mesh, MeshError, build_mesh
+from rigsim.render.variant import VariantChoice, choose_variant
 
 pytestmark = pytest.mark.render
 

@@ -6,7 +6,7 @@ import pytest
 from model.brdf import recipe as brdf_recipe
 from model.brdf import rgl
 from rigsim import render
-from rigsim.variant import choose_variant
+from rigsim.render.variant import choose_variant
 
 pytestmark = pytest.mark.render
 

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 from scipy.special import roots_legendre
 
-from rigsim.tissue_mc import Layer, LayerStack, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
 BATCHES = 40
 

@@ -14,9 +14,9 @@ import pytest
 from scipy import stats
 from scipy.special import roots_legendre
 
-from rigsim import photon_lanes
-from rigsim.fibre_profile import fibre_profile
-from rigsim.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.fiber.profile import fibre_profile
+from rigsim.tissue import photon_lanes
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
 
 BATCHES = 40
 NEEDS_LANES = pytest.mark.skipif(

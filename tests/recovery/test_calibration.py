@@ -23,9 +23,10 @@ from capture.plan import FLAT_POWERS, MALUS_ANGLES_DEG
 from capture.rig import load_rig
 from model import spectra
 from reconstruction.polarization import PolarizerAxes, separate
-from rigsim import shading, targets
+from rigsim import shading
 from rigsim.sensor import Sensor, expose, sensor_of
-from rigsim.skin_table import SkinTable
+from rigsim.targets import flat as targets
+from rigsim.tissue.skin_table import SkinTable
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 Z, RIGHT, UP = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])
@@ -393,7 +394,7 @@ def test_ignoring_exit_polarization_fails_the_bound_that_the_correction_meets():
 @pytest.mark.parametrize("kind", ["sensor", "polarization", "color"])
 def test_targets_captured_by_the_whole_rig_calibrate_to_the_truth(kind, tmp_path):
     """Through boxes, camera, session and disk at 384 pixels: the truth within 5 stated errors."""
-    from rigsim.films import films_of
+    from rigsim.as_built.polarizers import films_of
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.simulating.simulation import simulate_session
 

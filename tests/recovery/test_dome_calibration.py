@@ -1,6 +1,6 @@
 """The dome's truth is found again by calibration from simulated targets, within stated errors.
 
-The frames are made by `rigsim.scenes.dome_targets`: its own rays, its own texture, sensor noise and
+The frames are made by `rigsim.scenes.dome.targets`: its own rays, its own texture, sensor noise and
 color filters. Estimators see raw frames only.
 """
 
@@ -19,8 +19,8 @@ from capture.calibration.lights.white_plate import PlateWindow, WhitePlate
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import load_rig
-from rigsim.dome_build import Tolerances, build, image_of
-from rigsim.scenes.dome_targets import target_scene
+from rigsim.as_built.dome import Tolerances, build, image_of
+from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of, vignetting_map
 
 pytestmark = pytest.mark.long

@@ -170,7 +170,7 @@ def test_cameras_as_drawn_miss_what_calibrated_ones_keep(dome, judged):
 def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ignored(
     dome, monkeypatch
 ):
-    from rigsim import head_motion
+    from rigsim.subject import head_motion
 
     # far enough to show at this size of a pixel
     far = head_motion.head_motion(0, drift_mm=3.0, drift_deg=1.0)
@@ -201,7 +201,7 @@ def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ig
 @pytest.fixture(scope="module")
 def faulty(dome):
     """The same dome after a repair: one LED dead, two cables swapped, one camera moved."""
-    from rigsim import dome_build
+    from rigsim.as_built import dome as dome_build
 
     rig = Session.open(dome / "session-face").rig
     names = [light.name for light in rig.lights]

@@ -1,6 +1,6 @@
 """The gradient sphere's truth is found again from simulated photographs of the glass ball.
 
-`rigsim.scenes.glass_ball` makes them: rays from the whole pupil, diffraction, sensor noise, LEDs
+`rigsim.targets.glass_ball` makes them: rays from the whole pupil, diffraction, sensor noise, LEDs
 off their places, of different brightness, their films turned. The estimator sees raw frames only.
 """
 
@@ -16,12 +16,12 @@ from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from rigsim import shading
+from rigsim.as_built.polarizers import Films
+from rigsim.as_built.sphere import build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.films import Films
-from rigsim.scenes.glass_ball import ball_center_mm
-from rigsim.scenes.gradient import GradientScene
+from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.sensor import vignetting_map
-from rigsim.sphere_build import build_sphere
+from rigsim.targets.glass_ball import ball_center_mm
 
 pytestmark = pytest.mark.long
 

@@ -14,10 +14,10 @@ from scipy.ndimage import gaussian_filter
 from capture.rig import load_rig
 from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
-from rigsim.microrelief import make_micro_skin
-from rigsim.scenes.gradient import GradientScene
-from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
-from rigsim.taped_skin import GripState
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.world.taped_skin import GripState
 
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
 EXPOSURE_S = 0.03

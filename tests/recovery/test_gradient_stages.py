@@ -145,8 +145,8 @@ def test_documents_are_strict_json(made):
 
 def test_a_kernel_halves_the_distance_of_the_true_histograms_at_every_step():
     """On 7 mm of true relief, without camera: eq. (7) at the caliper's steps."""
-    from rigsim.microrelief import make_micro_skin
-    from rigsim.skin_stretch import deform, size_for
+    from rigsim.skin_patch.microrelief import make_micro_skin
+    from rigsim.skin_patch.stretch import deform, size_for
 
     side, pixel_um = 880, 8.0
     skin = make_micro_skin("cheek", seed=5, size_mm=size_for(side * pixel_um / 1e3, 0.8))

@@ -17,8 +17,8 @@ from capture.rig import load_rig
 from model import store
 from model.skin_reflectance import assemble
 from reconstruction.pipeline import recipes as pipeline
-from rigsim import dome_build
-from rigsim.led_light import lobe_exponent, white_intensity
+from rigsim.as_built import dome as dome_build
+from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
 from skinrig.rendering import evaluation
 from skinrig.rendering.photograph_errors import LIMIT

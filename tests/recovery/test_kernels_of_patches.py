@@ -8,8 +8,8 @@ from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
 from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, grid_of
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.normal_integration.height_filters import high_pass
-from rigsim.microrelief import make_micro_skin
-from rigsim.skin_stretch import deform
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.stretch import deform
 
 SITES = ("forehead", "cheek", "chin")
 PIXEL_UM, SIDE, PART = 6.0, 400, 128

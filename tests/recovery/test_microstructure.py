@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from reconstruction import normal_histogram
-from rigsim.microrelief import make_micro_skin
-from rigsim.skin_stretch import deform
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.stretch import deform
 from skinrig.benchmarks.microstructure import (
     TEXEL_UM,
     fitted_table,

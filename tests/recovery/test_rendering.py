@@ -7,7 +7,7 @@ import pytest
 
 from capture.calibration.geometry import CameraPose
 from capture.rig import load_rig
-from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.render import render

@@ -10,9 +10,9 @@ from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.scan.mesh import FACE_BOX_MM, load_ply
 from reconstruction.scan.registration import NormalEvidence, RegistrationError, align, register
 from reconstruction.scan.repair import crop, repair
-from rigsim.head import build_head
 from rigsim.render import Caster, g_buffer
-from rigsim.scanner import Scanner, scan_face
+from rigsim.scanner.pods import Scanner, scan_face
+from rigsim.subject.head import build_head
 
 RIG = load_rig("dome").resized(130)
 CAMERAS = [CameraPose.nominal(view) for view in RIG.views]

@@ -14,7 +14,7 @@ import pytest
 from model import dipole
 from model.dipole.gather import exitance
 from model.fresnel import normal_reflectance
-from rigsim.tissue_mc import Layer, LayerStack, escape_paths
+from rigsim.tissue.tissue_mc import Layer, LayerStack, escape_paths
 
 ETA = 1.4
 G = 0.8

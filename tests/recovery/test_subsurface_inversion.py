@@ -11,8 +11,8 @@ import pytest
 
 from model.dipole import effective_transport
 from reconstruction import subsurface
-from rigsim.fibre_profile import fibre_profile
-from rigsim.tissue_mc import Layer, LayerStack, transport
+from rigsim.fiber.profile import fibre_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 FIBRE_ERROR, COMMON_ERROR, FLOOR = 0.012, 0.01, 1e-8

@@ -8,7 +8,7 @@ import pytest
 from model.brdf import tables as brdf_tables
 from model.traits import TraitSpace
 from reconstruction import brdf_basis
-from rigsim.population import shifted, table_1
+from rigsim.population.population import shifted, table_1
 from skinrig.traits import truth as trait_truth
 
 PEOPLE = [person for person in table_1() if not person.applied]

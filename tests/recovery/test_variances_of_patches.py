@@ -5,8 +5,8 @@ import pytest
 
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.normal_integration.height_filters import high_pass
-from rigsim.microrelief import make_micro_skin
-from rigsim.skin_stretch import deform
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.stretch import deform
 
 SITES = ("forehead", "cheek", "chin")
 PIXEL_UM, SIDE, PART = 6.0, 448, 128

@@ -249,7 +249,7 @@ def test_the_readme_names_commands_that_exist(command):
 
 
 def test_a_simulated_world_is_captured_by_the_urls_of_its_box_and_camera(tmp_path, monkeypatch):
-    monkeypatch.setattr("rigsim.world._BENCH", {})
+    monkeypatch.setattr("rigsim.world.world._BENCH", {})
     out = tmp_path / "session"
     where = ["--port", "flash=sim://flash?seed=1&clock=virtual", "--camera", "cam=sim://flash/cam"]
     assert main(["capture", "flash", *where, "--target", "dark", "--out", str(out)]) == 0

@@ -39,9 +39,9 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
     good = "(Array(float64, 2, 'C', False, aligned=True),)"
     for row in [
         ("rigsim.no_such", "f", good),
-        ("rigsim.atlas", "no_such", good),
-        ("rigsim.atlas", "sample", good),  # no kernel
-        ("rigsim.head", "_distance", text),
+        ("rigsim.geometry.atlas", "no_such", good),
+        ("rigsim.geometry.atlas", "sample", good),  # no kernel
+        ("rigsim.subject.head", "_distance", text),
         (
             "model.photon_table.kernels",
             "evaluate",
@@ -52,8 +52,8 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
             "fit_points",
             "unicode_type",
         ),  # makes no such one
-        ("rigsim.head", "_distance", "(Array(float64"),
-        ("rigsim.head", "_distance", "__import__('os')"),
+        ("rigsim.subject.head", "_distance", "(Array(float64"),
+        ("rigsim.subject.head", "_distance", "__import__('os')"),
     ]:
         assert tool.compile_module([row]) == 1
 
@@ -61,7 +61,7 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
 @pytest.mark.parametrize(
     ("module", "function"),
     [
-        ("rigsim.atlas", "_rasterize"),
+        ("rigsim.geometry.atlas", "_rasterize"),
         ("model.photon_table.kernels", "evaluate"),  # compiled as it is imported
         ("reconstruction.photometric_stereo.kernels", "fit_points"),  # made by a cached function
     ],
@@ -75,7 +75,8 @@ def test_a_listed_kernel_compiles_for_its_types(module, function, tool):
 def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
     """A kernel's function may stand under another name, or be compiled by a function's call."""
     from reconstruction.photometric_stereo import kernels as photometric_kernels
-    from rigsim import atlas, skin_table
+    from rigsim.geometry import atlas
+    from rigsim.tissue import skin_table
 
     kinds = (tool._NAMES["float32"], tool._NAMES["int64"])
     assert tool._named(atlas._rasterize.py_func, kinds) == ("_rasterize", "(float32, int64)")

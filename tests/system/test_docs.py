@@ -139,8 +139,8 @@ def test_the_manual_lists_every_command_of_the_domes_box():
 )
 def test_the_manual_lists_every_command_of_a_later_rigs_boxes(box_name, heading):
     from capture.rig import load_rig
-    from rigsim.rig_boxes import RIG_OF_BOX
     from rigsim.world import World
+    from rigsim.world.rig_boxes import RIG_OF_BOX
 
     dome = World(load_rig("dome")).box("dome").device.commands()
     shared = dome if box_name == "gradient_sphere" else {}
@@ -166,7 +166,7 @@ def test_the_manual_lists_every_code():
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_the_shell_example_fires_a_served_box():
     from capture.rig import load_rig
-    from rigsim.serve import serve
+    from rigsim.world.serve import serve
 
     (script,) = blocks(WIRE, "bash")
     with serve(load_rig("flash").resized(16), seed=1) as served:

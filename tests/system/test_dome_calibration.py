@@ -8,8 +8,8 @@ import pytest
 from capture.calibration import geometry, store
 from capture.calibration.lights import LightTable
 from capture.session import Session
-from rigsim.dome_build import build, image_of
-from rigsim.led_light import lobe_exponent, white_intensity
+from rigsim.as_built.dome import build, image_of
+from rigsim.light.led_light import lobe_exponent, white_intensity
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
 

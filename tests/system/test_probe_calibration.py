@@ -7,7 +7,7 @@ import pytest
 
 from capture.calibration.fiber.gains import FibreCalibration
 from capture.session import Session
-from rigsim.probe_build import build_probe
+from rigsim.as_built.probe import build_probe
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
 

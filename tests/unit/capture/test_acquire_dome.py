@@ -16,8 +16,8 @@ from capture.plan.dome import dome_calibration_plan, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
-from rigsim.faults import Faults
-from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.world import World
 
 DOME = load_rig("dome")
 RIG = DOME.subset(lights=[light.name for light in DOME.lights[::12]], views=["C00", "C05"]).resized(

@@ -19,8 +19,8 @@ from capture.plan.gradient import gradient_calibration_plan, gradient_plan, stat
 from capture.plan.steps import PATTERNS
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
-from rigsim.faults import Faults
-from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.world import World
 
 RIG = load_rig("gradient").cropped(16)
 NAMES = (f"acquire-gradient-{number}" for number in itertools.count())

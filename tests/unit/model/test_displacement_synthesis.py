@@ -10,7 +10,7 @@ from model.displacement_synthesis import growth as synthesis
 from model.displacement_synthesis import kernels
 from model.displacement_synthesis.sources import filled
 from reconstruction import normal_histogram
-from rigsim.microrelief import make_micro_skin
+from rigsim.skin_patch.microrelief import make_micro_skin
 
 PIXEL_UM = 20.0
 SIDE = 640

@@ -11,8 +11,8 @@ from model.photon_table import kernels
 from model.photon_table import medium as photon_medium
 from model.photon_table.disc_distances import distance_rule
 from model.tissue_optics import adding_doubling
-from rigsim.fibre_profile import fibre_profile
-from rigsim.tissue_mc import Layer, LayerStack, transport
+from rigsim.fiber.profile import fibre_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
 RADII = np.arange(0.3, 7.2, 0.25)
 LOG_RADII = np.linspace(np.log(1e-5), np.log(1e4), 4000)

@@ -7,7 +7,7 @@ from scipy.special import ellipe
 from model import microstructure
 from model.microstructure import profile_length
 from model.microstructure.profile_length import ProfileError
-from rigsim.microrelief import make_micro_skin
+from rigsim.skin_patch.microrelief import make_micro_skin
 
 SPACING_UM = 5.0
 

@@ -231,8 +231,8 @@ def test_refinement_says_what_it_lacks():
 
 
 def test_a_flawed_scan_of_a_head_becomes_one_manifold_surface_near_the_truth():
-    from rigsim.head import build_head
-    from rigsim.scanner import Scanner, scan_face
+    from rigsim.scanner.pods import Scanner, scan_face
+    from rigsim.subject.head import build_head
 
     head = build_head(np.random.default_rng(5))
     settings = Scanner(triangles=8_000, resolution_mm=2.0)

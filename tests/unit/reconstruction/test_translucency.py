@@ -276,7 +276,7 @@ def test_shapes_and_ranges_that_do_not_fit_are_refused():
 
 
 def test_default_places_lie_on_the_simulated_heads():
-    from rigsim.head import LANDMARKS_MM, build_head
+    from rigsim.subject.head import LANDMARKS_MM, build_head
 
     head = build_head(np.random.default_rng(3))
     vertices = np.asarray(head.vertices_mm, np.float64)

@@ -10,9 +10,9 @@ from math import inf, pi
 import numpy as np
 import pytest
 
-from rigsim.anisotropic_tissue import AnisotropicTissue, anisotropic_profile
-from rigsim.fibre_profile import Fibres, fibre_profile
-from rigsim.tissue_mc import Layer, LayerStack, TransportError
+from rigsim.fiber.anisotropic_tissue import AnisotropicTissue, anisotropic_profile
+from rigsim.fiber.profile import Fibres, fibre_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
 FIBRES = Fibres((0.3, 1.3, 3.3))
 ALONG = AnisotropicTissue(0.05, 7.5, strength=-1.2)

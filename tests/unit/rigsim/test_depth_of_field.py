@@ -10,15 +10,22 @@ import pytest
 from scipy.special import j1
 
 from capture.rig import Rig, load_rig
-from rigsim.depth_of_field import LensPicture, LensSpread, before_focus, lens_spread, spread_of
-from rigsim.lens_blur import BlurError, lens_of
-from rigsim.render import Caster, GBuffer, camera_rays, g_buffer, trace
-from rigsim.scene_needs import Noise
-from rigsim.scenes import flash_needs
-from rigsim.scenes.flash import FlashScene
-from rigsim.scenes.olat import pixel_order
-from rigsim.subject import make_subject
-from rigsim.variant import VariantChoice
+from rigsim.light.olat import pixel_order
+from rigsim.needs import flash as flash_needs
+from rigsim.needs.effects import Noise
+from rigsim.render.caster import Caster
+from rigsim.render.depth_of_field import (
+    LensPicture,
+    LensSpread,
+    before_focus,
+    lens_spread,
+    spread_of,
+)
+from rigsim.render.lens_blur import BlurError, lens_of
+from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject.person import make_subject
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 K = 2

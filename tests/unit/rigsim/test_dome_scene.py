@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
-from rigsim.dome_build import BuiltDome, Tolerances, bend, build
-from rigsim.head_motion import MotionError, head_motion
-from rigsim.led_light import METER_RATE_PER_S
-from rigsim.scenes import olat
-from rigsim.scenes.dome import DomeScene
+from rigsim.as_built.dome import BuiltDome, Tolerances, bend, build
+from rigsim.light import olat
+from rigsim.light.led_light import METER_RATE_PER_S
+from rigsim.render.variant import VariantChoice, choose_variant
+from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.exposing import SceneError
-from rigsim.subject import make_subject
-from rigsim.targets import make_target
-from rigsim.variant import VariantChoice, choose_variant
+from rigsim.subject.head_motion import MotionError, head_motion
+from rigsim.subject.person import make_subject
+from rigsim.targets.flat import make_target
 
 pytestmark = pytest.mark.render
 

@@ -5,17 +5,11 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.dome_build import Tolerances, bend, build, image_of, pixel_corner_rays, unbend
-from rigsim.led_light import white_intensity
-from rigsim.scenes import mirror_ball, printed_plate
-from rigsim.scenes.dome_targets import (
-    PLACES,
-    TargetError,
-    TargetScene,
-    plate_normals,
-    target_scene,
-)
+from rigsim.as_built.dome import Tolerances, bend, build, image_of, pixel_corner_rays, unbend
+from rigsim.light.led_light import white_intensity
+from rigsim.scenes.dome.targets import PLACES, TargetError, TargetScene, plate_normals, target_scene
 from rigsim.sensor import vignetting_map
+from rigsim.targets import mirror_ball, printed_plate
 
 RIG = load_rig("dome").subset(views=["C07", "C10"]).resized(324)
 FRONT = int(np.argmax([light.position_mm[2] for light in RIG.lights]))

@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rigsim import face_regions, relief
-from rigsim.atlas import Atlas, unwrap
-from rigsim.expression_wrinkles import (
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.subject import face_regions, relief
+from rigsim.subject.expression_wrinkles import (
     FURROW,
     WrinkleLines,
     Wrinkles,
@@ -18,9 +19,8 @@ from rigsim.expression_wrinkles import (
     raise_wrinkles,
     wrinkle_lines,
 )
-from rigsim.mesh import Mesh, build_mesh
-from rigsim.subject import Subject, make_subject
-from rigsim.wrinkle_zones import ZONES
+from rigsim.subject.person import Subject, make_subject
+from rigsim.subject.wrinkle_zones import ZONES
 
 SIZE = 320
 PLATE = 256

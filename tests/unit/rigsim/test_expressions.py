@@ -5,11 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigsim import expressions, face_regions
-from rigsim.expressions import EXPRESSIONS, ExpressionError, displacement_mm, principal_stretches
-from rigsim.head import LANDMARKS_MM, build_head
-from rigsim.mesh import Mesh, MeshError, build_mesh, centered, load_mesh
-from rigsim.perfusion import STATES
+from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, centered, load_mesh
+from rigsim.subject import expressions, face_regions
+from rigsim.subject.expressions import (
+    EXPRESSIONS,
+    ExpressionError,
+    displacement_mm,
+    principal_stretches,
+)
+from rigsim.subject.head import LANDMARKS_MM, build_head
+from rigsim.subject.perfusion import STATES
 
 SCANNED_HEAD = Path(__file__).parents[4] / "shared" / "data" / "ict_face.npz"
 

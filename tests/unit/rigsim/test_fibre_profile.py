@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim.fibre_profile import Fibres, SpectralStack, fibre_paths, fibre_profile
-from rigsim.fibre_rings import KERNEL_NODES, ring_kernels
-from rigsim.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.fiber.profile import Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.fiber.rings import KERNEL_NODES, ring_kernels
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
 
 RED = LayerStack((Layer(inf, 0.1, 7.5, 0.8, 1.4),))
 LAYERED = LayerStack(

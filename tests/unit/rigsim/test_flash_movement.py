@@ -5,11 +5,11 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig, load_rig
-from rigsim import landmarks
-from rigsim.scenes.dome import DomeScene
-from rigsim.scenes.flash import FlashScene
-from rigsim.subject import Subject, make_subject
-from rigsim.variant import VariantChoice
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject import landmarks
+from rigsim.subject.person import Subject, make_subject
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.flash import truth_of
 

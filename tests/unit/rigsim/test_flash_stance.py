@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
-from rigsim import landmarks
-from rigsim.depth_of_field import facing_depths
-from rigsim.films import IDEAL
-from rigsim.scenes.flash import FlashScene
-from rigsim.subject import Subject, SubjectError, make_subject
-from rigsim.variant import VariantChoice
+from rigsim.as_built.polarizers import IDEAL
+from rigsim.render.depth_of_field import facing_depths
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject import landmarks
+from rigsim.subject.person import Subject, SubjectError, make_subject
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192

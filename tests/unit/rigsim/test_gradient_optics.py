@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.lens_blur import BlurError, Lens, blur, lens_of
-from rigsim.lobe_moments import MomentError, Surface, build_table, direct_moments, ripple
-from rigsim.patch_motion import PatchMotion, shifted
-from rigsim.scenes.glass_ball import ball_center_mm
-from rigsim.scenes.gradient import GradientScene
-from rigsim.scenes.gradient_resolution import slope_transfer
-from rigsim.self_shadow import HorizonError, horizon_tangent
-from rigsim.sphere_build import SphereError, as_drawn, build_sphere
+from rigsim.as_built.sphere import SphereError, as_drawn, build_sphere
+from rigsim.light.lobe_moments import MomentError, Surface, build_table, direct_moments, ripple
+from rigsim.light.self_shadow import HorizonError, horizon_tangent
+from rigsim.render.lens_blur import BlurError, Lens, blur, lens_of
+from rigsim.scenes.gradient.resolution import slope_transfer
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.motion import PatchMotion, shifted
+from rigsim.targets.glass_ball import ball_center_mm
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def test_the_ball_shows_leds_where_the_law_of_reflection_puts_them(rig):
     """Spots' middles of light against half-vectors, from the middle of the pupil; 0.3 px."""
     from scipy.ndimage import center_of_mass, label
 
-    from rigsim.scenes.mirror_ball import reflection_point
+    from rigsim.targets.mirror_ball import reflection_point
 
     small = rig.cropped(512)
     scene = GradientScene(small, "ball", seed=2)

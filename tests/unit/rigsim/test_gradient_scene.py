@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
+from rigsim.as_built.polarizers import IDEAL
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.films import IDEAL
-from rigsim.microrelief import make_micro_skin
-from rigsim.patch_motion import PatchMotion
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.gradient import FLAT_REFLECTANCE, METER_RATE_PER_S, GradientScene
-from rigsim.scenes.gradient_resolution import Waves, wavy_scene
+from rigsim.scenes.gradient.resolution import Waves, wavy_scene
+from rigsim.scenes.gradient.scene import FLAT_REFLECTANCE, METER_RATE_PER_S, GradientScene
 from rigsim.sensor import fixed_pattern
-from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
-from rigsim.taped_skin import GripState
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.motion import PatchMotion
+from rigsim.world.taped_skin import GripState
 
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
 SIDE = 64

@@ -5,12 +5,12 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig, load_rig
-from rigsim import face_regions, landmarks
-from rigsim.expressions import displacement_mm
-from rigsim.render import Caster
-from rigsim.scenes.flash import FlashScene
-from rigsim.subject import Subject, make_subject
-from rigsim.variant import VariantChoice
+from rigsim.render.caster import Caster
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject import face_regions, landmarks
+from rigsim.subject.expressions import displacement_mm
+from rigsim.subject.person import Subject, make_subject
 from skinrig.simulating.flash import landmarks_at_superpixels, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.

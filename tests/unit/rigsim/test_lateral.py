@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rigsim.atlas import Atlas, unwrap
-from rigsim.lateral import LateralError, line_spread_mm, spread_light
-from rigsim.mesh import build_mesh
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import build_mesh
+from rigsim.light.lateral import LateralError, line_spread_mm, spread_light
 
 SIZE = 256
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigsim.microrelief import SITES, MicroSkin, MicroSkinError, make_micro_skin
-from rigsim.polygon_net import polygon_net
+from rigsim.geometry.polygon_net import polygon_net
+from rigsim.skin_patch.microrelief import SITES, MicroSkin, MicroSkinError, make_micro_skin
 
 
 def slopes(skin: MicroSkin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigsim.perfusion import StateError
-from rigsim.perfusion_course import CourseError, EventCourse, PromptedCourse, with_blood
-from rigsim.scenes.flash_course import LEVELS, parabola_weights
-from rigsim.subject import make_subject
+from rigsim.scenes.flash.course import LEVELS, parabola_weights
+from rigsim.subject.perfusion import StateError
+from rigsim.subject.perfusion_course import CourseError, EventCourse, PromptedCourse, with_blood
+from rigsim.subject.person import make_subject
 
 
 def prompted(course, period_s=5.0, count=10):

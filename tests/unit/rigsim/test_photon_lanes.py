@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim import photon_lanes
-from rigsim.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.tissue import photon_lanes
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
 
 needs_lanes = pytest.mark.skipif(
     not photon_lanes.is_usable(), reason="Dr.Jit finds no LLVM 17 or newer here"

@@ -6,8 +6,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from rigsim import face_regions, population
-from rigsim.population import GROUPS, Member, PopulationError, shifted, table_1
+from rigsim.population import population
+from rigsim.population.population import GROUPS, Member, PopulationError, shifted, table_1
+from rigsim.subject import face_regions
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 PEOPLE = table_1()

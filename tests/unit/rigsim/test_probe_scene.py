@@ -10,18 +10,18 @@ import pytest
 
 from capture.rig import load_rig
 from model import spectra
-from rigsim.boxes.probe import SourceLight
-from rigsim.probe_build import (
+from rigsim.as_built.probe import (
     SPOT_RADIUS_PX,
     BuildError,
     ProbeTolerances,
     build_probe,
     unit_images,
 )
-from rigsim.probe_tissue import HomogeneousTissue
+from rigsim.boxes.probe import SourceLight
+from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene
-from rigsim.suction import HeadState
+from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene
+from rigsim.world.suction import HeadState
 
 RIG = load_rig("probe")
 VIEW = RIG.views[0]

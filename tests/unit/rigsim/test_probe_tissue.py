@@ -10,10 +10,9 @@ import pytest
 
 from capture.calibration.fiber.phantom import read_certificate
 from capture.rig import load_rig
-from rigsim import probe_tissue, skin_layers
-from rigsim.fibre_profile import fibre_profile
-from rigsim.probe_profile import Profiles, fibres_of
-from rigsim.probe_tissue import (
+from rigsim.fiber import probe_tissue
+from rigsim.fiber.probe_profile import Profiles, fibres_of
+from rigsim.fiber.probe_tissue import (
     PHANTOM,
     FibrousTissue,
     HomogeneousTissue,
@@ -23,7 +22,9 @@ from rigsim.probe_tissue import (
     parse_subject,
     phantom_certificate,
 )
-from rigsim.profile_smoothing import smooth_profile
+from rigsim.fiber.profile import fibre_profile
+from rigsim.fiber.profile_smoothing import smooth_profile
+from rigsim.tissue import skin_layers
 
 RIG = load_rig("probe")
 FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it

@@ -11,13 +11,13 @@ import pytest
 
 from capture.rig import load_rig
 from model import store
-from rigsim.fibre_profile import Fibres, fibre_profile
-from rigsim.homogeneous_fit import FAINTEST_PER_MM2, FitError, nearest_medium
-from rigsim.probe_tissue import PHANTOM, HomogeneousTissue
-from rigsim.probe_truth import Probing
-from rigsim.scenes.probe import ProbeScene
-from rigsim.tissue_mc import Layer, LayerStack
-from rigsim.white_fibre import WhiteFibre, WhiteFibreError
+from rigsim.fiber.homogeneous_fit import FAINTEST_PER_MM2, FitError, nearest_medium
+from rigsim.fiber.probe_tissue import PHANTOM, HomogeneousTissue
+from rigsim.fiber.profile import Fibres, fibre_profile
+from rigsim.fiber.white_fiber import WhiteFibre, WhiteFibreError
+from rigsim.scenes.probe.scene import ProbeScene
+from rigsim.scenes.probe.truth import Probing
+from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 RIG = load_rig("probe")
 FIBRES = Fibres(RIG.probe.radius_mm)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.relief_shadow import DIRECTIONS, SOFT_RAD, ReliefShadow
-from rigsim.scenes.dome import DomeScene
-from rigsim.scenes.flash import FlashScene
-from rigsim.scenes.flash_needs import WRINKLES
-from rigsim.subject import make_subject
-from rigsim.variant import VariantChoice, choose_variant
+from rigsim.light.relief_shadow import DIRECTIONS, SOFT_RAD, ReliefShadow
+from rigsim.needs.flash import WRINKLES
+from rigsim.render.variant import VariantChoice, choose_variant
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject.person import make_subject
 from skinrig.simulating.dome import small_dome
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")

@@ -8,11 +8,11 @@ import pytest
 import trimesh
 
 from reconstruction.scan.mesh import load_ply
-from rigsim.head import build_head
-from rigsim.mesh import MeshError, build_mesh
-from rigsim.render import Caster
-from rigsim.scanner import Scanner, scan_face, wrap_template
-from rigsim.subject import make_subject
+from rigsim.geometry.mesh import MeshError, build_mesh
+from rigsim.render.caster import Caster
+from rigsim.scanner.pods import Scanner, scan_face, wrap_template
+from rigsim.subject.head import build_head
+from rigsim.subject.person import make_subject
 
 HEAD = build_head(np.random.default_rng(5))
 CLEAN = {"flaws": False, "clothes": False}

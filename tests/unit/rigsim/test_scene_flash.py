@@ -9,13 +9,13 @@ import pytest
 
 from capture.calibration.color.chart import find_chart
 from capture.rig import Rig, load_rig
-from rigsim.films import IDEAL, FilmError, Films, films_of
+from rigsim.as_built.polarizers import IDEAL, FilmError, Films, films_of
+from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.flash import FLAT_LEVEL, METER_LEVEL, FlashScene
+from rigsim.scenes.flash.scene import FLAT_LEVEL, METER_LEVEL, FlashScene
 from rigsim.sensor import sensor_of
-from rigsim.subject import Subject, make_subject
-from rigsim.targets import make_target, patch_centers_mm
-from rigsim.variant import VariantChoice
+from rigsim.subject.person import Subject, make_subject
+from rigsim.targets.flat import make_target, patch_centers_mm
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim import effect_sizes
-from rigsim.bounce_color import STEPS, step_error
-from rigsim.furrow_light import hidden_share
-from rigsim.lateral import spread_light
-from rigsim.mesh import build_mesh
-from rigsim.probe_tissue import HomogeneousTissue, parse_subject
-from rigsim.render import Caster
-from rigsim.scene_needs import ENOUGH, Effect, NeedsError, Noise, SceneNeeds, decide
-from rigsim.scenes import flash_needs
-from rigsim.scenes.dome import DomeScene
-from rigsim.scenes.flash import FlashScene
-from rigsim.scenes.probe import ProbeScene
+from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_subject
+from rigsim.geometry.mesh import build_mesh
+from rigsim.light.interreflection_color import STEPS, step_error
+from rigsim.light.lateral import spread_light
+from rigsim.light.relief_interreflection import hidden_share
+from rigsim.needs import effect_sizes
+from rigsim.needs import flash as flash_needs
+from rigsim.needs.effects import ENOUGH, Effect, NeedsError, Noise, SceneNeeds, decide
+from rigsim.render.caster import Caster
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.sensor import expose, sensor_of
-from rigsim.subject import make_subject
-from rigsim.targets import make_target
+from rigsim.subject.person import make_subject
+from rigsim.targets.flat import make_target
 
 pytestmark = pytest.mark.render
 
@@ -64,7 +64,7 @@ def test_light_lost_at_an_edge_is_what_spreading_moves_across_it(texels):
     """Expected: the mean over a lit pixel beside a shadow; the edge and the pixel's sides run
     between texels. Tolerance: 5 %; texels of a quarter of the kernel's width lose 2 to 4 % less,
     those of half of it 6 %."""
-    from rigsim.atlas import unwrap
+    from rigsim.geometry.atlas import unwrap
 
     mesh = plate(SQUARE).mesh
     atlas = unwrap(mesh, 512)

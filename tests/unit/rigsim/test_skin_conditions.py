@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from rigsim import surface_brdf
-from rigsim.skin_conditions import (
+from rigsim.light import surface_brdf
+from rigsim.light.surface_brdf import Coating, SurfaceError
+from rigsim.population.conditions import (
     CONDITIONS,
     ConditionError,
     coated,
@@ -15,8 +16,7 @@ from rigsim.skin_conditions import (
     conditioned_subject,
     conditioned_surface,
 )
-from rigsim.subject import make_subject
-from rigsim.surface_brdf import Coating, SurfaceError
+from rigsim.subject.person import make_subject
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "LED-B3"
 UP = np.array([0.0, 0.0, 1.0])

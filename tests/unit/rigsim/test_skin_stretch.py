@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigsim.microrelief import SITES, MicroSkin, make_micro_skin
-from rigsim.skin_equilibrium import (
+from rigsim.skin_patch.equilibrium import (
     EquilibriumError,
     LayerProblem,
     find_equilibrium,
     surface_rise,
 )
-from rigsim.skin_stretch import (
+from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import (
     Compensation,
     StretchedSkin,
     StretchError,
@@ -21,7 +21,7 @@ from rigsim.skin_stretch import (
     size_for,
     stretches,
 )
-from rigsim.skin_stretch_kernels import bending, membrane
+from rigsim.skin_patch.stretch_kernels import bending, membrane
 
 Floats = NDArray[np.float64]
 

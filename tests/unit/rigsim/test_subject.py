@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim import face_regions, relief
-from rigsim.atlas import unwrap
-from rigsim.mesh import Mesh, MeshError, MeshFileError, build_mesh, load_mesh
-from rigsim.perfusion import STATES, StateError
-from rigsim.pigment import MELANIN_PRESETS
-from rigsim.subject import PRESETS, Subject, SubjectError, make_subject
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from rigsim.subject import face_regions, relief
+from rigsim.subject.perfusion import STATES, StateError
+from rigsim.subject.person import PRESETS, Subject, SubjectError, make_subject
+from rigsim.subject.pigment import MELANIN_PRESETS
 
 SIZE = 256
 

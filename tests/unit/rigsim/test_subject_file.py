@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from model.store import write_exr
-from rigsim import pigment, subject_file
-from rigsim.perfusion import STATES
-from rigsim.probe_tissue import SkinTissue, TissueError
-from rigsim.subject import make_subject
-from rigsim.subject_file import SubjectFileError, named, read, record
-from rigsim.subject_textures import texture
+from rigsim.fiber.probe_tissue import SkinTissue, TissueError
+from rigsim.population import files as subject_file
+from rigsim.population.files import named, read, record
+from rigsim.population.textures import SubjectFileError, texture
+from rigsim.subject import pigment
+from rigsim.subject.perfusion import STATES
+from rigsim.subject.person import make_subject
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from rigsim.suction import (
+from rigsim.world.suction import (
     OPEN_RIM_ML_PER_S_MBAR,
     CameraCooler,
     HeadState,

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from rigsim import shading, surface_brdf
-from rigsim.subject import make_subject
+from rigsim import shading
+from rigsim.light import surface_brdf
+from rigsim.subject.person import make_subject
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.taped_skin import TapedSkin, TapedSkinError, TapeMechanics, draw_mechanics
+from rigsim.world.taped_skin import TapedSkin, TapedSkinError, TapeMechanics, draw_mechanics
 
 CALIPER = load_rig("gradient").caliper
 PLAIN = TapeMechanics(

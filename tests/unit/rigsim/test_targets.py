@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigsim.targets import TARGETS, TargetError, make_target, patch_centers_mm
+from rigsim.targets.flat import TARGETS, TargetError, make_target, patch_centers_mm
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 

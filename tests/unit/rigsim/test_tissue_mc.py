@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim.tissue_mc import Layer, LayerStack, TransportError, escape_paths, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, escape_paths, transport
 
 RINGS_MM = (0.0, 0.05, 0.15, 0.4, inf)
 

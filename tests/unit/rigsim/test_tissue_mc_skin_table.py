@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 from scipy.optimize import least_squares
 
-from rigsim import skin_layers, skin_table
-from rigsim.lateral_kernels import GAUSSIAN_SIGMAS_MM, LateralKernels
-from rigsim.skin_table import SkinTable, SkinTableError
-from rigsim.tissue_mc import escape_paths, transport
+from rigsim.tissue import skin_layers, skin_table
+from rigsim.tissue.lateral_kernels import GAUSSIAN_SIGMAS_MM, LateralKernels
+from rigsim.tissue.skin_table import SkinTable, SkinTableError
+from rigsim.tissue.tissue_mc import escape_paths, transport
 
 # Wavelength (nm), C_m, C_hd, photons: fair to dark, bloodless to Soret peak, on and off the nodes.
 ENTRIES = (

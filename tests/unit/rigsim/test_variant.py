@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigsim import variant
+from rigsim.render import variant
 
 INSTALLED = variant.find_libraries({})
 

@@ -12,10 +12,10 @@ from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port
 from capture.rig import load_rig
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.faults import Faults
-from rigsim.rig_boxes import RIG_OF_BOX, SERIAL_NUMBERS
-from rigsim.taped_skin import GripState
-from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.rig_boxes import RIG_OF_BOX, SERIAL_NUMBERS
+from rigsim.world.taped_skin import GripState
+from rigsim.world.world import World
 
 RIG = load_rig("gradient").cropped(16)
 NAMES = (f"world-gradient-{number}" for number in itertools.count())

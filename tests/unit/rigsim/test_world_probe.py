@@ -11,9 +11,9 @@ from capture.devices.port import Port
 from capture.devices.probe import ProbeBox
 from capture.rig import load_rig
 from rigsim.boxes.probe import SourceLight
-from rigsim.faults import Faults
-from rigsim.suction import HeadState
-from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.suction import HeadState
+from rigsim.world.world import World
 
 RIG = load_rig("probe")
 NAMES = (f"world-probe-{number}" for number in itertools.count())

@@ -9,8 +9,8 @@ from capture.devices.port import PortBusy
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.faults import Faults
-from rigsim.world import World
+from rigsim.world.faults import Faults
+from rigsim.world.world import World
 from skinrig import acquisition, addresses
 from skinrig.cli import main
 from skinrig.errors import UsageError

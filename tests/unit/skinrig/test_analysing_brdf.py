@@ -11,7 +11,7 @@ from model import store
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction import brdf_basis, diffuse_albedo
-from rigsim import population
+from rigsim.population import population
 from skinrig.analysing import brdf as analysing_brdf
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf import AnalysisError

@@ -7,9 +7,9 @@ import pytest
 from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.scenes.dome import DomeScene
-from rigsim.scenes.flash import FlashScene
-from rigsim.scenes.gradient import GradientScene
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.gradient.scene import GradientScene
 from skinrig.simulating.leaving_out import SWITCHES
 from skinrig.simulating.simulation import SimulationError, simulate_session
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.displacement_synthesis.volume_noise import VolumeNoise
-from rigsim.microrelief import make_micro_skin
+from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig import microstructure_sphere as spheres
 from skinrig.microstructure_sphere import DEFORMATIONS, PLACES, Sphere, SphereError
 

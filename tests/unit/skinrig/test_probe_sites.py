@@ -7,7 +7,7 @@ import pytest
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.subsurface.translucency import SITE_UV, TranslucencyError
-from rigsim.head import build_head
+from rigsim.subject.head import build_head
 from skinrig import probe_sites
 from skinrig.probe_sites import ProbeSiteError
 

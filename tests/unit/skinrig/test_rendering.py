@@ -8,8 +8,8 @@ import pytest
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, transmitted
-from rigsim.atlas import spread, unwrap
-from rigsim.mesh import build_mesh
+from rigsim.geometry.atlas import spread, unwrap
+from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.geometry import GeometryError, own_mesh, parse_mesh, read_mesh
 from skinrig.rendering.render import Light, RenderingError, render

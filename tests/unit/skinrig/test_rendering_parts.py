@@ -6,7 +6,7 @@ import pytest
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance
-from rigsim.mesh import build_mesh
+from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, nearest_shares, reduced
 from skinrig.rendering.geometry import FittedSurface

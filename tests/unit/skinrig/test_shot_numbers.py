@@ -8,7 +8,7 @@ import pytest
 from capture.devices.camera import Exposure, Trigger, open_camera
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.serve import serve
+from rigsim.world.serve import serve
 from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.simulation import simulate_session
 
@@ -65,7 +65,7 @@ def test_a_resumed_session_holds_the_pixels_of_one_that_was_not_stopped(
 def test_no_two_shots_of_skin_in_a_caliper_that_is_taped_anew_share_their_noise(
     tmp_path, monkeypatch
 ):
-    from rigsim.world import World
+    from rigsim.world.world import World
 
     asked = {"width_px": 32, "angles": (0.0,), "steps": (-1, 1)}
     seed_of: dict[bytes, int] = {}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.brdf import tables as brdf_tables
-from rigsim.population import table_1
+from rigsim.population.population import table_1
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces
 

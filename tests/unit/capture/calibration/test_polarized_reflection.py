@@ -10,7 +10,7 @@ from capture.calibration.polarization.malus import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection, fresnel_amplitudes
 from capture.rig import load_rig
 from rigsim import shading
-from rigsim.films import absorbing_axis
+from rigsim.as_built.polarizers import absorbing_axis
 
 RIG = load_rig("gradient")
 VIEW = RIG.view("cam")

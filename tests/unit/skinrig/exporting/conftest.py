@@ -10,8 +10,8 @@ from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
-from rigsim.atlas import unwrap
-from rigsim.mesh import build_mesh
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import build_mesh
 from skinrig.exporting import obj
 from skinrig.exporting.tangents import FramedMesh
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rigsim.atlas import unwrap
-from rigsim.mesh import build_mesh
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import build_mesh
 from skinrig.exporting.tangents import FramedMesh, filled, from_tangent, to_tangent
 
 SIZE = 48

@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from rigsim.mesh import Mesh, MeshError
+from rigsim.geometry.mesh import Mesh, MeshError
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting import gltf, materialx, udim, usd
 from skinrig.exporting.material import Material

@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 
-from rigsim.subject import make_subject
+from rigsim.subject.person import make_subject
 from skinrig.viewer import deflating
 from skinrig.viewer.fine_skin import FineSkin
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigsim.mesh import build_mesh
+from rigsim.geometry.mesh import build_mesh
 from skinrig.viewer import hole_closing, patch_charts
 from skinrig.viewer.scene import Texture
 

@@ -9,8 +9,8 @@ from scipy.interpolate import griddata
 from model import store
 from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinMap
-from rigsim.landmarks import find
-from rigsim.subject import make_subject
+from rigsim.subject.landmarks import find
+from rigsim.subject.person import make_subject
 from skinrig import dynamic_appearance
 from skinrig.viewer import facial_color_assets, from_appearance, placed_color, procedural
 from skinrig.viewer.scene import SceneError, SceneSource

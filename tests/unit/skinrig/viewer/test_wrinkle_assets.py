@@ -94,7 +94,7 @@ def test_more_maps_or_zones_than_the_shader_holds_are_refused():
 @pytest.mark.long
 def test_wrinkles_of_a_simulated_person_explain_its_own_expressions():
     from model.wrinkles.partial_derivatives import encode
-    from rigsim.subject import make_subject
+    from rigsim.subject.person import make_subject
 
     person = make_subject("III", seed=0, size=256)
     model = wrinkle_assets.simulated_model(person, size=256)

@@ -1,0 +1,1 @@
+"""Actual rigs: nominal geometry plus tolerances."""

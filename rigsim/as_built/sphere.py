@@ -1,0 +1,221 @@
+"""A sphere of polarized LEDs as it was built: near the drawing, never on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Light, Rig
+from rigsim.as_built.polarizers import absorbing_axis
+from rigsim.shading import axis_in_plane
+
+FloatArray = NDArray[np.float64]
+
+MOMENTS: Final = ("1", "x", "y", "z")
+"""What each LED's light is weighted with; every lighting condition is a sum of these four."""
+
+PATTERN_WEIGHTS: Final[dict[str, tuple[float, float, float, float]]] = {
+    "full": (1.0, 0.0, 0.0, 0.0),
+    "x": (0.5, 0.5, 0.0, 0.0),
+    "y": (0.5, 0.0, 0.5, 0.0),
+    "z": (0.5, 0.0, 0.0, 0.5),
+    "-x": (0.5, -0.5, 0.0, 0.0),
+    "-y": (0.5, 0.0, -0.5, 0.0),
+    "-z": (0.5, 0.0, 0.0, -0.5),
+    "dark": (0.0, 0.0, 0.0, 0.0),
+}
+"""Each pattern as a sum of the moments: LED k shines with 1, (1 + w_k) / 2 or (1 - w_k) / 2."""
+
+
+class SphereError(ValueError):
+    """A sphere is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True)
+class SphereTolerances:
+    """Standard deviations of what a workshop leaves; 0 builds to the drawing."""
+
+    intensity: float = 0.05
+    """Relative, of an LED's intensity."""
+    place_mm: float = 1.0
+    """Place of an LED, mm, per axis."""
+    axis_deg: float = 1.0
+    """Turn of an LED's polarizing film, degrees."""
+
+    def __post_init__(self) -> None:
+        """Check signs."""
+        for name, value in dataclasses.asdict(self).items():
+            if not 0.0 <= value < math.inf:
+                raise SphereError(f"SphereTolerances.{name}: got {value}, expected >= 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BuiltSphere:
+    """The truth about the LEDs, in the order of the rig."""
+
+    nominal: Rig
+    """As drawn; the box weighs the LEDs by the directions in it."""
+    position_mm: FloatArray
+    """Where the LEDs are, mm, rig frame, shape (L, 3)."""
+    intensity: FloatArray
+    """Power over the mean of the drawing's, shape (L,), >= 0; 0 is dead."""
+    absorbs: FloatArray
+    """Absorbing axes of the films, unit vectors, shape (L, 3)."""
+    radius_mm: FloatArray
+    """Radii of the LEDs' discs, mm, shape (L,)."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges."""
+        count = len(self.nominal.lights)
+        for name, shape in (
+            ("position_mm", (count, 3)),
+            ("intensity", (count,)),
+            ("absorbs", (count, 3)),
+            ("radius_mm", (count,)),
+        ):
+            value = getattr(self, name)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise SphereError(f"{name}: got shape {value.shape}, expected finite {shape}")
+        if (self.intensity < 0.0).any():
+            raise SphereError(f"intensity: got {self.intensity.min()}, expected >= 0")
+
+    @property
+    def weights(self) -> FloatArray:
+        """Return what the moments weigh each LED with, shape (L, 4): 1 and nominal direction."""
+        place = np.array([light.position_mm for light in self.nominal.lights])
+        direction = place / np.linalg.norm(place, axis=1, keepdims=True)
+        return np.column_stack([np.ones(len(place)), direction])
+
+    @property
+    def dead(self) -> tuple[str, ...]:
+        """Return the names of LEDs that give no light."""
+        return tuple(
+            light.name
+            for light, power in zip(self.nominal.lights, self.intensity, strict=True)
+            if power == 0.0
+        )
+
+
+def as_drawn(rig: Rig) -> BuiltSphere:
+    """Return a sphere that stands exactly as its drawing says.
+
+    Parameters
+    ----------
+    rig
+        The drawing; its lights must be LEDs with polarizers and share one spectrum.
+
+    Raises
+    ------
+    SphereError
+        A light is no LED, or the spectra differ.
+    """
+    spectra_names = {light.illuminant for light in rig.lights}
+    if len(spectra_names) > 1:
+        raise SphereError(
+            f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+        )
+    power = np.array([_power(light) for light in rig.lights])
+    return BuiltSphere(
+        rig,
+        np.array([light.position_mm for light in rig.lights], np.float64),
+        power / power.mean(),
+        np.array([absorbing_axis(light) for light in rig.lights]),
+        np.array([light.radius_mm for light in rig.lights], np.float64),
+    )
+
+
+def build_sphere(
+    rig: Rig,
+    *,
+    seed: int,
+    tolerances: SphereTolerances | None = None,
+    dead: tuple[str, ...] = (),
+    weak: tuple[str, ...] = (),
+) -> BuiltSphere:
+    """Draw a sphere as built; the same seed builds each LED the same in any subset.
+
+    Parameters
+    ----------
+    rig
+        The drawing.
+    seed
+        Seed of what the workshop left.
+    tolerances
+        Standard deviations; None takes the usual ones.
+    dead, weak
+        Names of LEDs that give nothing, and a third of their light.
+
+    Returns
+    -------
+    BuiltSphere
+    """
+    size = tolerances or SphereTolerances()
+    drawn = as_drawn(rig)
+    for name in (*dead, *weak):
+        rig.light(name)
+    position, intensity, absorbs = [], [], []
+    for light, power in zip(rig.lights, drawn.intensity, strict=True):
+        rng = np.random.default_rng([seed, *light.name.encode()])
+        place = np.asarray(light.position_mm) + size.place_mm * rng.standard_normal(3)
+        share = 0.0 if light.name in dead else 1.0 / 3.0 if light.name in weak else 1.0
+        turn_deg = size.axis_deg * float(rng.standard_normal())
+        position.append(place)
+        intensity.append(power * share * math.exp(size.intensity * float(rng.standard_normal())))
+        axis_deg = 0.0 if light.polarizer_axis_deg is None else light.polarizer_axis_deg
+        absorbs.append(axis_in_plane(axis_deg + 90.0 + turn_deg, place, (0.0, 1.0, 0.0)))
+    return BuiltSphere(
+        rig, np.array(position), np.array(intensity), np.array(absorbs), drawn.radius_mm
+    )
+
+
+def _power(light: Light) -> float:
+    if light.power_w is None:
+        raise SphereError(f"light {light.name!r}: is no LED, it has no power_w")
+    return light.power_w
+
+
+REFERENCE_MM: Final = 600.0
+"""Distance at which an LED of intensity 1 gives unit irradiance."""
+
+
+def diffuser_radiance(
+    sphere: BuiltSphere, x_mm: FloatArray, y_mm: FloatArray, *, extinction: float = math.inf
+) -> FloatArray:
+    """Return the radiance of a perfect white diffuser at z = 0 that faces +z, for each moment.
+
+    Parameters
+    ----------
+    sphere
+        The LEDs; they shine at the origin.
+    x_mm, y_mm
+        Places, any shape, mm.
+    extinction
+        Of the LEDs' films, > 1; what a film passes of unpolarized light is at least half.
+
+    Returns
+    -------
+    ndarray
+        Shape (4, ...), in the unit of `rigsim.light.lobe_moments`.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> white = diffuser_radiance(as_drawn(load_rig("gradient")), np.zeros(1), np.zeros(1))
+    >>> bool(abs(white[1, 0] / white[0, 0]) < 0.01), bool(white[3, 0] > 0.5 * white[0, 0])
+    (True, True)
+    """
+    x, y = np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64)
+    out = np.zeros((4, *np.broadcast_shapes(x.shape, y.shape)))
+    film = 0.5 * (1.0 + 1.0 / extinction)
+    for led, (place, weight) in enumerate(zip(sphere.position_mm, sphere.weights, strict=True)):
+        if place[2] <= 0.0:
+            continue
+        square = (place[0] - x) ** 2 + (place[1] - y) ** 2 + place[2] ** 2
+        light = film / math.pi * sphere.intensity[led] * REFERENCE_MM**2 * place[2] / square**1.5
+        out += weight.reshape(4, *[1] * (out.ndim - 1)) * light
+    return out

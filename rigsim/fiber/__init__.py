@@ -1,0 +1,1 @@
+"""Light through fibers: Monte Carlo profiles as the probe measures them."""

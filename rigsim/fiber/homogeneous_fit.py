@@ -1,0 +1,151 @@
+"""The homogeneous medium whose profile is nearest to a given one.
+
+Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
+fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the given
+one: the logarithms of the ratios have the least variance over the fibres, all of one weight; fibres
+that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from
+noise. The factor is for what pigment in a thin layer on top takes from light on its way in and
+out, at all distances alike. Tissue without layers that scatters by direction has no such factor:
+with one its nearest media jump between far valleys from one direction to the next. Of dark skin the
+nearest medium scatters without bounds: its profile is that of a dipole at the surface, which tells
+sigma_tr and no more; the search ends at `MOST_SCATTERING`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from rigsim.fiber.profile import Fibres
+from rigsim.fiber.white_fiber import WhiteFibre
+
+FloatArray = NDArray[np.float64]
+
+FAINTEST_PER_MM2: Final = 1e-7
+"""R_f that gives a tenth of an electron per pixel and exposure of 30 s for each electron of read
+noise: about ten standard errors of a spot's sum."""
+
+FEWEST: Final = 4
+"""Fibres that must be bright enough."""
+
+STARTS: Final = (
+    (0.03, 1.0), (0.1, 2.0), (0.4, 3.0), (1.0, 1.0), (0.01, 8.0), (0.005, 20.0), (0.004, 60.0),
+)  # fmt: skip
+"""sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
+fibres less than far ones, which looks like more scattering than tissue has."""
+MOST_SCATTERING: Final = 200.0
+"""Of the search, 1/mm."""
+UNHELD: Final = 1e3
+"""Residual of media that the table does not hold."""
+
+
+class FitError(ValueError):
+    """A profile that no homogeneous medium can be fitted to."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomogeneousFit:
+    """The nearest homogeneous medium, and how near it is."""
+
+    sigma_a_per_mm: float
+    """Absorption coefficient, 1/mm."""
+    sigma_s_prime_per_mm: float
+    """Reduced scattering coefficient, 1/mm."""
+    factor: float
+    """R_f over that of the medium, geometric mean over the fibres used."""
+    residual: float
+    """Standard deviation of log(R_f / R_f of the medium) over the fibres used; its root mean
+    square where the factor is 1 by definition."""
+    fibres: int
+    """How many were used."""
+
+    @property
+    def sigma_tr_per_mm(self) -> float:
+        """Effective transport coefficient sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm."""
+        a = self.sigma_a_per_mm
+        return math.sqrt(3.0 * a * (a + self.sigma_s_prime_per_mm))
+
+
+def nearest_medium(
+    reflectance_per_mm2: ArrayLike, fibres: Fibres, *, dimmed: bool = True
+) -> HomogeneousFit:
+    """Return the homogeneous medium that is nearest to a profile.
+
+    Parameters
+    ----------
+    reflectance_per_mm2
+        R_f of the fibres, 1/mm^2, shape (F,).
+    fibres
+        The fibres.
+    dimmed
+        Whether a layer on top may take a share of the light: the factor is free, else 1.
+
+    Returns
+    -------
+    HomogeneousFit
+        See the module for the definition.
+
+    Raises
+    ------
+    FitError
+        Fewer than `FEWEST` fibres are bright enough, or the best medium lies at the table's end.
+
+    Examples
+    --------
+    >>> fibres = Fibres(tuple(0.3 + 0.25 * k for k in range(28)))
+    >>> own, _ = WhiteFibre.load().profile(0.1, 2.0, fibres)
+    >>> fit = nearest_medium(own, fibres)
+    >>> round(fit.sigma_a_per_mm, 3), round(fit.sigma_s_prime_per_mm, 2)
+    (0.1, 2.0)
+    """
+    profile = np.asarray(reflectance_per_mm2, np.float64)
+    use = profile >= FAINTEST_PER_MM2
+    if profile.shape != (len(fibres.radii_mm),) or int(use.sum()) < FEWEST:
+        raise FitError(
+            f"reflectance_per_mm2: got {int(use.sum())} bright of {profile.shape}, expected "
+            f"{len(fibres.radii_mm)} with at least {FEWEST} of {FAINTEST_PER_MM2} 1/mm^2"
+        )
+    table = WhiteFibre.load()
+    used = Fibres(
+        tuple(np.array(fibres.radii_mm)[use].tolist()), fibres.core_mm, fibres.source_core_mm,
+        fibres.numerical_aperture, fibres.source_numerical_aperture,
+    )  # fmt: skip
+    target = np.log(profile[use])
+    both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
+    low = table.distance[0] / (min(used.radii_mm) - both)
+    # sigma_a / sigma_s' rather than sigma_a, as the table ends there
+    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MOST_SCATTERING]])
+
+    def misfit(logs: FloatArray) -> FloatArray:
+        scattering = math.exp(logs[1])
+        if not table.holds(math.exp(logs[0]) * scattering, scattering, used):
+            return UNHELD * np.cos(np.arange(target.size))
+        value, _ = table.profile(math.exp(logs[0]) * scattering, scattering, used)
+        off = np.log(value) - target
+        return np.asarray(off - off.mean()) if dimmed else off
+
+    ends = [
+        least_squares(
+            misfit, np.clip(np.log([a / s, s]), bounds[0] + 0.01, bounds[1] - 0.01), bounds=bounds
+        )
+        for a, s in STARTS
+    ]
+    best = min(ends, key=lambda end: float(end.cost))
+    # at the most scattering sigma_tr alone shapes the profile: it stays what it is
+    if best.x[1] - bounds[0, 1] < 1e-3:
+        raise FitError(f"sigma_s': got {math.exp(best.x[1]):.3g} 1/mm, the table's end")
+    scattering = math.exp(best.x[1])
+    absorption = math.exp(best.x[0]) * scattering
+    value, _ = table.profile(absorption, scattering, used)
+    return HomogeneousFit(
+        absorption,
+        scattering,
+        math.exp(float(np.mean(target - np.log(value)))) if dimmed else 1.0,
+        math.sqrt(2.0 * float(best.cost) / int(use.sum())),
+        int(use.sum()),
+    )

@@ -1,0 +1,216 @@
+"""What the probe's fibres take from a tissue, by Monte Carlo, kept for a whole series."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Fibre, Probe, Rig
+from model import spectra
+from rigsim.fiber.anisotropic_tissue import anisotropic_profile
+from rigsim.fiber.probe_tissue import FibrousTissue, ProbedTissue, TissueError, TissueOptics
+from rigsim.fiber.profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.fiber.profile_smoothing import smooth_profile
+from rigsim.fiber.white_fiber import ETA, G, WhiteFibre
+
+FloatArray = NDArray[np.float64]
+
+KEPT: Final = 64
+"""Profiles and runs of photons that are kept."""
+
+TURNS: Final = 16
+"""Directions over half a turn in which anisotropic tissue is traced; it has harmonics to the 8th,
+so that those between follow from them exactly."""
+
+SUCTION_STEP_MBAR: Final = 0.1
+"""Suctions nearer than half of it share a profile: the blood differs by less than a 1000th."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Reflectance in the fibres in the camera's bands."""
+
+    reflectance_per_mm2: FloatArray
+    """R_f in 1/mm^2, shape (F, 3), >= 0."""
+    stderr: FloatArray
+    """Standard error of the Monte Carlo, same shape."""
+
+
+class Profiles:
+    """Profiles of one tissue under one probe.
+
+    Parameters
+    ----------
+    rig
+        The drawing; it must have a probe, one view and one light.
+    tissue
+        What the probe sits on.
+    photons
+        Photons for one site and angle.
+    seed
+        Of the photons; a profile depends on it and on the tissue alone, not on what was asked
+        before.
+    threads
+        Threads of the photons; the result does not depend on it.
+    """
+
+    def __init__(
+        self, rig: Rig, tissue: ProbedTissue, *, photons: int, seed: int, threads: int = 2
+    ) -> None:
+        if rig.probe is None or len(rig.views) != 1 or len(rig.lights) != 1:
+            raise TissueError(f"rig {rig.name!r}: expected a contact probe, one view and one light")
+        self.rig, self.tissue = rig, tissue
+        self.photons, self.seed, self.threads = photons, seed, threads
+        self.probe: Probe = rig.probe
+        self._runs: OrderedDict[tuple[object, ...], FibrePaths | Profile] = OrderedDict()
+        self._by_turn: FloatArray | None = None
+        self._profiles: OrderedDict[tuple[object, ...], Profile] = OrderedDict()
+
+    def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
+        """Return what the fibres take at a site.
+
+        Parameters
+        ----------
+        site
+            Name of the site.
+        angle_deg
+            Turn of the head about its axis, degrees.
+        suction_mbar
+            Suction under the head, mbar.
+
+        Returns
+        -------
+        Profile
+            The same for equal arguments and seeds.
+
+        Raises
+        ------
+        TissueError
+            The tissue has no such site.
+        """
+        suction = SUCTION_STEP_MBAR * round(suction_mbar / SUCTION_STEP_MBAR)
+        key = (site, angle_deg, suction)
+        if key not in self._profiles:
+            while len(self._profiles) >= KEPT:
+                self._profiles.popitem(last=False)
+            if isinstance(self.tissue, FibrousTissue):
+                self._profiles[key] = self._turned(self.tissue, angle_deg)
+            else:
+                self._profiles[key] = self._made(self.tissue.optics(site, angle_deg, suction))
+        self._profiles.move_to_end(key)
+        return self._profiles[key]
+
+    def _turned(self, tissue: FibrousTissue, angle_deg: float) -> Profile:
+        """Return the profile along one direction, by the Fourier series of those traced."""
+        if self._by_turn is None:
+            run = anisotropic_profile(
+                tissue.medium(),
+                fibres_of(self.probe),
+                azimuth_rad=np.pi * np.arange(TURNS) / TURNS,
+                photons=self.photons,
+                rng=np.random.default_rng([self.seed, zlib.crc32(repr(tissue).encode())]),
+                threads=self.threads,
+            )
+            self._by_turn = run.batch_reflectance_per_mm2
+        order = np.fft.rfftfreq(TURNS, 1.0 / TURNS)
+        share = np.where((order == 0) | (2 * order == TURNS), 1.0, 2.0) / TURNS
+        wave = share * np.exp(2j * order * np.radians(angle_deg))
+        each = (np.fft.rfft(self._by_turn, axis=-1) @ wave).real
+        value, error = smooth_profile(np.array(self.probe.radius_mm), each[..., None])
+        return Profile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
+
+    def _made(self, optics: TissueOptics) -> Profile:
+        run = self._run(optics)
+        if isinstance(run, Profile):
+            return run
+        made = run.profile(optics.amount)
+        value, error = smooth_profile(made.radii_mm, made.batch_reflectance_per_mm2)
+        return Profile(value, error)
+
+    def _run(self, optics: TissueOptics) -> FibrePaths | Profile:
+        key = (optics.wavelength_nm, optics.stacks)
+        if key not in self._runs:
+            while len(self._runs) >= KEPT:
+                self._runs.popitem(last=False)
+            self._runs[key] = self._traced(optics)
+        self._runs.move_to_end(key)
+        return self._runs[key]
+
+    def _traced(self, optics: TissueOptics) -> FibrePaths | Profile:
+        words = repr((optics.wavelength_nm, optics.stacks)).encode()
+        rng = np.random.default_rng([self.seed, zlib.crc32(words)])
+        stack = optics.stacks[0] if not optics.wavelength_nm else self.spectral(optics)
+        kind = fibres_of(self.probe)
+        if optics.absorber is not None:
+            return fibre_paths(
+                stack, kind, photons=self.photons, rng=rng, absorber=optics.absorber,
+                threads=self.threads,
+            )  # fmt: skip
+        stored = self._stored(optics, kind)
+        if stored is not None:
+            return stored
+        if not any(layer.sigma_s_per_mm for one in optics.stacks for layer in one.layers):
+            nothing = np.zeros((len(self.probe.fibres), 3))
+            return Profile(nothing, nothing)
+        made = fibre_profile(
+            stack, photons=self.photons, rng=rng, threads=self.threads, **dataclasses.asdict(kind)
+        )
+        value, error = made.reflectance_per_mm2, made.stderr
+        if value.ndim == 1:
+            value, error = (np.repeat(a[:, None], 3, axis=1) for a in (value, error))
+        return Profile(value, error)
+
+    def _stored(self, optics: TissueOptics, kind: Fibres) -> Profile | None:
+        """Return the profile of a homogeneous medium that the stored photons tell of."""
+        table = WhiteFibre.load()
+        each = []
+        for stack in optics.stacks:
+            layer = stack.layers[0]
+            scattering = layer.sigma_s_per_mm * (1.0 - layer.g)
+            if (
+                len(stack.layers) > 1
+                or abs(layer.g - G) > 1e-12
+                or (layer.eta, stack.eta_above) != (ETA, 1.0)
+                or not table.holds(layer.sigma_a_per_mm, scattering, kind)
+            ):
+                return None
+            each.append(table.profile(layer.sigma_a_per_mm, scattering, kind))
+        weights = np.ones((1, 3))
+        if optics.wavelength_nm:
+            weights = self.spectral(optics).band_weights
+        # errors of similar media are of the same photons: they add up
+        value, error = (np.stack(part).T @ weights for part in zip(*each, strict=True))
+        return Profile(value, error)
+
+    def spectral(self, optics: TissueOptics) -> SpectralStack:
+        """Return the stacks with the camera's bands under the probe's light."""
+        weights = spectra.band_weights(
+            self.rig.views[0].spectral_sensitivity,
+            self.rig.lights[0].illuminant,
+            optics.wavelength_nm,
+        )
+        return SpectralStack(optics.wavelength_nm, optics.stacks, weights)
+
+
+def fibres_of(probe: Probe) -> Fibres:
+    """Return the probe's fibres as the walk of photons wants them.
+
+    Raises
+    ------
+    TissueError
+        The detection fibres are not all alike.
+    """
+    first: Fibre = probe.fibres[0]
+    for fibre in probe.fibres:
+        if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
+            raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")
+    return Fibres(
+        probe.radius_mm, first.core_mm, probe.source_core_mm, first.numerical_aperture,
+        probe.source_numerical_aperture,
+    )  # fmt: skip

@@ -1,0 +1,395 @@
+"""What a fibre probe sits on: tissues by site, turn of the head and suction."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Final, Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
+from rigsim.subject.pigment import MELANIN_PRESETS
+from rigsim.tissue import skin_layers
+from rigsim.tissue.skin_layers import ANISOTROPY, ETA
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
+
+FloatArray = NDArray[np.float64]
+Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
+
+LEAST_SIGMA_A_PER_MM: Final = 1e-7
+"""Absorption that a medium without any is traced with, 1/mm: else photons wander for ever. A path
+of 1 m loses a ten-thousandth."""
+
+BLOOD_AT_REST: Final[Mapping[str, float]] = {
+    "forehead": 0.005, "cheek": 0.006, "chin": 0.016, "abdomen": 0.005,
+}  # fmt: skip
+"""Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimetres,
+so less than what colors the face, whose vessels lie under the epidermis."""
+MELANIN_SHARE: Final = 0.25
+"""Of the presets' melanin: theirs colors the faces of other rigs, while spectra of forearms ask for
+about 0.003 (`rigsim.tissue.skin_table`), and so do the paper's sigma_tr. This project's choice."""
+BLOOD_KEPT: Final = 0.25
+"""Share of the blood at rest that no pressure presses out."""
+CAPILLARY_MBAR: Final = 30.0
+"""Pressure in capillaries that the head's works against, mbar: about 23 mm of mercury."""
+TOUCH_MBAR: Final = 3.0
+"""Pressure under a head that is laid on without suction, mbar."""
+
+WAVELENGTH_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
+"""Wavelengths that skin is traced at, nm; between them reflectance is linear."""
+PHANTOM_NM: Final = tuple(float(nm) for nm in range(400, 701, 20))
+"""The same of the phantom."""
+AS_MADE: Final = (0.8, -0.7)
+"""By how many standard uncertainties the phantom is off its certificate: sigma_a, sigma_s'."""
+
+
+class TissueError(ValueError):
+    """A tissue is described wrongly or asked for a site that it has not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TissueOptics:
+    """What light meets under the head."""
+
+    wavelength_nm: tuple[float, ...]
+    """Wavelengths of the stacks, nm; empty for a gray tissue, which has one stack."""
+    stacks: tuple[LayerStack, ...]
+    """Layers at each wavelength, with the least of the absorber that comes and goes."""
+    absorber: FloatArray | None
+    """Absorption of that absorber in each layer per amount, 1/mm, shape (wavelengths, layers);
+    None where none does."""
+    amount: float
+    """How much of it there is above the least, >= 0."""
+
+
+class ProbedTissue(Protocol):
+    """What the probe's scene wants to know of a tissue."""
+
+    @property
+    def kind(self) -> Kind:
+        """What its truth is."""
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return what light meets; equal stacks for equal sites and angles."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomogeneousTissue:
+    """A half space of one material, the same at every site, angle and suction."""
+
+    sigma_a_per_mm: float | tuple[float, ...]
+    """Absorption coefficient, 1/mm, >= 0; one for each wavelength, or one for all."""
+    sigma_s_prime_per_mm: float | tuple[float, ...]
+    """Reduced scattering coefficient, 1/mm, >= 0, likewise."""
+    g: float = ANISOTROPY
+    """Mean cosine of the Henyey-Greenstein phase function, -1 < g < 1."""
+    eta: float = ETA
+    """Refractive index, 1 to 3."""
+    wavelength_nm: tuple[float, ...] = ()
+    """Wavelengths, increasing, nm; empty: gray."""
+
+    def __post_init__(self) -> None:
+        wanted = max(len(self.wavelength_nm), 1)
+        for name, low, high in (
+            ("sigma_a_per_mm", 0.0, 1e4),
+            ("sigma_s_prime_per_mm", 0.0, 1e4),
+            ("g", -0.9999, 0.9999),
+            ("eta", 1.0, 3.0),
+        ):
+            values = np.atleast_1d(getattr(self, name))
+            if not ((values >= low) & (values <= high)).all():
+                raise TissueError(
+                    f"{name}: got {getattr(self, name)}, expected {low:g} to {high:g}"
+                )
+            if len(values) not in (1, wanted):
+                raise TissueError(f"{name}: got {len(values)} numbers, expected 1 or {wanted}")
+
+    @property
+    def kind(self) -> Kind:
+        """Return "homogeneous"."""
+        return "homogeneous"
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return the material; nothing changes it."""
+        del site, angle_deg, suction_mbar
+        sigma_a, scattering = np.broadcast_arrays(
+            np.atleast_1d(self.sigma_a_per_mm), np.atleast_1d(self.sigma_s_prime_per_mm)
+        )
+        count = max(len(self.wavelength_nm), 1)
+        stacks = tuple(
+            half_space(float(a), float(s), self.g, self.eta)
+            for a, s in zip(np.resize(sigma_a, count), np.resize(scattering, count), strict=True)
+        )
+        return TissueOptics(self.wavelength_nm, stacks, None, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FibrousTissue:
+    """A gray half space whose fibres run one way, as in abdominal skin; the same at every site."""
+
+    sigma_a_per_mm: float
+    """Absorption coefficient, 1/mm, > 0."""
+    sigma_s_prime_per_mm: float
+    """Reduced scattering coefficient for strength 0, 1/mm, > 0."""
+    strength: float = -1.0
+    """See `rigsim.fiber.anisotropic_tissue.AnisotropicTissue`; below 0 light goes farther along."""
+    axis_deg: float = 0.0
+    """Direction of the fibres: the head's angle at which its line lies along them, degrees."""
+
+    def __post_init__(self) -> None:
+        try:
+            self.medium()
+        except TransportError as error:
+            raise TissueError(str(error)) from error
+
+    @property
+    def kind(self) -> Kind:
+        """Return "anisotropic"."""
+        return "anisotropic"
+
+    def medium(self) -> AnisotropicTissue:
+        """Return the tissue as photons meet it."""
+        return AnisotropicTissue(
+            self.sigma_a_per_mm,
+            self.sigma_s_prime_per_mm / (1.0 - ANISOTROPY),
+            ANISOTROPY,
+            ETA,
+            self.strength,
+            math.radians(self.axis_deg),
+        )
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return the material without its direction, which `medium` tells."""
+        del site, angle_deg, suction_mbar
+        stack = half_space(self.sigma_a_per_mm, self.sigma_s_prime_per_mm, ANISOTROPY, ETA)
+        return TissueOptics((), (stack,), None, 0.0)
+
+
+def half_space(
+    sigma_a_per_mm: float, sigma_s_prime_per_mm: float, g: float, eta: float
+) -> LayerStack:
+    """Return a half space under air, with `LEAST_SIGMA_A_PER_MM` at least.
+
+    Examples
+    --------
+    >>> layer = half_space(0.0, 1.5, 0.8, 1.4).layers[0]
+    >>> layer.sigma_a_per_mm, round(layer.sigma_s_per_mm, 9)
+    (1e-07, 7.5)
+    """
+    sigma_s = sigma_s_prime_per_mm / (1.0 - g)
+    return LayerStack(
+        (Layer(math.inf, max(sigma_a_per_mm, LEAST_SIGMA_A_PER_MM), sigma_s, g, eta),)
+    )
+
+
+class SkinTissue:
+    """Skin of two layers: an epidermis with melanin on a dermis with blood.
+
+    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Under a head the blood that is not
+    held back is pressed out: of the blood at rest there is left
+
+        BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
+
+    with the suction as the pressure, for the rim's force is the suction times the cup's area and
+    the face's area is about that, and `TOUCH_MBAR` of a head that is only laid on.
+
+    Parameters
+    ----------
+    preset
+        One of `rigsim.subject.pigment.MELANIN_PRESETS`.
+    seed
+        Of what differs between subjects and between the sites of one, >= 0.
+    melanin
+        Volume fraction of melanosomes of a face of this kind, instead of the preset's, 0.005 to
+        0.45.
+    blood
+        Factor of all blood, 0.1 to 4.
+
+    Raises
+    ------
+    TissueError
+        The preset is unknown, the seed negative, or a number out of range.
+
+    Notes
+    -----
+    That pressure takes blood out of the skin under a probe is measured (Reif et al. 2008,
+    doi:10.1117/1.2870115; Landis 1930, doi:10.1152/ajplegacy.1930.93.2.353, for the pressure in
+    capillaries); the law's form is this project's choice, and so are the blood at rest and its
+    differences by site. The nearest media of preset III under 60 mbar
+    (`rigsim.fiber.homogeneous_fit`) lie below the means in table 2 of Weyrich et al. 2006,
+    doi:10.1145/1141911.1141987: by 0.5 to 0.8 of its deviations in red, 1.3 to 1.6 in green, and
+    2.1 to 3.5 in blue, where a camera's band lets light through that is hardly absorbed.
+
+    Examples
+    --------
+    >>> skin = SkinTissue("III", seed=1)
+    >>> skin.blood("cheek", 60.0) < skin.blood("cheek", 0.0) < skin.blood("chin", 0.0)
+    True
+    """
+
+    def __init__(
+        self, preset: str, *, seed: int = 0, melanin: float | None = None, blood: float = 1.0
+    ) -> None:
+        if preset not in MELANIN_PRESETS:
+            known = ", ".join(MELANIN_PRESETS)
+            raise TissueError(f"preset: got {preset!r}, expected one of {known}")
+        if seed < 0:
+            raise TissueError(f"seed: got {seed}, expected >= 0")
+        if melanin is not None and not 0.005 <= melanin <= 0.45:
+            raise TissueError(f"melanin: got {melanin}, expected 0.005 to 0.45")
+        if not 0.1 <= blood <= 4.0:
+            raise TissueError(f"blood: got {blood}, expected 0.1 to 4")
+        self.preset, self.seed, self._blood = preset, seed, blood
+        self._melanin = MELANIN_PRESETS[preset] if melanin is None else melanin
+        self._own = np.random.default_rng([seed, 0x736B]).standard_normal(2)
+
+    @property
+    def kind(self) -> Kind:
+        """Return "layered"."""
+        return "layered"
+
+    def melanin(self, site: str) -> float:
+        """Return the volume fraction of melanosomes in an epidermis of 0.25 mm."""
+        factor = math.exp(0.1 * float(self._own[0]) + 0.05 * self._drawn(site)[0])
+        return MELANIN_SHARE * self._melanin * factor
+
+    def epidermis_mm(self, site: str) -> float:
+        """Return the epidermis's thickness, mm."""
+        return skin_layers.EPIDERMIS_MM * math.exp(0.06 * self._drawn(site)[1])
+
+    def blood(self, site: str, suction_mbar: float) -> float:
+        """Return the volume fraction of blood in the dermis under the head."""
+        pressure = max(suction_mbar, TOUCH_MBAR)
+        left = BLOOD_KEPT + (1.0 - BLOOD_KEPT) * math.exp(-pressure / CAPILLARY_MBAR)
+        return left * self._rest(site)
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return the layers; the blood above what no pressure takes out is the absorber."""
+        del angle_deg
+        rest = self._rest(site)
+        least = BLOOD_KEPT * rest
+        melanin, thickness = self.melanin(site), self.epidermis_mm(site)
+        stacks, absorber = [], []
+        for wavelength in WAVELENGTH_NM:
+            stack = skin_layers.skin(wavelength, melanin, least)
+            top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
+            stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
+            # more blood is less of the bloodless rest
+            dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
+            absorber.append([skin_layers.EPIDERMAL_BLOOD_SHARE * dermis, dermis])
+        amount = self.blood(site, suction_mbar) - least
+        return TissueOptics(WAVELENGTH_NM, tuple(stacks), np.array(absorber), amount)
+
+    def _rest(self, site: str) -> float:
+        if site not in BLOOD_AT_REST:
+            known = ", ".join(BLOOD_AT_REST)
+            raise TissueError(f"site: got {site!r}, expected one of {known}")
+        return (
+            self._blood
+            * BLOOD_AT_REST[site]
+            * math.exp(0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2])
+        )
+
+    def _drawn(self, site: str) -> tuple[float, float, float]:
+        rng = np.random.default_rng([self.seed, 0x7369, zlib.crc32(site.encode())])
+        a, b, c = rng.standard_normal(3)
+        return float(a), float(b), float(c)
+
+
+def phantom_certificate() -> Mapping[str, Any]:
+    """Return the certificate of `PHANTOM`, package data of schema ``skinrig.phantom/1``."""
+    path = resources.files("rigsim").joinpath("data", "phantom.json")
+    loaded: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return loaded
+
+
+def make_phantom(
+    certificate: Mapping[str, Any], *, deviations: tuple[float, float] = AS_MADE
+) -> HomogeneousTissue:
+    """Return a block as it was made, near its certificate.
+
+    Parameters
+    ----------
+    certificate
+        Of schema ``skinrig.phantom/1``.
+    deviations
+        By how many of its standard uncertainties sigma_a and sigma_s' are off.
+
+    Returns
+    -------
+    HomogeneousTissue
+        Spectral; between the certificate's wavelengths both coefficients follow a power.
+
+    Examples
+    --------
+    >>> paper = phantom_certificate()
+    >>> block = make_phantom(paper)
+    >>> block.g == paper["g"], block.eta == paper["eta"]
+    (True, True)
+    """
+    x, known = np.log(PHANTOM_NM), np.log(certificate["wavelength_nm"])
+    factor = [
+        1.0 + count * certificate["uncertainty"][name]
+        for count, name in zip(deviations, ("sigma_a", "sigma_s_prime"), strict=True)
+    ]
+    sigma_a, scattering = (
+        np.exp(np.interp(x, known, np.log(certificate[name]))) * share
+        for name, share in zip(("sigma_a_per_mm", "sigma_s_prime_per_mm"), factor, strict=True)
+    )
+    return HomogeneousTissue(
+        tuple(sigma_a.tolist()), tuple(scattering.tolist()), certificate["g"], certificate["eta"],
+        PHANTOM_NM,
+    )  # fmt: skip
+
+
+def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
+    """Return the tissue that a subject's text names.
+
+    Parameters
+    ----------
+    text
+        A preset of melanin, "I" to "VI", "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" or
+        "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS_DEG]]", in 1/mm.
+    seed
+        Of what differs between subjects.
+
+    Raises
+    ------
+    TissueError
+        The text names nothing known, or a number is out of range.
+
+    Examples
+    --------
+    >>> parse_subject("homogeneous:0.04,1.5").sigma_s_prime_per_mm
+    1.5
+    >>> parse_subject("III", seed=2).preset
+    'III'
+    """
+    name, colon, rest = text.partition(":")
+    if not colon and name in MELANIN_PRESETS:
+        return SkinTissue(name, seed=seed)
+    try:
+        numbers = [float(word) for word in rest.split(",")]
+    except ValueError:
+        numbers = []
+    if name == "homogeneous" and len(numbers) in (2, 3):
+        sigma_a, scattering, g = (*numbers, ANISOTROPY)[:3]
+        return HomogeneousTissue(sigma_a, scattering, g)
+    if name == "anisotropic" and len(numbers) in (2, 3, 4):
+        return FibrousTissue(*numbers)
+    raise TissueError(
+        f"subject: got {text!r}, expected one of {', '.join(MELANIN_PRESETS)}, "
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
+        "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS_DEG]] in 1/mm"
+    )
+
+
+PHANTOM: Final = make_phantom(phantom_certificate())
+"""The solid block that sessions of target "phantom" are of, as made."""

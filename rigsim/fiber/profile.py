@@ -1,0 +1,423 @@
+"""What fibres on tissue take from a source fibre: Monte Carlo transport scored in their cones.
+
+The quantity is the reflectance in the fibre R_f in 1/mm^2: the power that a detection fibre takes,
+divided by the source's power, the area of the fibre's core and the square of its aperture. Where
+the light that leaves is Lambertian, it is the exitance per source power, averaged over the core.
+
+Three things make it cheap. Light is scored at every collision instead of where photons happen to
+leave. A plane stack is the same everywhere, so photons start at a point and are scored in rings,
+with the exact share of the pairs of points, one in each core, that lie so far apart. And photons
+are split where few arrive and merged by roulette where many do, so that every distance is visited
+alike; weights keep all of it unbiased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.fiber.photon_splitting import (
+    WINDOW_CELLS,
+    flat_window,
+    learned_window,
+    scoring_chances,
+    transport_depth_mm,
+)
+from rigsim.fiber.rings import ring_kernels
+from rigsim.fiber.walk import walk_to_fibres
+from rigsim.tissue import tissue_mc
+from rigsim.tissue.tissue_mc import LayerStack, TransportError
+
+FloatArray = NDArray[np.float64]
+
+PATH_SCALE_MM: Final = 0.05
+"""Path length above which the nodes of a path histogram are spaced by their logarithm."""
+
+PATH_STEP: Final = 0.006
+"""Relative spacing of those nodes; a reweighted score is off by (sigma path step)^2 / 8 of it."""
+
+LONGEST_PATH_MM: Final = 20_000.0
+"""Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
+
+PILOT_SHARE: Final = 0.01
+"""Photons that each of `PILOTS` runs spends to learn how many arrive where, of those traced."""
+
+PILOTS: Final = 3
+"""Each pilot sees farther than the one before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fibres:
+    """A source fibre and detection fibres that stand on the surface."""
+
+    radii_mm: tuple[float, ...]
+    """Distances of the detection fibres' axes from the source's, mm, >= 0, at least one."""
+    core_mm: float = 0.2
+    """Diameter of the detection fibres' cores, mm, > 0."""
+    source_core_mm: float = 0.2
+    """Diameter of the source fibre's core, mm, >= 0."""
+    numerical_aperture: float = 0.22
+    """Numerical aperture of the detection fibres, in (0, 1]; 1 in air takes all angles."""
+    source_numerical_aperture: float = 0.22
+    """Numerical aperture of the source fibre, in [0, 1]; 0 for parallel light."""
+
+    def __post_init__(self) -> None:
+        if not self.radii_mm:
+            raise TransportError("radii_mm: expected at least one distance, got none")
+        for radius in self.radii_mm:
+            _require("radii_mm", radius, isfinite(radius) and radius >= 0.0, "finite, >= 0")
+        _require("core_mm", self.core_mm, isfinite(self.core_mm) and self.core_mm > 0.0, "> 0")
+        core = self.source_core_mm
+        _require("source_core_mm", core, isfinite(core) and core >= 0.0, ">= 0")
+        aperture = self.numerical_aperture
+        _require("numerical_aperture", aperture, 0.0 < aperture <= 1.0, "in (0, 1]")
+        aperture = self.source_numerical_aperture
+        _require("source_numerical_aperture", aperture, 0.0 <= aperture <= 1.0, "in [0, 1]")
+
+
+@dataclass(frozen=True, slots=True)
+class SpectralStack:
+    """Layers that depend on the wavelength, and the bands in which light is measured."""
+
+    wavelength_nm: tuple[float, ...]
+    """Wavelengths, nm, at least one."""
+    stacks: tuple[LayerStack, ...]
+    """The layers at each wavelength; as many in each."""
+    band_weights: FloatArray
+    """Share of each wavelength in each band, >= 0, shape (wavelengths, bands): the light source's
+    spectrum times the band's sensitivity, each column of sum 1 for a reflectance."""
+
+    def __post_init__(self) -> None:
+        count = len(self.wavelength_nm)
+        if not count or len(self.stacks) != count:
+            raise TransportError(
+                f"stacks: expected one for each of {count} wavelengths (at least one), "
+                f"got {len(self.stacks)}"
+            )
+        if len({len(stack.layers) for stack in self.stacks}) != 1:
+            raise TransportError("stacks: expected as many layers at every wavelength")
+        weights = np.asarray(self.band_weights, np.float64)
+        if weights.ndim != 2 or len(weights) != count or not np.all(weights >= 0.0):
+            raise TransportError(
+                f"band_weights: expected numbers >= 0 of shape ({count}, bands), got shape "
+                f"{weights.shape}"
+            )
+        if not np.all(np.isfinite(weights)) or not np.all(weights.sum(axis=0) > 0.0):
+            raise TransportError("band_weights: expected finite columns that are not all zero")
+        object.__setattr__(self, "band_weights", weights)
+
+
+@dataclass(frozen=True, slots=True)
+class FibreProfile:
+    """Reflectance in the fibre by distance, with one-sigma standard errors."""
+
+    radii_mm: FloatArray
+    """Distances as asked for, mm, shape (F,)."""
+    reflectance_per_mm2: FloatArray
+    """R_f in 1/mm^2, shape (F,), or (F, bands) of a `SpectralStack`."""
+    stderr: FloatArray
+    """Standard error of `reflectance_per_mm2`, same shape. Neighbours' errors are correlated."""
+    batch_reflectance_per_mm2: FloatArray
+    """`reflectance_per_mm2` of each independent batch, shape (batches, F[, bands])."""
+    photons: int
+    """Photons traced, those of the pilot left out."""
+
+    @property
+    def batches(self) -> int:
+        """Independent batches behind the standard errors."""
+        return len(self.batch_reflectance_per_mm2)
+
+
+@dataclass(frozen=True, slots=True)
+class FibrePaths:
+    """Light in the fibres by the path that it took through one absorber.
+
+    More of the absorber weakens a path by the factor exp(-sigma path) and changes no collision, so
+    one run serves every concentration above that of the run.
+    """
+
+    radii_mm: FloatArray
+    """Distances as asked for, mm, shape (F,)."""
+    path_mm: FloatArray
+    """Nodes of the path in the counted absorber, mm, increasing from 0, shape (nodes,)."""
+    score: NDArray[np.float32]
+    """R_f in 1/mm^2 that took each path, shape (batches, F, nodes[, bands])."""
+    photons: int
+    """Photons traced."""
+
+    def profile(self, extra_per_mm: float = 0.0) -> FibreProfile:
+        """Return the profile with absorption added to that of the run.
+
+        Parameters
+        ----------
+        extra_per_mm
+            Absorption coefficient in 1/mm of the counted absorber at a share of 1, above what the
+            run had, >= 0. Noise grows with it, as fewer and fewer paths matter.
+
+        Returns
+        -------
+        FibreProfile
+
+        Raises
+        ------
+        TransportError
+            When `extra_per_mm` is negative or not finite.
+        """
+        fine = isfinite(extra_per_mm) and extra_per_mm >= 0.0
+        _require("extra_per_mm", extra_per_mm, fine, "a finite number >= 0")
+        survival = np.exp(-extra_per_mm * self.path_mm)
+        each = np.einsum("bfn...,n->bf...", self.score, survival, dtype=np.float64)
+        return summary(self.radii_mm, each, self.photons)
+
+
+def fibre_profile(
+    stack: LayerStack | SpectralStack,
+    *,
+    radii_mm: ArrayLike,
+    photons: int,
+    rng: np.random.Generator,
+    core_mm: float = 0.2,
+    source_core_mm: float = 0.2,
+    numerical_aperture: float = 0.22,
+    source_numerical_aperture: float = 0.22,
+    batches: int = tissue_mc.MIN_BATCHES,
+    threads: int = 1,
+) -> FibreProfile:
+    """Trace light from a source fibre to detection fibres on the same surface.
+
+    Parameters
+    ----------
+    stack
+        Layers and the media around them, at one wavelength or at several in bands. The source
+        shines uniformly over its core and over the projected solid angle of its cone.
+    radii_mm
+        Distances of the detection fibres from the source, mm, >= 0, shape (F,).
+    photons
+        Photons to trace, rounded up to a multiple of `batches` (times wavelengths).
+    rng
+        Source of the batches' seeds; a fresh generator of equal seed repeats the result exactly.
+    core_mm, source_core_mm
+        Diameters of the cores, mm.
+    numerical_aperture, source_numerical_aperture
+        Apertures of the fibres, n sin(half angle).
+    batches
+        Independent batches, at least 20.
+    threads
+        Threads to use; the result does not depend on it.
+
+    Returns
+    -------
+    FibreProfile
+        R_f with standard errors. Light that left the source and was never scattered, only
+        reflected by inner interfaces, is included; what the surface itself mirrors is not.
+
+    Raises
+    ------
+    TransportError
+        When the request makes no sense; the message names the field.
+
+    Examples
+    --------
+    >>> from math import inf
+    >>> from rigsim.tissue.tissue_mc import Layer
+    >>> red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
+    >>> near_and_far = fibre_profile(
+    ...     red, radii_mm=(0.3, 3.3), photons=4000, rng=np.random.default_rng(0)
+    ... )
+    >>> bool(near_and_far.reflectance_per_mm2[0] > 10.0 * near_and_far.reflectance_per_mm2[1])
+    True
+    """
+    fibres = Fibres(
+        tuple(np.atleast_1d(np.asarray(radii_mm, np.float64)).tolist()),
+        core_mm, source_core_mm, numerical_aperture, source_numerical_aperture,
+    )  # fmt: skip
+    each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
+    return summary(np.array(fibres.radii_mm), each, traced)
+
+
+def fibre_paths(
+    stack: LayerStack | SpectralStack,
+    fibres: Fibres,
+    *,
+    photons: int,
+    rng: np.random.Generator,
+    absorber: ArrayLike | None = None,
+    batches: int = tissue_mc.MIN_BATCHES,
+    threads: int = 1,
+) -> FibrePaths:
+    """Trace light as `fibre_profile` does and keep its paths through one absorber.
+
+    Parameters
+    ----------
+    stack, photons, rng, batches, threads
+        As in `fibre_profile`. Take the smallest absorption of interest.
+    fibres
+        The fibres.
+    absorber
+        Share of the counted absorber in each layer, >= 0 and somewhere > 0, shape (layers,) or
+        (wavelengths, layers): 1 everywhere (the default) for absorption that is added to all
+        layers, or blood's fraction times its absorption for a change of blood.
+
+    Returns
+    -------
+    FibrePaths
+
+    Raises
+    ------
+    TransportError
+        When the request makes no sense; the message names the field.
+
+    Examples
+    --------
+    >>> from math import inf
+    >>> from rigsim.tissue.tissue_mc import Layer
+    >>> clear = LayerStack((Layer(inf, 0.01, 7.5, 0.8, 1.4),))
+    >>> paths = fibre_paths(
+    ...     clear, Fibres((0.3, 3.3)), photons=4000, rng=np.random.default_rng(0)
+    ... )
+    >>> light, dark = paths.profile(0.0), paths.profile(0.24)
+    >>> bool((light.reflectance_per_mm2 > dark.reflectance_per_mm2).all())
+    True
+    """
+    spectral = _spectral(stack)
+    shape = (len(spectral.stacks), len(spectral.stacks[0].layers))
+    shares = np.ones(shape) if absorber is None else np.asarray(absorber, np.float64)
+    if shares.ndim not in (1, 2) or not np.all(np.isfinite(shares)) or not np.all(shares >= 0.0):
+        raise TransportError(f"absorber: expected finite numbers >= 0 for {shape[1]} layers")
+    try:
+        shares = np.broadcast_to(shares, shape)
+    except ValueError as error:
+        raise TransportError(
+            f"absorber: expected shape {shape[1:]} or {shape}, got {shares.shape}"
+        ) from error
+    if not shares.max() > 0.0:
+        raise TransportError("absorber: expected a share > 0 in some layer, got none")
+    each, traced = _trace(stack, fibres, photons, rng, batches, threads, shares / shares.max())
+    nodes = PATH_SCALE_MM * np.expm1(PATH_STEP * np.arange(_path_nodes())) * shares.max()
+    return FibrePaths(np.array(fibres.radii_mm), nodes, each.astype(np.float32), traced)
+
+
+def _path_nodes() -> int:
+    return int(np.ceil(np.log1p(LONGEST_PATH_MM / PATH_SCALE_MM) / PATH_STEP)) + 1
+
+
+def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
+    if isinstance(stack, SpectralStack):
+        return stack
+    return SpectralStack((0.0,), (stack,), np.ones((1, 1)))
+
+
+def summary(radii_mm: FloatArray, each: FloatArray, photons: int) -> FibreProfile:
+    """Return mean and standard error of independent batches, shape (batches, F, ...)."""
+    error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
+    return FibreProfile(radii_mm, each.mean(axis=0), error, each, photons)
+
+
+def _trace(
+    stack: LayerStack | SpectralStack,
+    fibres: Fibres,
+    photons: int,
+    rng: np.random.Generator,
+    batches: int,
+    threads: int,
+    absorber: FloatArray | None,
+) -> tuple[FloatArray, int]:
+    """Return scores by batch, shape (batches, F[, nodes][, bands]), and the photons traced."""
+    spectral = _spectral(stack)
+    tissue_mc.photons_per_batch(photons, batches, threads)
+    order = np.argsort(fibres.radii_mm, kind="stable")
+    kernels, starts, counts = ring_kernels(
+        np.array(fibres.radii_mm)[order], 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+    )
+    shares = spectral.band_weights.max(axis=1)
+    shares = shares / shares.sum()
+    nodes = (_path_nodes(),) if absorber is not None else ()
+    bands = spectral.band_weights.shape[1:]
+    total = np.zeros((batches, len(order), *nodes, *bands))
+    traced = 0
+    for index, layers in enumerate(spectral.stacks):
+        seeds = tissue_mc.batch_seeds(rng, batches + PILOTS)
+        if not shares[index] > 0.0:
+            continue
+        count = -(-round(photons * float(shares[index])) // batches) or 1
+        traced += count * batches
+        plan = _Plan(layers, fibres, kernels, starts, counts, absorber, index)
+        window = flat_window(plan.reach_mm, plan.farthest_mm)
+        pilot = max(200, round(PILOT_SHARE * count * batches))
+        for seed in seeds[batches:]:
+            window = plan.learned(window, pilot, seed)
+
+        def run(batch: int, plan: _Plan = plan, window: FloatArray = window,
+                count: int = count, seeds: NDArray[np.uint64] = seeds) -> FloatArray:  # fmt: skip
+            return plan.run(window, count, seeds[batch])[0]
+
+        for batch, score in enumerate(tissue_mc.in_threads(run, batches, threads)):
+            for band in range(bands[0]):
+                weight = spectral.band_weights[index, band]
+                total[batch, ..., band] += weight / count * score
+    back = np.empty_like(total)
+    back[:, order] = total
+    return (back if isinstance(stack, SpectralStack) else back[..., 0]), traced
+
+
+class _Plan:
+    """What the walk needs of one stack and its fibres."""
+
+    def __init__(
+        self,
+        stack: LayerStack,
+        fibres: Fibres,
+        kernels: FloatArray,
+        starts: NDArray[np.int64],
+        counts: NDArray[np.int64],
+        absorber: FloatArray | None,
+        index: int,
+    ) -> None:
+        self.fibres = fibres
+        self.kernels, self.starts, self.counts = kernels, starts, counts
+        table = tissue_mc.layer_table(stack)
+        depth = np.zeros(len(table))
+        share = np.zeros(len(table))
+        with np.errstate(invalid="ignore"):
+            thickness = table[1:-1, 1] - table[1:-1, 0]
+            optical = np.where(table[1:-1, 2] > 0.0, thickness * table[1:-1, 2], 0.0)
+        depth[2:] = np.cumsum(optical)
+        if absorber is not None:
+            share[1:-1] = absorber[index]
+        self.table = np.column_stack([table, depth, share])
+        self.counts_paths = absorber is not None
+        farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
+        self.reach_mm = 3.0 * max(farthest, 1.0)
+        self.farthest_mm = max(farthest, 1.0)
+        self.chances, self.chances_per_mm = scoring_chances(self.table)
+        self.deeper_per_mm = 1.0 / transport_depth_mm(self.table)
+
+    def learned(self, window: FloatArray, photons: int, seed: NDArray[np.uint64]) -> FloatArray:
+        """Return weights at which every distance is visited alike, learned from some photons."""
+        visited = self.run(window, photons, seed)[1]
+        return learned_window(visited, window, self.reach_mm, self.farthest_mm)
+
+    def run(
+        self, window: FloatArray, photons: int, seed: NDArray[np.uint64]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the fibres' scores and of the weights that visited each distance."""
+        fibres = len(self.kernels)
+        tally = np.zeros(fibres)
+        histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
+        visited = np.zeros((2, len(window)))
+        walk_to_fibres(
+            self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
+            self.kernels, self.starts, self.counts, window, self.chances,
+            WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm,
+            PATH_STEP, PATH_SCALE_MM, photons, seed.copy(), tally, histogram, visited,
+        )  # fmt: skip
+        return (histogram if self.counts_paths else tally), visited
+
+
+def _require(name: str, value: float, holds: bool, expected: str) -> None:
+    if not holds:
+        raise TransportError(f"{name}: expected {expected}, got {value}")

@@ -1,0 +1,303 @@
+"""The compiled walk of photons that are seen by fibres (see `rigsim.fiber.profile`).
+
+At each collision the light that would go straight into a fibre's cone is scored: its chance to be
+scattered there, to reach the surface and to pass it. So photons need not happen to leave within a
+narrow cone. Where scattering is more forward than that cone is narrow, such scores are rare and
+large; so both ways share each direction by their densities (the balance heuristic of Veach and
+Guibas 1995, doi:10.1145/218380.218498): photons that leave within the cone straight from a
+collision count for the rest. After a reflection at some interface they count in full.
+"""
+
+from __future__ import annotations
+
+from math import copysign, exp, log, sqrt
+
+import numpy as np
+from numba import njit
+
+from rigsim.tissue.photon_walk import draw, fresnel, scatter
+
+TABLE_COLUMNS = 8
+"""Columns of the layer table: top, bottom (mm), sigma_t (1/mm), albedo, g, eta, optical depth of
+the top below the surface, share of the counted absorber."""
+
+STACK_DEPTH = 512  # copies of photons that wait; when full, photons are not split further
+MOST_COPIES = 16  # of one photon at one collision
+DEEPEST = 30.0  # most that the depth raises the weight at which photons are kept
+_STATE = 9  # x, y, z, ux, uy, uz, weight, path, layer
+
+
+@njit(inline="always")
+def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, tally, histogram):  # type: ignore[no-untyped-def]
+    """Add light that leaves at a distance to the fibres that reach there."""
+    bin_ = int(rho * kernels[0, 2])
+    if bin_ >= starts.shape[0]:
+        return
+    for fibre in range(starts[bin_], starts[bin_] + counts[bin_]):
+        at = (rho - kernels[fibre, 0]) * kernels[fibre, 1]
+        if at < 0.0:
+            continue
+        node = int(at)
+        if node >= kernels.shape[1] - 4:
+            continue
+        share = at - node
+        low = kernels[fibre, 3 + node]
+        score = value * (low + share * (kernels[fibre, 4 + node] - low))
+        if histogram.shape[0] == 0:
+            tally[fibre] += score
+        else:
+            position = log(1.0 + path / path_scale) / log_step
+            left = min(int(position), histogram.shape[1] - 2)
+            start = path_scale * (exp(left * log_step) - 1.0)
+            stop = path_scale * (exp((left + 1) * log_step) - 1.0)
+            part = min((path - start) / (stop - start), 1.0)
+            histogram[fibre, left] += score * (1.0 - part)
+            histogram[fibre, left + 1] += score * part
+
+
+@njit(
+    "void(float64[:,::1], float64, float64, float64[:,::1], int64[::1], int64[::1], float64[::1],"
+    " float64[::1], float64, float64, float64, float64, float64, int64, uint64[::1], float64[::1],"
+    " float64[:,::1], float64[:,::1])",
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def walk_to_fibres(  # type: ignore[no-untyped-def]
+    table, source_sine, fibre_sine, kernels, starts, counts, window, chances, per_mm,
+    deeper_per_mm, chances_per_mm, log_step, path_scale, photons, seed, tally, histogram, visited,
+):  # fmt: skip
+    """Trace photons from a point source in a cone and score what fibres take.
+
+    Parameters
+    ----------
+    table
+        Row 0 the medium above, rows 1 to n the layers, row n + 1 the medium below; see
+        `TABLE_COLUMNS`. float64, shape (n + 2, 8).
+    source_sine, fibre_sine
+        Numerical apertures of the source and of the fibres.
+    kernels
+        One row a fibre, in the order of their distance: smallest exit radius it takes (mm), nodes
+        per mm, bins of `starts` per mm, then its density (1/mm^2) at the nodes.
+        float64, shape (F, 3 + nodes + 1), the last value 0.
+    starts, counts
+        First fibre and number of fibres that reach each bin of exit radius, int64, shape (bins,).
+    window
+        Weight at which photons are kept, by their distance from the entry; lighter ones play,
+        heavier ones are split. float64, shape (cells,); the last holds for all farther ones.
+    chances
+        Probability to score a collision, by its depth; 0 where no light comes up.
+        float64, shape (levels,).
+    per_mm, chances_per_mm
+        Cells of `window` and of `chances` per mm.
+    deeper_per_mm
+        Growth of the kept weight per mm of depth, in units of that at the surface.
+    log_step, path_scale
+        Nodes of `histogram` lie at ``path_scale * (exp(log_step * k) - 1)`` mm.
+    photons
+        Photons to trace.
+    seed
+        State of the generator, not all zero, uint64, shape (4,).
+    tally
+        Light in each fibre per area, aperture^2 and photon in 1/mm^2, float64, shape (F,), added
+        to when `histogram` is empty.
+    histogram
+        The same by the path in the counted absorber, each score shared by the two nodes around it
+        so that its mean path is kept. float64, shape (F, nodes) or (0, 0), added to.
+    visited
+        Weight of scored collisions by distance from the entry; of all, in units of the weight kept
+        at their depth. float64, shape (2, cells), added to.
+    """
+    s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
+    last = table.shape[0] - 1
+    eta_above = table[0, 5]
+    cells = window.shape[0] - 1
+    levels = chances.shape[0]
+    waiting = np.empty((STACK_DEPTH, _STATE))
+    eta_ratio = eta_above / table[1, 5]
+
+    for _ in range(photons):
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        sine2 = source_sine * source_sine * u / (eta_above * eta_above)
+        reflected, mu = fresnel(sqrt(1.0 - sine2), eta_above, table[1, 5])
+        x = 0.0  # position, mm
+        y = 0.0
+        z = 0.0
+        ux = sqrt(sine2) * eta_ratio  # direction
+        uy = 0.0
+        uz = mu
+        weight = 1.0 - reflected
+        path = 0.0  # in the counted absorber, mm
+        layer = 1
+        direct = False  # unreflected since a collision that was scored
+        chance = 0.0  # that collision's: probability to be scored, layer, direction, its cosine
+        from_layer = 1
+        now_z = 1.0
+        turn = 1.0
+        alive = 0
+
+        while True:
+            top = table[layer, 0]
+            bottom = table[layer, 1]
+            sigma_t = table[layer, 2]
+            g = table[layer, 4]
+            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+            depth_left = -log(u)  # optical depth to the next collision
+
+            while True:
+                gap = bottom - z if uz > 0.0 else z - top
+                if depth_left * abs(uz) < sigma_t * gap:
+                    step = depth_left / sigma_t
+                    x += step * ux
+                    y += step * uy
+                    z += step * uz
+                    path += step * table[layer, 7]
+                    weight *= table[layer, 3]
+                    r2 = x * x + y * y
+                    cell = min(int(sqrt(r2 + z * z) * per_mm), cells)
+
+                    level = int(z * chances_per_mm)
+                    chance = chances[level] if level < levels else 0.0
+                    if chance > 0.0:
+                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                        if u <= chance:
+                            # A direction within the cone outside, uniform in projected angle.
+                            while True:
+                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                                p = 2.0 * u - 1.0
+                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                                q = 2.0 * u - 1.0
+                                norm = p * p + q * q
+                                if norm <= 1.0:
+                                    break
+                            eta = table[layer, 5]
+                            p *= fibre_sine
+                            q *= fibre_sine
+                            norm *= fibre_sine * fibre_sine  # (eta sin)^2, kept by refraction
+                            mu = sqrt(1.0 - norm / (eta * eta))
+                            turn = (ux * p + uy * q) / eta - uz * mu
+                            spread = 1.0 + g * g - 2.0 * g * turn
+                            phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))  # times pi
+                            drawn = chance * eta * eta * mu / (fibre_sine * fibre_sine)
+                            value = weight * phase / (drawn + phase)
+                            value *= eta_above * eta_above / (fibre_sine * fibre_sine)
+                            x_out = x
+                            y_out = y
+                            out_path = path
+                            at = z
+                            tau = 0.0
+                            for k in range(layer, 0, -1):
+                                eta = table[k, 5]
+                                mu = sqrt(1.0 - norm / (eta * eta))
+                                way = (at - table[k, 0]) / mu
+                                at = table[k, 0]
+                                tau += way * table[k, 2]
+                                x_out += way * p / eta
+                                y_out += way * q / eta
+                                out_path += way * table[k, 7]
+                                if eta != table[k - 1, 5]:
+                                    reflected, _mu = fresnel(mu, eta, table[k - 1, 5])
+                                    value *= 1.0 - reflected
+                            value *= exp(-tau)
+                            _on_fibres(
+                                sqrt(x_out * x_out + y_out * y_out), value, out_path, kernels,
+                                starts, counts, log_step, path_scale, tally, histogram,
+                            )  # fmt: skip
+
+                    deeper = min(1.0 + z * deeper_per_mm, DEEPEST)
+                    target = window[cell] * deeper
+                    visited[0, cell] += weight * chance
+                    visited[1, cell] += weight / deeper
+                    if weight < 0.5 * target:
+                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                        if u * target > weight:
+                            break
+                        weight = target
+                    elif weight > 2.0 * target:
+                        copies = min(int(weight / target), MOST_COPIES, STACK_DEPTH - alive + 1)
+                        if copies > 1:
+                            weight /= copies
+                            for _copy in range(copies - 1):
+                                waiting[alive, 0] = x
+                                waiting[alive, 1] = y
+                                waiting[alive, 2] = z
+                                waiting[alive, 3] = ux
+                                waiting[alive, 4] = uy
+                                waiting[alive, 5] = uz
+                                waiting[alive, 6] = weight
+                                waiting[alive, 7] = path
+                                waiting[alive, 8] = layer
+                                alive += 1
+                    # The light that goes straight on from here has been scored, in part.
+                    direct = True
+                    was_x, was_y, was_z = ux, uy, uz
+                    s0, s1, s2, s3, ux, uy, uz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
+                    from_layer, now_z = layer, uz
+                    turn = was_x * ux + was_y * uy + was_z * uz
+                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    depth_left = -log(u)
+                    continue
+
+                # The next boundary comes first.
+                step = gap / abs(uz)
+                x += step * ux
+                y += step * uy
+                path += step * table[layer, 7]
+                depth_left = max(0.0, depth_left - sigma_t * step)
+                beyond = layer + 1 if uz > 0.0 else layer - 1
+                z = bottom if uz > 0.0 else top
+                eta = table[layer, 5]
+                eta_beyond = table[beyond, 5]
+                if eta != eta_beyond:
+                    reflected, mu = fresnel(abs(uz), eta, eta_beyond)
+                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    if u <= reflected:
+                        uz = -uz
+                        direct = False
+                        continue
+                    ux *= eta / eta_beyond
+                    uy *= eta / eta_beyond
+                    uz = copysign(mu, uz)
+                if beyond == 0:
+                    sine2 = (1.0 - uz * uz) * eta_above * eta_above
+                    if sine2 <= fibre_sine * fibre_sine:
+                        share = 1.0
+                        if direct:
+                            g = table[from_layer, 4]
+                            eta = table[from_layer, 5]
+                            spread = 1.0 + g * g - 2.0 * g * turn
+                            phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))
+                            drawn = chance * eta * eta * abs(now_z) / (fibre_sine * fibre_sine)
+                            share = phase / (drawn + phase)
+                        _on_fibres(
+                            sqrt(x * x + y * y),
+                            share * weight * eta_above * eta_above / (fibre_sine * fibre_sine),
+                            path, kernels, starts, counts, log_step, path_scale, tally, histogram,
+                        )  # fmt: skip
+                    break
+                if beyond == last:
+                    break
+                layer = beyond
+                top = table[layer, 0]
+                bottom = table[layer, 1]
+                sigma_t = table[layer, 2]
+                g = table[layer, 4]
+
+            if alive == 0:
+                break
+            alive -= 1
+            x = waiting[alive, 0]
+            y = waiting[alive, 1]
+            z = waiting[alive, 2]
+            weight = waiting[alive, 6]
+            path = waiting[alive, 7]
+            layer = int(waiting[alive, 8])
+            level = int(z * chances_per_mm)
+            chance = chances[level] if level < levels else 0.0
+            direct = True
+            was_x, was_y, was_z = waiting[alive, 3], waiting[alive, 4], waiting[alive, 5]
+            s0, s1, s2, s3, ux, uy, uz = scatter(
+                s0, s1, s2, s3, was_x, was_y, was_z, table[layer, 4]
+            )
+            from_layer, now_z = layer, uz
+            turn = was_x * ux + was_y * uy + was_z * uz

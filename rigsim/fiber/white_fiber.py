@@ -1,0 +1,262 @@
+"""Reflectance in the fibre of homogeneous half spaces, from a stored Monte Carlo table.
+
+Lengths are counted in 1 / sigma_s', so that one table over the distance and sigma_a / sigma_s'
+serves every medium of g = 0.8 and eta = 1.4 under air: R_f = sigma_s'^2 F(r sigma_s', sigma_a /
+sigma_s'). The table is package data made by ``tools/make_white_fibre.py`` from the photons of
+`rigsim.fiber.profile`, for a source that is a point of numerical aperture 0.22 and for points of
+detection of the same aperture; the fibres' cores are averaged over here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib import resources
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
+
+from rigsim.fiber.profile import Fibres
+
+FloatArray = NDArray[np.float64]
+
+G: Final = 0.8
+ETA: Final = 1.4
+APERTURE: Final = 0.22
+FILE: Final = "white_fibre_mc.npz"
+
+DIFFUSES: Final = 0.01
+"""sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
+is that of diffusion to a thousandth."""
+
+DIFFUSED_FROM: Final = (12.0, 20.0)
+"""Distances between which what photons told of each goes over into what all of them tell of
+diffused light (`diffused`)."""
+DEPTH2: Final = 17.5
+"""Mean square depth of that light's source and its image, in 1 / sigma_s'^2: from the photons of
+sigma_a / sigma_s' of 0.003 to 0.009, which alone would say 17.0 to 17.4, and less surely 19.5 of
+none."""
+ALIKE: Final = 4.0
+"""Nodes of distance that share their error: the knots that photons are smoothed with."""
+DISC_RADII, DISC_TURNS = 2, 6
+"""Points in a core: rings, and points on each."""
+
+
+class WhiteFibreError(ValueError):
+    """A medium or a distance outside the table."""
+
+
+def decay(absorption: ArrayLike) -> FloatArray:
+    """Return about what the logarithm of F falls by per unit of distance, far away.
+
+    Parameters
+    ----------
+    absorption
+        sigma_a / sigma_s', any shape, >= 0.
+    """
+    a = np.asarray(absorption, np.float64)
+    return np.asarray(np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a))
+
+
+def distance_axis(distance: ArrayLike) -> FloatArray:
+    """Return the coordinate in which F is smooth, of distances in 1 / sigma_s'."""
+    return np.asarray(np.log(np.asarray(distance, np.float64) + 0.4))
+
+
+def absorption_axis(absorption: ArrayLike) -> FloatArray:
+    """Return the coordinate in which F is smooth, of sigma_a / sigma_s'."""
+    return np.asarray(np.log1p(20.0 * np.sqrt(np.asarray(absorption, np.float64))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteFibre:
+    """The table."""
+
+    distance: FloatArray
+    """Nodes in 1 / sigma_s', increasing, > 0, shape (D,)."""
+    absorption: FloatArray
+    """Nodes of sigma_a / sigma_s', increasing from 0, shape (A,)."""
+    shape: FloatArray
+    """log(F distance) + decay(absorption) distance, shape (D, A)."""
+    relative_error: FloatArray
+    """Relative standard error of F, shape (D, A)."""
+    recipe: Mapping[str, Any]
+    """What it was made with."""
+
+    @staticmethod
+    @cache
+    def load() -> WhiteFibre:
+        """Return the stored table, read-only."""
+        path = resources.files("rigsim").joinpath("data", FILE)
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            arrays = {
+                name: np.asarray(stored[name], np.float64)
+                for name in ("distance", "absorption", "shape", "relative_error")
+            }
+            recipe = json.loads(str(stored["recipe"]))
+        for array in arrays.values():
+            array.setflags(write=False)
+        return WhiteFibre(**arrays, recipe=recipe)
+
+    def holds(self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibres: Fibres) -> bool:
+        """Return whether a medium under some fibres is inside the table."""
+        if not sigma_s_prime_per_mm > 0.0:
+            return False
+        both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
+        near, far = min(fibres.radii_mm) - both, max(fibres.radii_mm) + both
+        apertures = (fibres.numerical_aperture, fibres.source_numerical_aperture)
+        return bool(
+            apertures == (APERTURE, APERTURE)
+            and near * sigma_s_prime_per_mm >= self.distance[0]
+            and (
+                far * sigma_s_prime_per_mm <= self.distance[-1]
+                or sigma_a_per_mm / sigma_s_prime_per_mm <= DIFFUSES
+            )
+            and sigma_a_per_mm / sigma_s_prime_per_mm <= self.absorption[-1]
+        )
+
+    def profile(
+        self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibres: Fibres
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what fibres take.
+
+        Parameters
+        ----------
+        sigma_a_per_mm, sigma_s_prime_per_mm
+            Coefficients, 1/mm.
+        fibres
+            The fibres; both apertures 0.22.
+
+        Returns
+        -------
+        reflectance_per_mm2, stderr : ndarray
+            R_f in 1/mm^2 and its standard error, shape (F,). Errors of neighbours, and of similar
+            media, are correlated.
+
+        Raises
+        ------
+        WhiteFibreError
+            Outside the table.
+
+        Examples
+        --------
+        >>> r_f, error = WhiteFibre.load().profile(0.04, 1.5, Fibres((0.3, 3.3)))
+        >>> bool(r_f[0] > 20.0 * r_f[1] > 0.0), bool((error < 0.01 * r_f).all())
+        (True, True)
+        """
+        if not self.holds(sigma_a_per_mm, sigma_s_prime_per_mm, fibres):
+            raise WhiteFibreError(
+                f"sigma_a, sigma_s': got {sigma_a_per_mm}, {sigma_s_prime_per_mm} 1/mm, expected "
+                "both, and the fibres, inside the table"
+            )
+        apart, share = distances(fibres)
+        scaled = apart * sigma_s_prime_per_mm
+        a = sigma_a_per_mm / sigma_s_prime_per_mm
+        shape, error = _splines()
+        held = np.minimum(scaled, self.distance[-1])
+        x = distance_axis(held)
+        y = np.full_like(x, float(absorption_axis(a)))
+        fall = float(decay(a))
+        log_f = shape.ev(x, y) - np.log(held) - fall * scaled
+        # beyond the table: log_f has gone on with the fall of the last distance
+        log_f += (diffused(scaled, a) + fall * scaled) - (diffused(held, a) + fall * held)
+        each = share * np.exp(log_f)
+        value = sigma_s_prime_per_mm**2 * each.sum(axis=1)
+        relative = error(np.stack([x, y], axis=-1))
+        return value, np.asarray((relative * each).sum(axis=1) / each.sum(axis=1) * value)
+
+
+def diffused(distance: FloatArray, absorption: float) -> FloatArray:
+    """Return the logarithm of diffused light far from its source, up to a constant.
+
+    That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 + `DEPTH2`, and
+    k of transport theory to the second order of the phase function.
+
+    Parameters
+    ----------
+    distance
+        In 1 / sigma_s', any shape.
+    absorption
+        sigma_a / sigma_s'.
+    """
+    a = absorption
+    k = np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a / (1.0 + G))
+    d = np.sqrt(distance**2 + DEPTH2)
+    return np.asarray(np.log1p(k * d) - k * d - 3.0 * np.log(d))
+
+
+def _of_all(table: WhiteFibre) -> tuple[FloatArray, FloatArray]:
+    """Return shape and error with far nodes of weak absorption told by all of them together."""
+    shape, error = table.shape.copy(), table.relative_error.copy()
+    near, far = DIFFUSED_FROM
+    rows = table.distance > near
+    x = table.distance[rows]
+    share = np.clip(np.log(x / near) / np.log(far / near), 0.0, 1.0)
+    for column in np.flatnonzero(table.absorption <= DIFFUSES):
+        a = float(table.absorption[column])
+        curve = diffused(x, a) + np.log(x) + float(decay(a)) * x
+        weight = 1.0 / error[rows, column] ** 2
+        level = (weight * (shape[rows, column] - curve)).sum() / weight.sum()
+        shape[rows, column] += share * (curve + level - shape[rows, column])
+        together = np.sqrt(ALIKE / weight.sum())
+        error[rows, column] += share * (together - error[rows, column])
+    return shape, error
+
+
+@cache
+def _splines() -> tuple[RectBivariateSpline, RegularGridInterpolator]:
+    table = WhiteFibre.load()
+    axes = distance_axis(table.distance), absorption_axis(table.absorption)
+    shape, error = _of_all(table)
+    return RectBivariateSpline(*axes, shape, s=0.0), RegularGridInterpolator(axes, error)
+
+
+@lru_cache(maxsize=8)
+def distances(fibres: Fibres) -> tuple[FloatArray, FloatArray]:
+    """Return distances of pairs of points, one in each core, and their shares.
+
+    Parameters
+    ----------
+    fibres
+        The fibres.
+
+    Returns
+    -------
+    distance_mm, share : ndarray
+        Shape (F, pairs), mm, and shares that sum to 1 in each row.
+
+    Examples
+    --------
+    >>> apart, share = distances(Fibres((0.3,), 0.2, 0.2))
+    >>> round(float(apart.min()), 2) >= 0.1, round(float((share * apart**2).sum()), 6)
+    (True, 0.1)
+    """
+    one, weight = disc_points(DISC_RADII, DISC_TURNS)
+    target = 0.5 * fibres.core_mm * one
+    source = 0.5 * fibres.source_core_mm * one
+    offset = (target[:, None, :] - source[None, :, :]).reshape(-1, 2)
+    share = np.outer(weight, weight).reshape(-1)
+    radii = np.array(fibres.radii_mm)[:, None]
+    apart = np.hypot(radii + offset[:, 0], offset[:, 1])
+    return apart, np.broadcast_to(share, apart.shape)
+
+
+def disc_points(rings: int, turns: int) -> tuple[FloatArray, FloatArray]:
+    """Return points in the unit disc, shape (rings turns, 2), and their shares of its area.
+
+    Examples
+    --------
+    >>> points, share = disc_points(2, 6)
+    >>> round(float(share @ (points**2).sum(axis=1)), 12)  # the mean of r^2
+    0.5
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    radius = np.sqrt(0.5 * (nodes + 1.0))
+    turn = 2.0 * math.pi * (np.arange(turns) + 0.25) / turns
+    points = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return points.reshape(-1, 2), np.repeat(0.5 * weights / turns, turns)

@@ -1,0 +1,1 @@
+"""Meshes, texture atlases and noise on surfaces."""

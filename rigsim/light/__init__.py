@@ -1,0 +1,1 @@
+"""Light on skin: BRDF, shadows, interreflection and lateral scattering."""

@@ -1,0 +1,176 @@
+"""Light from skin to skin, between coarse patches of a face.
+
+Light that leaves the interior of one patch falls on another, enters it and leaves again. Patches
+are the texels of a coarse texture; the exchange between two that see each other is that of two
+points, each with the boundary's transmittance at its own angle. The series over bounces is summed
+until what is left is below `ENOUGH`.
+
+Notes
+-----
+Only light from inside is passed on, and it is taken up by the interior only: highlights of lit skin
+on skin, and lit skin mirrored in skin, are left out (a few percent of a few percent).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numba import njit, prange
+from scipy import sparse
+
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.surface_brdf import through
+from rigsim.render import OFFSET_MM, Caster
+
+ENOUGH: Final = 1e-3
+"""Share of the first bounce below which further ones are left out."""
+
+MOST_BOUNCES: Final = 30
+
+PATCHES: Final = 96
+"""Texels along one side of the coarse texture. On a pale head under one light what comes by other
+skin, 1 % of all, is 16 % low with 64, 6 % with 96 and 4 % with 128, against Mitsuba."""
+
+PAIRS_AT_ONCE: Final = 1 << 21
+
+
+class SkinBounce:
+    """How light goes from patch to patch on one face.
+
+    Parameters
+    ----------
+    caster
+        The face's mesh.
+    patches
+        Texels along one side of the coarse texture, >= 8.
+    """
+
+    def __init__(self, caster: Caster, *, patches: int = PATCHES) -> None:
+        self.mesh = caster.mesh
+        self.atlas = unwrap(caster.mesh, patches)
+        covered = self.atlas.covered
+        self._covered = covered
+        point = self.atlas.position_mm[covered]
+        normal = self.atlas.normal[covered]
+        self._area_mm2 = _texel_area(self.atlas)[covered]
+        self.exchange = _exchange(caster, point, normal, self._area_mm2)
+        """Light that enters a row's patch per light that has been inside a column's patch and is
+        sent out with R_d 1, shape (P, P), sparse."""
+
+    def coarsen(self, texture: Float32Array) -> Float32Array:
+        """Average a texture over the patches, shape (P, C), from shape (N, N, C)."""
+        size, coarse = texture.shape[0], self.atlas.size
+        row = np.arange(size) * coarse // size
+        sums = np.zeros((coarse, coarse, texture.shape[2]), np.float64)
+        count = np.zeros((coarse, coarse), np.float64)
+        np.add.at(sums, (row[:, None], row[None, :]), texture)
+        np.add.at(count, (row[:, None], row[None, :]), 1.0)
+        mean = sums / np.maximum(count, 1.0)[..., None]
+        return np.asarray(mean[self._covered], np.float32)
+
+    def surface(self) -> tuple[Float32Array, Float32Array]:
+        """Return the patches' middles in mm and their normals, shape (1, P, 3) each."""
+        return (
+            self.atlas.position_mm[self._covered][None],
+            self.atlas.normal[self._covered][None],
+        )
+
+    def indirect(
+        self, entered: Float32Array, r_d: Float32Array, *, enough: float = ENOUGH
+    ) -> Float32Array:
+        """Return what enters by way of other skin.
+
+        Parameters
+        ----------
+        entered
+            Light that enters each patch directly, shape (P,).
+        r_d
+            Factor of the diffuse term, shape (P, C).
+        enough
+            Share of the first bounce below which further ones are left out.
+
+        Returns
+        -------
+        ndarray of float32
+            Light that enters after one or more bounces, same unit, as the coarse texture, shape
+            (N, N, C), 0 where the texture has no surface.
+        """
+        latest = self.exchange @ (r_d * entered[:, None])
+        total = latest.copy()
+        least = enough * float(np.abs(latest).max(initial=0.0))
+        for _ in range(MOST_BOUNCES):
+            if not float(np.abs(latest).max(initial=0.0)) > least:
+                break
+            latest = self.exchange @ (r_d * latest)
+            total += latest
+        out = np.zeros((*self._covered.shape, r_d.shape[1]), np.float32)
+        out[self._covered] = total
+        return out
+
+
+_living: WeakValueDictionary[int, SkinBounce] = WeakValueDictionary()
+
+
+def bounce_on(caster: Caster) -> SkinBounce:
+    """Return the exchange on a mesh, the same as long as anybody holds it."""
+    found = _living.get(id(caster.mesh))  # which is the mesh's own while the exchange holds it
+    if found is None:
+        found = _living[id(caster.mesh)] = SkinBounce(caster)
+    return found
+
+
+def _texel_area(atlas: Atlas) -> Float32Array:
+    cross = np.cross(atlas.dp_du_mm, atlas.dp_dv_mm)
+    return np.asarray(np.linalg.norm(cross, axis=-1) / atlas.size**2, np.float32)
+
+
+def _exchange(
+    caster: Caster, point: Float32Array, normal: Float32Array, area: Float32Array
+) -> sparse.csr_array:
+    count = len(point)
+    rows, columns, values = [], [], []
+    step = max(1, PAIRS_AT_ONCE // count)
+    for first in range(0, count, step):
+        block = np.arange(first, min(first + step, count))
+        strength = np.zeros((len(block), count - first), np.float32)
+        _form(point, normal, first, strength)
+        i, j = np.nonzero(strength)
+        start = point[block[i]] + np.float32(OFFSET_MM) * normal[block[i]]
+        way = point[first + j] + np.float32(OFFSET_MM) * normal[first + j] - start
+        length = np.linalg.norm(way, axis=-1)
+        way /= length[:, None]
+        free = ~caster.blocked(start, way, 0.999 * length)
+        i, j = i[free], j[free]
+        share = strength[i, j]
+        # what two patches send each other goes along one line: it is traced once
+        for here, there in ((block[i], first + j), (first + j, block[i])):
+            # A patch that is near is no point: its whole hemisphere holds no more than all light.
+            values.append(share * area[there] / (math.pi + share * area[there]))
+            rows.append(here)
+            columns.append(there)
+    shape = (count, count)
+    pairs = (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_array((np.concatenate(values), pairs), shape=shape)
+
+
+@njit(parallel=True, cache=True)
+def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
+    """Write cos cos T T / d^2 for pairs that face each other, of each the first alone."""
+    for n in prange(out.shape[0]):
+        i = first + n
+        for j in range(i + 1, first + out.shape[1]):
+            x = float(point[j, 0]) - point[i, 0]
+            y = float(point[j, 1]) - point[i, 1]
+            z = float(point[j, 2]) - point[i, 2]
+            here = x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]
+            there = -(x * normal[j, 0] + y * normal[j, 1] + z * normal[j, 2])
+            if here <= 0.0 or there <= 0.0:
+                continue
+            squared = x * x + y * y + z * z
+            length = math.sqrt(squared)
+            here, there = min(here / length, 1.0), min(there / length, 1.0)
+            out[n, j - first] = here * there * through(here) * through(there) / squared

@@ -1,0 +1,167 @@
+"""The color of light that went from skin to skin: reflected twice or more, so redder than once.
+
+A camera's channel is a sum over wavelengths. What is reflected once may be summed before, as its
+channel's mean reflectance; a product of two reflectances may not: in skin's red channel, which
+blood and melanin make uneven, the mean of the square is larger than the square of the mean.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import View
+from model import spectra
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.interreflection import ENOUGH, SkinBounce
+from rigsim.subject import Subject
+from rigsim.tissue.skin_table import SkinTable
+
+STEPS: Final = (5, 3, 2)
+"""Every how many of the table's wavelengths may be summed at, the most first: the ends stay."""
+
+LEAST: Final = 1e-6
+"""Reflectance and cover below which a patch has no color."""
+
+
+class BounceColor:
+    """How light goes from skin to skin on one face in one state, seen by one camera.
+
+    Parameters
+    ----------
+    bounce
+        How light goes from patch to patch.
+    subject, state
+        Whose skin, in which state of its blood.
+    r_d
+        Factor of the diffuse term per channel with what covers the skin, shape (N, N, 3).
+    reflectance
+        White-balanced reflectance of the skin per channel, shape (N, N, 3).
+    camera, light
+        Names known to `model.spectra`.
+    spectral
+        Whether wavelengths are told apart; without, each channel is taken as one.
+    step
+        Every how many of the table's wavelengths are summed at, 1 or one of `STEPS`.
+    enough
+        Share of the first bounce below which further ones are left out.
+    """
+
+    def __init__(
+        self,
+        bounce: SkinBounce,
+        subject: Subject,
+        state: str,
+        r_d: Float32Array,
+        reflectance: Float32Array,
+        *,
+        camera: str,
+        light: str,
+        spectral: bool = True,
+        step: int = 1,
+        enough: float = ENOUGH,
+    ) -> None:
+        self._bounce, self._enough = bounce, enough
+        covered = subject.atlas.covered.astype(np.float32)
+        blood = subject.hemoglobin(state)
+        factor = r_d / np.maximum(reflectance, np.float32(LEAST))
+        layers = np.dstack([covered, subject.melanin, blood, factor, r_d]) * covered[..., None]
+        coarse = bounce.coarsen(np.asarray(layers, np.float32))
+        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(LEAST))
+        self._r_d = np.ascontiguousarray(coarse[:, 6:])
+        self._weights: Float32Array | None = None
+        if spectral:
+            table = SkinTable.load()
+            weights = spectra.band_weights(camera, light, table.wavelength_nm[::step])
+            skin = table.spectra(coarse[:, 1], coarse[:, 2])[:, ::step]
+            # what covers the skin (hair, makeup) is gray beside it
+            cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
+            self._spectrum = np.asarray(skin * cover, np.float32)
+            self._channel = np.maximum(self._spectrum @ weights, LEAST).astype(np.float32)
+            self._weights = np.asarray(weights, np.float32)
+
+    def entering(self, direct: Float32Array) -> Float32Array:
+        """Return the light that enters by way of other skin.
+
+        Parameters
+        ----------
+        direct
+            Light that enters each patch directly, shape (P,).
+
+        Returns
+        -------
+        ndarray of float32
+            As the coarse texture, shape (n, n, 3), same unit: multiplied by the patch's reflectance
+            in a channel it gives what leaves in that channel.
+        """
+        if self._weights is None:
+            return self._bounce.indirect(direct, self._r_d, enough=self._enough)
+        each = self._bounce.indirect(direct, self._spectrum, enough=self._enough)
+        covered = self._bounce.atlas.covered
+        out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
+        out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
+        return out
+
+    def on_texture(self, direct: Float32Array, size: int) -> Float32Array:
+        """Return `entering` on a texture of so many texels a side, shape (size, size, 3)."""
+        from rigsim.geometry.atlas import sample, spread
+
+        coarse = self.entering(direct)
+        filled = spread(coarse, self._bounce.atlas.covered, steps=2)
+        middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)
+        u, v = np.meshgrid(middle, middle[::-1])
+        uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
+        return sample(filled, uv, np.ones((size, size), np.bool_))
+
+
+def color_error(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+    """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
+
+    Of typical skin.
+    """
+    table = SkinTable.load()
+    weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
+    covered = subject.atlas.covered
+    blood = subject.hemoglobin(state)
+    skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
+    return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
+
+
+def step_error(
+    subject: Subject, state: str, camera: str, light: str, step: int
+) -> NDArray[np.float64]:
+    """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
+
+    Parameters
+    ----------
+    subject, state
+        Whose skin, in which state.
+    camera, light
+        Names known to `model.spectra`.
+    step
+        Every how many of the table's wavelengths are summed at.
+
+    Returns
+    -------
+    ndarray
+        Relative, shape (3,): the most for light that goes between any two of the face's extremes
+        and middles of melanin and blood, by its mean of products over its mean.
+    """
+    table = SkinTable.load()
+    covered = subject.atlas.covered
+    ends = [
+        [part.min(), np.median(part), part.max()]
+        for part in (subject.melanin[covered], subject.hemoglobin(state)[covered])
+    ]
+    melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
+    skin = table.spectra(melanin, blood)
+
+    def bounced(every: int) -> NDArray[np.float64]:
+        weights = spectra.band_weights(camera, light, table.wavelength_nm[::every])
+        some = skin[:, ::every]
+        twice = np.einsum("al,bl,lc->abc", some, some, weights)
+        return np.asarray(twice / (some @ weights)[None], np.float64)
+
+    return np.asarray(np.abs(bounced(step) / bounced(1) - 1.0).max(axis=(0, 1)), np.float64)

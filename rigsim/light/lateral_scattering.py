@@ -1,0 +1,171 @@
+"""What leaves the inside of a face under one lamp: light that spread sideways, or came from skin.
+
+The light that enters is gathered in the face's texture; it spreads by the same lateral transport as
+in the flash rig (`rigsim.light.subsurface_radiance.spread_pattern` says how well that holds), and comes from
+other skin by `rigsim.light.interreflection`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from rigsim import shading
+from rigsim.geometry.atlas import spread
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light import lateral
+from rigsim.light.interreflection import SkinBounce
+from rigsim.light.interreflection_color import BounceColor
+from rigsim.light.olat import Lamp
+from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.subsurface_radiance import HAIR_REFLECTANCE, PIGMENT_BLUR_MM, typical_kernels
+from rigsim.light.surface_brdf import SkinSurface
+from rigsim.render import Caster, visibility
+from rigsim.subject import Subject
+from rigsim.tissue.skin_color import skin_color
+from rigsim.tissue.skin_layers import ETA
+
+SHADOW_SAMPLES: Final = 4
+"""Points on the lamp that cast shadows on each texel."""
+
+
+class SkinBleeding:
+    """One face, ready to be lit from within.
+
+    Parameters
+    ----------
+    subject
+        The face.
+    surface
+        Its reflection.
+    caster
+        Its mesh.
+    camera, light
+        Names known to `model.spectra`.
+    subsurface
+        Whether light spreads sideways.
+    bounce
+        How light goes from skin to skin; None leaves that out.
+    spectral
+        Whether that light is reflected wavelength by wavelength.
+    enough
+        Share of the first bounce below which further ones are left out.
+    relief
+        What of the texture's relief hides lights; None: nothing.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        surface: SkinSurface,
+        caster: Caster,
+        *,
+        camera: str,
+        light: str,
+        subsurface: bool,
+        bounce: SkinBounce | None,
+        spectral: bool = True,
+        enough: float = 1e-3,
+        relief: ReliefShadow | None = None,
+    ) -> None:
+        self._relief = relief
+        self._subject, self._surface, self._caster = subject, surface, caster
+        self.subsurface = subsurface
+        self._bounce = bounce
+        if bounce is not None:
+            self._color = BounceColor(
+                bounce, subject, "neutral", surface.r_d, surface.reflectance,
+                camera=camera, light=light, spectral=spectral, enough=enough,
+            )  # fmt: skip
+        if subsurface:
+            blood = subject.hemoglobin("neutral")
+            clear = skin_color(camera, light).rgb(np.zeros_like(subject.melanin), blood)
+            log_m = np.log(surface.reflectance / clear) * np.float32(0.5)
+            blurred = lateral.spread_light(log_m, subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1)))
+            self._kernels = typical_kernels(subject, "neutral", camera, light)
+            self._pigment = np.exp(blurred)
+            self._inside = self._pigment * clear
+
+    def glow(self, lamp: Lamp) -> Float32Array:
+        """Return what leaves the interior before the boundary.
+
+        Parameters
+        ----------
+        lamp
+            The light, in the frame of the mesh, of intensity 1 mm^2 on its axis.
+
+        Returns
+        -------
+        ndarray of float32
+            pi times radiance, shape (N, N, 3): with lateral transport all light from inside,
+            without it only that which came from other skin; multiplied by the boundary's
+            transmittance it is what a camera sees.
+        """
+        subject, surface = self._subject, self._surface
+        atlas = subject.atlas
+        covered = atlas.covered[..., None]
+        came: Float32Array | None = None
+        if self._bounce is not None:
+            point, normal = self._bounce.surface()
+            direct = entering(self._caster, lamp, point, normal, normal)[0]
+            came = self._color.on_texture(direct, atlas.size)
+        if not self.subsurface:
+            if came is None:
+                raise ValueError("glow: got neither subsurface nor bounce, expected one")
+            return spread(surface.r_d * came, atlas.covered)
+        entered = entering(self._caster, lamp, atlas.position_mm, surface.normal, atlas.normal)
+        if self._relief is not None:
+            entered *= self._relief.on_texture(
+                atlas.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm
+            )
+        light = entered[..., None] if came is None else entered[..., None] + came
+        light = np.where(covered, light, np.float32(0.0))
+        spreading = np.ascontiguousarray(self._inside * light, np.float32)
+        weights = self._kernels.weights
+        scale = np.float32(shading.interior_scale(ETA))
+        skin = lateral.spread_light(spreading, atlas, self._kernels.sigmas_mm, weights)
+        hair = subject.hair[..., None]
+        over = hair * np.asarray(HAIR_REFLECTANCE, np.float32) * light
+        return spread(scale * ((1.0 - hair) * self._pigment * skin + over), atlas.covered)
+
+
+def entering(
+    caster: Caster,
+    lamp: Lamp,
+    position_mm: Float32Array,
+    normal: Float32Array,
+    mesh_normal: Float32Array,
+) -> Float32Array:
+    """Return the light of a lamp that enters, for an intensity of 1 mm^2 on its axis.
+
+    Parameters
+    ----------
+    caster
+        The mesh that casts shadows.
+    lamp
+        The light.
+    position_mm, normal, mesh_normal
+        Points, their normals with relief, and those of the mesh, shape (..., 3).
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (...).
+    """
+    seen = visibility(
+        caster,
+        position_mm,
+        mesh_normal,
+        lamp.position_mm,
+        radius_mm=lamp.radius_mm,
+        samples=SHADOW_SAMPLES,
+    )
+    way = np.asarray(lamp.position_mm, np.float32) - position_mm
+    squared = np.sum(way * way, axis=-1)
+    way /= np.sqrt(squared)[..., None]
+    cosine = np.clip(np.sum(way * normal, axis=-1), 0.0, 1.0)
+    off = np.maximum(-(way @ np.asarray(lamp.axis, np.float32)), 0.0)
+    rs, rp = shading.fresnel_amplitudes(cosine, ETA)
+    passed = 1.0 - 0.5 * (rs * rs + rp * rp)
+    return np.asarray(seen * cosine * off**lamp.exponent * passed / squared, np.float32)

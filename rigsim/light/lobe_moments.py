@@ -1,0 +1,400 @@
+"""What a surface element sends to the camera from a sphere of LEDs, as four moments of the light.
+
+Every lighting condition of the sphere weighs LED k by a sum of 1 and the coordinates w_k of its
+direction. So four sums over the LEDs, with weights 1, x, y and z, give all conditions: of the
+surface's reflection as Stokes vectors, which serve any analyser, and of the light that enters.
+
+The sums are smooth functions of the normal and of the place in the field, and are looked up in a
+table; `direct_moments` is the sum itself.
+
+Notes
+-----
+The table's axes are p = n_xy / (1 + n_z), half the tilt's tangent: a facet's reflection turns with
+its half angle, so the lobe is about equally wide everywhere. Between nodes values are interpolated
+with cubics in p (Catmull and Rom 1974) and linearly over the field. Steeper normals than
+`STEEPEST_DEG` are summed directly.
+
+The LEDs are points here. They stand about 17 degrees apart, so that facets that mirror neighbours
+into the camera differ by 8.5 degrees: a lobe narrower than that resolves them, and the sum over
+the normal shows their lattice. `ripple` measures it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim import shading
+from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.geometry.mesh import Float32Array
+
+FloatArray = NDArray[np.float64]
+
+STEEPEST_DEG: Final = 70.0
+"""Tilt of normals up to which the table is used."""
+
+CHANNELS: Final = 16
+"""Numbers in a table's node: 4 moments x 3 Stokes parameters, then 4 moments of entering light."""
+
+
+class MomentError(ValueError):
+    """A table or a sum of moments is asked for wrongly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """How a surface element reflects, and who looks at it."""
+
+    alpha: float
+    """GGX roughness, 1e-3 to 1."""
+    eta: float
+    """Refractive index of the interior, > 1."""
+    eye_mm: tuple[float, float, float]
+    """Place of the camera, mm, rig frame."""
+    image_right: tuple[float, float, float]
+    """The image's x axis, unit vector."""
+    extinction: float
+    """Extinction ratio of the LEDs' films, > 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Sums over the LEDs for some surface elements."""
+
+    specular: Float32Array
+    """Stokes vectors of the surface's reflection, shape (N, 4, 3), radiance in 1/sr per unit of
+    `irradiance_share`; the moments in the order of `rigsim.as_built.sphere.MOMENTS`."""
+    entering: Float32Array
+    """Light that enters, shape (N, 4), cosine included."""
+
+    def packed(self) -> Float32Array:
+        """Return both as shape (N, `CHANNELS`)."""
+        count = len(self.entering)
+        return np.concatenate([self.specular.reshape(count, 12), self.entering], axis=1)
+
+
+def irradiance_share(
+    sphere: BuiltSphere, places_mm: ArrayLike, led: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return where an LED is seen, and its irradiance across the beam, its film aside.
+
+    Parameters
+    ----------
+    sphere
+        The LEDs; their lobes point at the origin.
+    places_mm
+        Points, shape (N, 3).
+    led
+        Index of the LED.
+
+    Returns
+    -------
+    to_light : ndarray
+        Unit vectors, shape (N, 3).
+    share : ndarray
+        Intensity times the square of 600 mm over distance squared, shape (N,).
+    """
+    place = sphere.position_mm[led]
+    way = place - np.asarray(places_mm, np.float64)
+    square = np.einsum("ni,ni->n", way, way)
+    to_light = way / np.sqrt(square)[:, None]
+    off = np.clip(to_light @ (place / np.linalg.norm(place)), 0.0, 1.0)
+    half_deg = sphere.nominal.lights[led].half_intensity_deg
+    lobe = 1.0 if half_deg is None else off ** (math.log(0.5) / math.log(math.cos(
+        math.radians(half_deg))))  # fmt: skip
+    return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
+
+
+def led_moments(
+    normals: ArrayLike,
+    places_mm: ArrayLike,
+    sphere: BuiltSphere,
+    led: int,
+    surface: Surface,
+    *,
+    alpha: ArrayLike | None = None,
+) -> tuple[Float32Array, Float32Array]:
+    """Return what one LED adds, before its weights: Stokes vectors (N, 3) and entering light (N,).
+
+    Parameters
+    ----------
+    normals, places_mm
+        Unit normals, and points in mm, shape (N, 3).
+    sphere, led
+        The LED.
+    surface
+        How it is reflected.
+    alpha
+        Roughness of each, shape (N,); None takes the surface's.
+    """
+    points = np.asarray(places_mm, np.float64)
+    to_light, share = irradiance_share(sphere, points, led)
+    to_camera = np.asarray(surface.eye_mm) - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    specular = shading.specular_stokes(
+        normals,
+        to_light,
+        to_camera,
+        surface.alpha if alpha is None else alpha,
+        eta=surface.eta,
+        light_absorbs=sphere.absorbs[led],
+        image_right=surface.image_right,
+        extinction=surface.extinction,
+    )
+    entry = shading.entry_transmittance(
+        normals,
+        to_light,
+        eta=surface.eta,
+        light_absorbs=sphere.absorbs[led],
+        extinction=surface.extinction,
+    )
+    cosine = np.einsum("ni,ni->n", np.asarray(normals, np.float32), to_light.astype(np.float32))
+    entry = entry * np.maximum(cosine, np.float32(0.0))
+    scale = share.astype(np.float32)
+    return specular * scale[:, None], np.asarray(entry * scale, np.float32)
+
+
+def direct_moments(
+    normals: ArrayLike,
+    places_mm: ArrayLike,
+    sphere: BuiltSphere,
+    surface: Surface,
+    *,
+    leds: Sequence[int] | None = None,
+    alpha: ArrayLike | None = None,
+) -> Moments:
+    """Sum over the LEDs one by one.
+
+    Parameters
+    ----------
+    normals
+        Unit normals, shape (N, 3), rig frame.
+    places_mm
+        Points, mm, shape (N, 3) or (3,).
+    sphere
+        The LEDs.
+    surface
+        How the surface reflects.
+    leds
+        Which LEDs; None takes all.
+    alpha
+        Roughness of each, shape (N,); None takes the surface's.
+
+    Returns
+    -------
+    Moments
+    """
+    n = np.asarray(normals, np.float32)
+    points = np.broadcast_to(np.asarray(places_mm, np.float64), n.shape)
+    specular = np.zeros((len(n), 4, 3))
+    entering = np.zeros((len(n), 4))
+    weights = sphere.weights
+    for led in range(len(weights)) if leds is None else leds:
+        if sphere.intensity[led] == 0.0:
+            continue
+        stokes, entry = led_moments(n, points, sphere, led, surface, alpha=alpha)
+        specular += weights[led][None, :, None] * stokes[:, None, :]
+        entering += weights[led][None, :] * entry[:, None]
+    return Moments(specular.astype(np.float32), entering.astype(np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MomentTable:
+    """Moments over normal and place in the field."""
+
+    values: Float32Array
+    """Shape (alphas, fields, fields, size, size, `CHANNELS`): y, x, then p_y, p_x, all upwards."""
+    alphas: FloatArray
+    """Roughnesses, evenly spaced, 1 or 3 of them; in between by a parabola."""
+    half_field_mm: float
+    """The field's nodes go from minus to plus this."""
+    reach: float
+    """The nodes of p go from minus to plus this."""
+
+    def covers(self, normals: Float32Array) -> NDArray[np.bool_]:
+        """Return which normals the table holds, shape (N,)."""
+        return np.asarray(normals[:, 2] >= np.float32(math.cos(math.radians(STEEPEST_DEG))))
+
+    def lookup(
+        self,
+        normals: Float32Array,
+        x_mm: Float32Array,
+        y_mm: Float32Array,
+        alpha: Float32Array | None = None,
+    ) -> Float32Array:
+        """Return the moments of normals within `STEEPEST_DEG`, shape (N, `CHANNELS`).
+
+        Parameters
+        ----------
+        normals
+            Unit normals, shape (N, 3); steeper ones get zeros.
+        x_mm, y_mm
+            Places, shape (N,); beyond the field that of its border.
+        alpha
+            Roughness, shape (N,), within that of the table; None takes the middle one.
+        """
+        nodes = len(self.alphas)
+        share = np.zeros((len(normals), nodes), np.float32)
+        share[:, nodes // 2] = 1.0
+        if nodes > 1 and alpha is not None:
+            t = (alpha - np.float32(self.alphas[1])) / np.float32(self.alphas[1] - self.alphas[0])
+            share[:, 0], share[:, 1], share[:, 2] = 0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)
+        out = np.zeros((len(normals), CHANNELS), np.float32)
+        _lookup(
+            self.values,
+            np.float32(self.half_field_mm),
+            np.float32(self.reach),
+            np.float32(math.cos(math.radians(STEEPEST_DEG))),
+            np.ascontiguousarray(normals, np.float32),
+            np.ascontiguousarray(x_mm, np.float32),
+            np.ascontiguousarray(y_mm, np.float32),
+            share,
+            out,
+        )
+        return out
+
+
+def build_table(
+    sphere: BuiltSphere,
+    surface: Surface,
+    *,
+    half_field_mm: float,
+    alpha_range: tuple[float, float] | None = None,
+    size: int = 97,
+    fields: int = 3,
+    leds: Sequence[int] | None = None,
+) -> MomentTable:
+    """Tabulate the moments.
+
+    Parameters
+    ----------
+    sphere, surface, leds
+        As for `direct_moments`.
+    half_field_mm
+        Half the side of the field, mm, > 0.
+    alpha_range
+        Least and largest roughness; None takes that of the surface alone.
+    size
+        Nodes along each axis of the normals, >= 9.
+    fields
+        Nodes along each side of the field, >= 2.
+
+    Returns
+    -------
+    MomentTable
+
+    Raises
+    ------
+    MomentError
+        Too few nodes, or no field.
+    """
+    if size < 9 or fields < 2:
+        raise MomentError(f"size, fields: got {size}, {fields}, expected at least 9 and 2")
+    if not half_field_mm > 0.0:
+        raise MomentError(f"half_field_mm: got {half_field_mm}, expected > 0")
+    # one node more than the cubic needs beyond the steepest normal
+    edge = math.tan(0.5 * math.radians(STEEPEST_DEG))
+    reach = edge * (size - 1) / (size - 1 - 4)
+    axis = np.linspace(-reach, reach, size)
+    py, px = np.meshgrid(axis, axis, indexing="ij")
+    square = px**2 + py**2
+    inside = square <= (edge + 2.1 * math.sqrt(2.0) * (axis[1] - axis[0])) ** 2
+    normals = (np.stack([2 * px, 2 * py, 1 - square], axis=-1) / (1 + square)[..., None])[inside]
+    nodes = np.linspace(-half_field_mm, half_field_mm, fields)
+    low, high = alpha_range or (surface.alpha, surface.alpha)
+    alphas = np.array([low]) if high <= low else np.linspace(low, high, 3)
+    values = np.zeros((len(alphas), fields, fields, size, size, CHANNELS), np.float32)
+    # few long sums: one for each LED, over all nodes
+    k, row, column, node = np.meshgrid(
+        np.arange(len(alphas)), np.arange(fields), np.arange(fields), np.arange(len(normals)),
+        indexing="ij",
+    )  # fmt: skip
+    places = np.stack([nodes[column], nodes[row], np.zeros(row.shape)], axis=-1).reshape(-1, 3)
+    found = direct_moments(
+        normals[node.ravel()], places, sphere, surface, leds=leds, alpha=alphas[k.ravel()]
+    )
+    values[:, :, :, inside] = found.packed().reshape(*row.shape, CHANNELS)
+    return MomentTable(values, alphas, half_field_mm, reach)
+
+
+def ripple(sphere: BuiltSphere, surface: Surface, *, steepest_deg: float = 25.0) -> float:
+    """Return how much the lattice of LEDs shows in the reflection of light from everywhere.
+
+    Parameters
+    ----------
+    sphere, surface
+        As for `direct_moments`.
+    steepest_deg
+        Tilt up to which normals are tried.
+
+    Returns
+    -------
+    float
+        Standard deviation of S0 under all LEDs over its mean, about its smooth trend (a parabola).
+    """
+    count = 2500
+    k = np.arange(count) + 0.5
+    height = 1.0 - (1.0 - math.cos(math.radians(steepest_deg))) * k / count
+    phi = math.pi * (1.0 + math.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - height**2)
+    normals = np.column_stack([flat * np.cos(phi), flat * np.sin(phi), height])
+    s0 = direct_moments(normals, (0.0, 0.0, 0.0), sphere, surface).specular[:, 0, 0]
+    x, y = normals[:, 0], normals[:, 1]
+    basis = np.column_stack([np.ones(count), x, y, x * x, x * y, y * y])
+    rest = s0 - basis @ np.linalg.lstsq(basis, s0, rcond=None)[0]
+    return float(rest.std() / s0.mean())
+
+
+@njit(cache=True, inline="always")
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Return the four weights of Catmull and Rom's cubic."""
+    a = np.float32(0.5) * t * (t * (np.float32(2.0) - t) - np.float32(1.0))
+    d = np.float32(0.5) * t * t * (t - np.float32(1.0))
+    b = np.float32(1.0) + np.float32(0.5) * t * t * (np.float32(3.0) * t - np.float32(5.0))
+    return a, b, np.float32(1.0) - a - b - d, d
+
+
+@njit(parallel=True, cache=True, fastmath=True)
+def _lookup(values, half_field, reach, least_z, normals, x, y, alphas, out):  # type: ignore[no-untyped-def]
+    fields, size = values.shape[1], values.shape[3]
+    per_p = np.float32((size - 1) / (2.0 * reach))
+    per_mm = np.float32((fields - 1) / (2.0 * half_field))
+    most = np.float32(fields - 1)
+    for i in prange(normals.shape[0]):
+        nz = normals[i, 2]
+        if nz < least_z:
+            continue
+        u = (normals[i, 0] / (np.float32(1.0) + nz) + reach) * per_p
+        v = (normals[i, 1] / (np.float32(1.0) + nz) + reach) * per_p
+        column, row = int(u), int(v)
+        a = _cubic(u - np.float32(column))
+        b = _cubic(v - np.float32(row))
+        fx = min(max((x[i] + half_field) * per_mm, np.float32(0.0)), most)
+        fy = min(max((y[i] + half_field) * per_mm, np.float32(0.0)), most)
+        left, low = min(int(fx), fields - 2), min(int(fy), fields - 2)
+        fx -= np.float32(left)
+        fy -= np.float32(low)
+        for q in range(4 * values.shape[0]):
+            level, n = q // 4, q % 4
+            weight = (fx if n % 2 else np.float32(1.0) - fx) * (
+                fy if n // 2 else np.float32(1.0) - fy
+            )
+            weight *= alphas[i, level]
+            if weight == np.float32(0.0):
+                continue
+            for r in range(4):
+                for c in range(4):
+                    share = weight * a[c] * b[r]
+                    for k in range(values.shape[5]):
+                        out[i, k] += (
+                            share
+                            * values[
+                                level, low + n // 2, left + n % 2, row + r - 1, column + c - 1, k
+                            ]
+                        )

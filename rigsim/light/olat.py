@@ -1,0 +1,558 @@
+"""One light at a time on what one camera sees: geometry found once, then shadow rays and shading.
+
+Camera rays are traced once for a view. What they meet is kept as compact rows, sorted by pixel;
+for every light, rays that face it are tested against the mesh, and what arrives is shaded and
+summed into the pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import View
+from rigsim.geometry.mesh import Float32Array, Int32Array
+from rigsim.light.surface_brdf import R_D_LIMIT, boundary, coated_terms, ggx, surface_terms, through
+from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
+from rigsim.render.depth_of_field import LensPicture, before_focus, lens_spread
+
+FloatArray = NDArray[np.float64]
+UInt16Array = NDArray[np.uint16]
+UInt8Array = NDArray[np.uint8]
+
+LookUp = Callable[[GBuffer, NDArray[np.int32]], tuple[Float32Array, Float32Array]]
+"""Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
+with a coating (n, 11)."""
+
+BAND_RAYS: Final = 1 << 20
+"""Camera rays worked on at a time; bounds memory at full resolution."""
+
+CHUNK: Final = 1 << 13
+"""Rows that one thread works on at a time."""
+
+PLASTIC: Final = 0.7548776662466927
+"""Inverse of the plastic number, the root of x^3 = x + 1."""
+
+DISC_POINTS: Final = 1 << 12
+"""Points on a light's disc that rows take in turn."""
+
+SKIN, MATT, METAL = 0, 1, 2
+"""How rows reflect: skin of `rigsim.light.surface_brdf`, Lambertian, GGX facets of a metal."""
+
+FULL: Final = 65535.0
+NORMAL_SCALE: Final = 32767.0
+FUZZ_LIMIT: Final = 0.01
+"""Largest optical depth of vellus hair that a row can hold."""
+BARE: Final = 7
+"""Columns of a surface without a coating."""
+ETA_COLUMN: Final = 9
+"""The column that holds the index of a coating's film."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamp:
+    """A light in the frame of the mesh."""
+
+    position_mm: FloatArray
+    """Centre of the emitting disc, shape (3,)."""
+    axis: FloatArray
+    """Unit vector in which the disc shines, shape (3,)."""
+    exponent: float
+    """Exponent of the cosine off the axis that the intensity follows; nothing shines backwards."""
+    radius_mm: float
+    """Radius of the disc, 0 for a point."""
+
+    def radii(self) -> tuple[FloatArray, FloatArray]:
+        """Return two perpendicular radii of the disc, mm, shape (3,) each."""
+        axis = np.asarray(self.axis, np.float64)
+        helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        side = np.cross(helper, axis)
+        side *= self.radius_mm / float(np.linalg.norm(side))
+        return side, np.cross(axis, side)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """What a camera's rays meet, as rows sorted by pixel."""
+
+    shape: tuple[int, int]
+    """Rows and columns of the image."""
+    subpixels: int
+    """Rays along each side of a pixel."""
+    pixel: Int32Array
+    """Pixels with at least one row, shape (P,), index into the flat image."""
+    first: Int32Array
+    """First row of each of these, shape (P + 1,)."""
+    position_mm: Float32Array
+    """Points, shape (n, 3), frame of the mesh."""
+    normal: NDArray[np.int16]
+    """Shading normals times `NORMAL_SCALE`, shape (n, 3)."""
+    prim: Int32Array
+    """Triangles, shape (n,)."""
+    slot: UInt8Array
+    """Place in the pixel, row by row, below subpixels^2, shape (n,)."""
+    uv: UInt16Array
+    """Texture coordinates times `FULL`, shape (n, 2)."""
+    surface: UInt16Array
+    """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; with a
+    coating also film, its alpha, its index - 1, powder; times `FULL`; shape (n, 7) or (n, 11). Matt
+    rows hold their reflectance as r_d, metal ones too and their alpha as roughness."""
+    camera_mm: FloatArray
+    """Centre of projection, shape (3,)."""
+    kind: int
+    """`SKIN`, `MATT` or `METAL`."""
+    lens: LensPicture | None = None
+    """How the lens spreads the rows' light; None: it is sharp everywhere."""
+
+    @property
+    def megabytes(self) -> float:
+        """Memory held by the rows."""
+        arrays = (
+            self.pixel, self.first, self.position_mm, self.normal, self.prim, self.slot, self.uv,
+            self.surface,
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays) / 1e6
+
+    def scatter(self, rows: Float32Array) -> Float32Array:
+        """Average rows over each pixel's covered part, shape (H, W, C); zero elsewhere."""
+        count = np.diff(self.first)
+        out = np.zeros((self.shape[0] * self.shape[1], rows.shape[1]), np.float32)
+        if len(rows):
+            sums = np.add.reduceat(rows, self.first[:-1], axis=0, dtype=np.float64)
+            out[self.pixel] = sums / count[:, None]
+        return out.reshape(*self.shape, rows.shape[1])
+
+    def coverage(self) -> Float32Array:
+        """Return the share of each pixel that is covered, shape (H, W)."""
+        out = np.zeros(self.shape[0] * self.shape[1], np.float32)
+        out[self.pixel] = np.diff(self.first) / np.float32(self.subpixels**2)
+        return out.reshape(self.shape)
+
+    def normals(self) -> Float32Array:
+        """Return the shading normals, shape (n, 3)."""
+        return np.asarray(self.normal, np.float32) / np.float32(NORMAL_SCALE)
+
+
+def pack_surface(values: Float32Array) -> UInt16Array:
+    """Return rows of `rigsim.light.surface_brdf.SkinSurface.packed` as `Hits.surface` holds them."""
+    unit = np.asarray(values, np.float32).copy()
+    if not (np.isfinite(unit).all() and unit.min(initial=0.0) >= 0.0):
+        raise ValueError("surface: got values that are negative or not finite, expected >= 0")
+    unit[:, :3] = np.sqrt(unit[:, :3] / np.float32(R_D_LIMIT))
+    unit[:, 5] /= np.float32(FUZZ_LIMIT)
+    if unit.shape[1] > BARE:
+        unit[:, ETA_COLUMN] = np.maximum(unit[:, ETA_COLUMN] - np.float32(1.0), 0.0)
+    if unit.max(initial=0.0) > 1.0 + 1e-6:
+        raise ValueError(f"surface: got {unit.max(axis=0)} of its limits, expected at most 1")
+    return np.rint(np.minimum(unit, 1.0) * np.float32(FULL)).astype(np.uint16)
+
+
+def unpack_surface(surface: UInt16Array) -> Float32Array:
+    """Invert `pack_surface`."""
+    unit = np.asarray(surface, np.float32) / np.float32(FULL)
+    unit[:, :3] = np.float32(R_D_LIMIT) * unit[:, :3] ** 2
+    unit[:, 5] *= np.float32(FUZZ_LIMIT)
+    if unit.shape[1] > BARE:
+        unit[:, ETA_COLUMN] += np.float32(1.0)
+    return unit
+
+
+def find_hits(
+    caster: Caster,
+    view: View,
+    look_up: LookUp,
+    *,
+    subpixels: int,
+    kind: int = SKIN,
+    distortion: ArrayLike | None = None,
+    illuminant: str | None = None,
+) -> Hits:
+    """Trace a camera's rays and keep what they meet.
+
+    Parameters
+    ----------
+    caster
+        The mesh.
+    view
+        The camera, in the frame of the mesh.
+    look_up
+        Gives shading normals (n, 3) and surfaces, (n, 7) or (n, 11), for a G-buffer's rows.
+    subpixels
+        Rays along each side of a pixel.
+    kind
+        How rows reflect.
+    distortion
+        Of the lens, see `rigsim.render.camera_rays`.
+    illuminant
+        Spectrum of the light that the lens spreads; None: the lens is sharp everywhere.
+
+    Returns
+    -------
+    Hits
+        Rows sorted by pixel.
+    """
+    k, width, height = subpixels, view.width_px, view.height_px
+    band = max(1, BAND_RAYS // (width * k * k))
+    parts: list[tuple[NDArray[np.generic], ...]] = []
+    begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
+    for top in range(begin, end, band):
+        rows = (top, min(top + band, end))
+        buffers = g_buffer(caster, view, subpixels=k, rows=rows, distortion=distortion)
+        order, pixel, first, slot = pixel_order(buffers.mask, k)
+        normal, surface = look_up(buffers, order)
+        parts.append(
+            (
+                np.repeat(pixel + np.int32(top * width), np.diff(first)),
+                buffers.position_mm.reshape(-1, 3)[order],
+                np.rint(normal * np.float32(NORMAL_SCALE)).astype(np.int16),
+                buffers.prim.reshape(-1)[order],
+                slot,
+                np.rint(buffers.uv.reshape(-1, 2)[order] * np.float32(FULL)).astype(np.uint16),
+                pack_surface(surface),
+            )
+        )
+    owner, position, normals, prim, slots, uv, packed = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
+    starts = np.flatnonzero(np.diff(owner, prepend=-1))
+    pixels = np.asarray(owner[starts], np.int32)
+    begins = np.append(starts, len(owner)).astype(np.int32)
+    lens = None
+    if illuminant is not None:
+        toward = before_focus(view, np.asarray(position, np.float32))
+        spread = lens_spread(view, illuminant, subpixels=k, depths_mm=_extremes(toward))
+        lens = LensPicture(
+            spread, (height, width), pixels, begins, np.asarray(slots, np.uint8), toward
+        )
+    return Hits(
+        shape=(height, width),
+        subpixels=k,
+        pixel=pixels,
+        first=begins,
+        position_mm=np.asarray(position, np.float32),
+        normal=np.asarray(normals, np.int16),
+        prim=np.asarray(prim, np.int32),
+        slot=np.asarray(slots, np.uint8),
+        uv=np.asarray(uv, np.uint16),
+        surface=np.asarray(packed, np.uint16),
+        camera_mm=np.asarray(view.position_mm, np.float64),
+        kind=kind,
+        lens=lens,
+    )
+
+
+def _extremes(values: Float32Array) -> tuple[float, float]:
+    return float(values.min(initial=0.0)), float(values.max(initial=0.0))
+
+
+def pixel_order(
+    mask: NDArray[np.bool_], subpixels: int
+) -> tuple[Int32Array, Int32Array, Int32Array, UInt8Array]:
+    """Return the samples that meet something, those of one pixel together.
+
+    Parameters
+    ----------
+    mask
+        Samples that do, shape (H k, W k).
+    subpixels
+        The k above.
+
+    Returns
+    -------
+    order : ndarray of int32
+        Index into the flat mask, shape (n,).
+    pixel, first : ndarray of int32
+        Pixels with at least one, index into the flat picture, shape (P,), and the first of each,
+        shape (P + 1,).
+    slot : ndarray of uint8
+        Place in the pixel, row by row, shape (n,).
+
+    Examples
+    --------
+    >>> [part.tolist() for part in pixel_order(np.array([[True, False], [True, True]]), 2)]
+    [[0, 2, 3], [0], [0, 3], [0, 2, 3]]
+    """
+    k, wide = subpixels, mask.shape[1]
+    grid = np.arange(mask.size, dtype=np.int32).reshape(-1, k, wide // k, k)
+    order = grid.transpose(0, 2, 1, 3).reshape(-1)
+    order = order[mask.reshape(-1)[order]]
+    across, down = order % wide, order // wide
+    owner = down // k * (wide // k) + across // k
+    starts = np.flatnonzero(np.diff(owner, prepend=-1))
+    slot = (down % k * k + across % k).astype(np.uint8)
+    return order, owner[starts], np.append(starts, len(owner)).astype(np.int32), slot
+
+
+def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
+    """Return the first row of the image that the mesh can reach, and the one after the last."""
+    offset = caster.mesh.vertices_mm - np.asarray(view.position_mm, np.float32)
+    _, up, back = (np.asarray(axis, np.float32) for axis in view.axes)
+    depth = -(offset @ back)
+    if bent or not float(depth.min()) > 1.0:
+        return 0, view.height_px
+    row = 0.5 * (view.height_px - 1) - view.focal_px * (offset @ up) / depth
+    begin, end = int(row.min()) - 1, int(row.max()) + 3
+    begin = min(max(begin, 0), view.height_px - 1)
+    return begin, min(max(end, begin + 1), view.height_px)
+
+
+def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
+    """Tell which rows see their point of a light.
+
+    Every row has its own point on the disc; neighbours' points are spread evenly over it. Only
+    shadows depend on it: shading takes the disc's centre, which errs by the square of radius over
+    distance, 2e-4 in the dome, and adds no noise.
+
+    Parameters
+    ----------
+    hits
+        Rows.
+    caster
+        The mesh that casts shadows.
+    lamp
+        The light.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape (n,).
+    """
+    center = np.ascontiguousarray(lamp.position_mm, np.float64)
+    side, other = lamp.radii()
+    across, along = disc_points(DISC_POINTS)
+    points = np.stack([across, along])[:, :, None] * np.stack([side, other])[:, None]
+    targets = center + points.sum(axis=0)
+    chunks = -(-len(hits.position_mm) // CHUNK)
+    count = np.zeros(chunks + 1, np.int64)
+    _count_facing(hits.position_mm, hits.normal, center, count)
+    count = np.cumsum(count)
+    index = np.empty(count[-1], np.int32)
+    start = np.empty((count[-1], 3), np.float32)
+    way = np.empty((count[-1], 3), np.float32)
+    length = np.empty(count[-1], np.float32)
+    _aim(
+        hits.position_mm, hits.normal, hits.prim, caster.mesh.vertices_mm, caster.mesh.faces,
+        center, targets, count, index, start, way, length,
+    )  # fmt: skip
+    visible = np.zeros(len(hits.position_mm), np.bool_)
+    visible[index] = ~caster.blocked(start, way, length)
+    return visible
+
+
+def lift(hits: Hits, caster: Caster) -> Float32Array:
+    """Return where the rows' shadow rays start, above their triangles, shape (n, 3)."""
+    offset = np.float32(OFFSET_MM) * caster.face_normals[hits.prim]
+    return np.asarray(hits.position_mm + offset, np.float32)
+
+
+def sum_rows(
+    hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array, color: Float32Array
+) -> Float32Array:
+    """Sum what rows send, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
+    if hits.lens is not None:
+        return hits.lens.see(np.stack([red, green, blue], axis=1)) * np.asarray(color, np.float32)
+    out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
+    share = np.asarray(color, np.float32) / np.float32(hits.subpixels**2)
+    _sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
+    return out.reshape(*hits.shape, 3)
+
+
+def light_up(
+    hits: Hits,
+    lamp: Lamp,
+    visible: NDArray[np.bool_],
+    color: Float32Array,
+    glow: Float32Array | None = None,
+    *,
+    diffuse: bool = True,
+    relief: Float32Array | None = None,
+) -> Float32Array:
+    """Shade rows by one light and sum them into pixels.
+
+    Parameters
+    ----------
+    hits
+        Rows.
+    lamp
+        The light.
+    visible
+        Rows that see it, see `seen_from`.
+    color
+        Intensity on the light's axis, shape (3,), see `rigsim.light.led_light`.
+    glow
+        What else leaves the interior of skin, before the boundary: pi times radiance for an
+        intensity of 1 mm^2, shape (n, 3).
+    diffuse
+        False leaves out skin's own diffuse term, for a glow that holds it.
+    relief
+        Part of the light that the texture's relief leaves to each row, shape (n,); None: all.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (H, W, 3), in full scales per second, averaged over whole pixels.
+    """
+    rows = np.zeros((3, len(hits.position_mm)), np.float32)
+    extra = np.zeros((0, 3), np.float32) if glow is None else glow
+    center = np.ascontiguousarray(lamp.position_mm, np.float64)
+    axis = np.ascontiguousarray(lamp.axis, np.float64)
+    _shade(
+        hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind, center, axis,
+        float(lamp.exponent), visible, extra, diffuse,
+        np.ones(0, np.float32) if relief is None else relief, rows,
+    )  # fmt: skip
+    return sum_rows(hits, rows[0], rows[1], rows[2], color)
+
+
+def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
+    """Return points of the unit disc, shape (count,) each; neighbours are spread evenly over it.
+
+    The additive sequence of the plastic number, mapped to the disc with even density.
+    """
+    index = np.arange(count)
+    u, v = (0.5 + index * PLASTIC) % 1.0, (0.5 + index * PLASTIC**2) % 1.0
+    radius, angle = np.sqrt(u), 2.0 * np.pi * v
+    return (radius * np.cos(angle)).astype(np.float32), (radius * np.sin(angle)).astype(np.float32)
+
+
+@njit(cache=True)  # a few ms at most: waiting for a second thread would take longer
+def _sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-untyped-def]
+    for p in range(pixel.shape[0]):
+        r = g = b = np.float32(0.0)
+        for i in range(first[p], first[p + 1]):
+            r += red[i]
+            g += green[i]
+            b += blue[i]
+        out[pixel[p], 0] = share[0] * r
+        out[pixel[p], 1] = share[1] * g
+        out[pixel[p], 2] = share[2] * b
+
+
+@njit(cache=True, inline="always")
+def _faces(i, position, normal, center):  # type: ignore[no-untyped-def]
+    dot = (
+        (center[0] - position[i, 0]) * normal[i, 0]
+        + (center[1] - position[i, 1]) * normal[i, 1]
+        + (center[2] - position[i, 2]) * normal[i, 2]
+    )
+    return dot > 0.0
+
+
+@njit(parallel=True, cache=True)
+def _count_facing(position, normal, center, count):  # type: ignore[no-untyped-def]
+    for chunk in prange(count.shape[0] - 1):
+        n = 0
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
+            n += _faces(i, position, normal, center)
+        count[chunk + 1] = n
+
+
+@njit(parallel=True, cache=True)
+def _aim(  # type: ignore[no-untyped-def]
+    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length,
+):  # fmt: skip
+    for chunk in prange(count.shape[0] - 1):
+        at = count[chunk]
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
+            if not _faces(i, position, normal, center):
+                continue
+            k = i % targets.shape[0]
+            x, y, z = targets[k, 0], targets[k, 1], targets[k, 2]
+            p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+            a, b, c = faces[prim[i], 0], faces[prim[i], 1], faces[prim[i], 2]
+            e0 = float(vertices[b, 0]) - vertices[a, 0]
+            e1 = float(vertices[b, 1]) - vertices[a, 1]
+            e2 = float(vertices[b, 2]) - vertices[a, 2]
+            f0 = float(vertices[c, 0]) - vertices[a, 0]
+            f1 = float(vertices[c, 1]) - vertices[a, 1]
+            f2 = float(vertices[c, 2]) - vertices[a, 2]
+            n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+            norm = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            # Rays start above the triangle, on the side that the light is on if it is in front.
+            lift = OFFSET_MM / norm if norm > 0.0 else 0.0
+            p0, p1, p2 = p0 + lift * n0, p1 + lift * n1, p2 + lift * n2
+            w0, w1, w2 = x - p0, y - p1, z - p2
+            far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
+            index[at] = i
+            start[at, 0], start[at, 1], start[at, 2] = p0, p1, p2
+            way[at, 0], way[at, 1], way[at, 2] = w0 / far, w1 / far, w2 / far
+            length[at] = 0.999 * far
+            at += 1
+
+
+@njit(parallel=True, cache=True)
+def _shade(  # type: ignore[no-untyped-def]
+    position, normal, surface, camera, kind, center, axis, exponent, visible, glow, diffuse,
+    relief, out,
+):  # fmt: skip
+    has_glow = glow.shape[0] > 0
+    for i in prange(position.shape[0]):
+        if not visible[i] and not has_glow:
+            continue
+        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        norm = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        n0, n1, n2 = n0 * norm, n1 * norm, n2 * norm
+        p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+        v0, v1, v2 = camera[0] - p0, camera[1] - p1, camera[2] - p2
+        norm = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        v0, v1, v2 = v0 * norm, v1 * norm, v2 * norm
+        nv = min(n0 * v0 + n1 * v1 + n2 * v2, 1.0)
+        if nv <= 0.0:
+            continue
+        if has_glow:
+            leaving = through(nv)
+            out[0, i] += leaving * glow[i, 0]
+            out[1, i] += leaving * glow[i, 1]
+            out[2, i] += leaving * glow[i, 2]
+        if not visible[i]:
+            continue
+        l0, l1, l2 = center[0] - p0, center[1] - p1, center[2] - p2
+        squared = l0 * l0 + l1 * l1 + l2 * l2
+        norm = 1.0 / math.sqrt(squared)
+        l0, l1, l2 = l0 * norm, l1 * norm, l2 * norm
+        nl = min(n0 * l0 + n1 * l1 + n2 * l2, 1.0)
+        if nl <= 0.0:
+            continue
+        strength = nl / squared
+        off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
+        if off <= 0.0:
+            continue
+        strength *= off**exponent
+        if relief.shape[0] > 0:
+            strength *= relief[i]
+        s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
+        r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
+        if kind == MATT:
+            out[0, i] += strength * r0
+            out[1, i] += strength * r1
+            out[2, i] += strength * r2
+            continue
+        h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
+        length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+        nh = min((nl + nv) / length, 1.0)
+        rough = surface[i, 3] / FULL
+        if kind == METAL:
+            lobe = math.pi * strength * ggx(nl, nv, nh, rough)
+            out[0, i] += lobe * r0
+            out[1, i] += lobe * r1
+            out[2, i] += lobe * r2
+            continue
+        oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
+        if surface.shape[1] > BARE:
+            lobe = coated_terms(
+                nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz, surface[i, 7] / FULL,
+                surface[i, 8] / FULL, 1.0 + surface[i, 9] / FULL, surface[i, 10] / FULL,
+            )  # fmt: skip
+        else:
+            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
+        gloss = math.pi * strength * bare * lobe
+        inside = strength * boundary(nl, nv) if diffuse else 0.0
+        out[0, i] += gloss + inside * r0
+        out[1, i] += gloss + inside * r1
+        out[2, i] += gloss + inside * r2

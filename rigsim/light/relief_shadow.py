@@ -1,0 +1,133 @@
+"""Shadows of wrinkles: relief that the texture holds and the mesh does not, hiding lights from it.
+
+For each direction over the texture the elevation of its own horizon is found once
+(`rigsim.light.self_shadow`); a light below it is hidden from that texel. Horizons are those of the relief
+over the mesh as if that were flat over a few millimeters; what the mesh hides, rays tell.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike
+
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.self_shadow import horizon_tangent
+from rigsim.subject import Subject
+
+DIRECTIONS: Final = 24
+"""Directions in which horizons are found; between them they are blended."""
+
+SOFT_RAD: Final = 0.02
+"""Least half width of a shadow's edge in elevation: a texel is no point."""
+
+
+class ReliefShadow:
+    """One face's relief, ready to hide lights.
+
+    Parameters
+    ----------
+    subject
+        The face in its pose.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        atlas = subject.atlas
+        self._du, self._dv = atlas.dp_du_mm, atlas.dp_dv_mm
+        self._size = atlas.size
+        height = np.where(atlas.covered, subject.height_um, np.float32(0.0)).astype(np.float32)
+        # um a texel; what a texel measures along each direction, its own frame says
+        self._horizon = np.stack(
+            [
+                horizon_tangent(height, pixel_um=1.0, azimuth_rad=2.0 * math.pi * k / DIRECTIONS)
+                for k in range(DIRECTIONS)
+            ]
+        )
+
+    def seen(
+        self,
+        uv: Float32Array,
+        position_mm: Float32Array,
+        light_mm: ArrayLike,
+        *,
+        radius_mm: float = 0.0,
+    ) -> Float32Array:
+        """Return which part of a light the relief leaves to each point.
+
+        Parameters
+        ----------
+        uv
+            Texture coordinates, shape (n, 2), (0, 0) is bottom left.
+        position_mm
+            The points, frame of the mesh, shape (n, 3).
+        light_mm
+            Middle of the light, same frame, shape (3,).
+        radius_mm
+            Of its disc, which makes edges soft.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (n,), 0 to 1.
+        """
+        out = np.empty(len(uv), np.float32)
+        light = np.asarray(light_mm, np.float64)
+        _seen(
+            np.ascontiguousarray(uv, np.float32), np.ascontiguousarray(position_mm, np.float32),
+            light, radius_mm, self._du, self._dv, self._horizon, out,
+        )  # fmt: skip
+        return out
+
+    def on_texture(
+        self, position_mm: Float32Array, light_mm: ArrayLike, *, radius_mm: float = 0.0
+    ) -> Float32Array:
+        """Return `seen` of every texel, shape (N, N), from their positions, shape (N, N, 3)."""
+        middle = (np.arange(self._size, dtype=np.float32) + np.float32(0.5)) / self._size
+        uv = np.stack(np.meshgrid(middle, middle[::-1]), axis=-1).reshape(-1, 2)
+        found = self.seen(
+            uv.astype(np.float32), position_mm.reshape(-1, 3), light_mm, radius_mm=radius_mm
+        )
+        return found.reshape(self._size, self._size)
+
+
+@njit(parallel=True, cache=True)
+def _seen(uv, position, light, radius, du, dv, horizon, out):  # type: ignore[no-untyped-def]
+    size = du.shape[0]
+    turns = horizon.shape[0]
+    for i in prange(uv.shape[0]):
+        column = min(max(int(uv[i, 0] * size), 0), size - 1)
+        row = min(max(int((1.0 - uv[i, 1]) * size), 0), size - 1)
+        a0, a1, a2 = float(du[row, column, 0]), float(du[row, column, 1]), float(du[row, column, 2])
+        b0, b1, b2 = float(dv[row, column, 0]), float(dv[row, column, 1]), float(dv[row, column, 2])
+        n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+        area = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        w0, w1, w2 = light[0] - position[i, 0], light[1] - position[i, 1], light[2] - position[i, 2]
+        far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
+        out[i] = 1.0
+        if area <= 0.0 or far <= 0.0:
+            continue
+        up = (w0 * n0 + w1 * n1 + w2 * n2) / (area * far)
+        if up <= 0.0:
+            continue  # behind the mesh, which rays tell
+        # the direction over the texture: w = a du + b dv + c n
+        p, q = w0 * a0 + w1 * a1 + w2 * a2, w0 * b0 + w1 * b1 + w2 * b2
+        aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+        ab = a0 * b0 + a1 * b1 + a2 * b2
+        a, b = bb * p - ab * q, aa * q - ab * p
+        length = math.hypot(a, b)
+        if length <= 0.0:
+            continue  # overhead
+        a, b = a / length, b / length
+        texel_um = 1e3 / size * math.sqrt(max(a * a * aa + 2.0 * a * b * ab + b * b * bb, 1e-12))
+        turn = math.atan2(b, a) / (2.0 * math.pi) % 1.0 * turns
+        k = int(turn)
+        share = turn - k
+        low, high = horizon[k % turns, row, column], horizon[(k + 1) % turns, row, column]
+        edge = math.atan(((1.0 - share) * float(low) + share * float(high)) / texel_um)
+        soft = max(radius / far, SOFT_RAD)
+        out[i] = min(max(0.5 + (math.asin(min(up, 1.0)) - edge) / (2.0 * soft), 0.0), 1.0)
+        if edge <= 0.0:
+            out[i] = 1.0

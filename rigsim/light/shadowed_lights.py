@@ -1,0 +1,135 @@
+"""Light that a relief keeps from its own points, taken away from the sum over all LEDs."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.lobe_moments import Surface
+from rigsim.shading import entry_one, specular_one
+
+
+class Elements(Protocol):
+    """Surface elements of a picture."""
+
+    @property
+    def x_mm(self) -> Float32Array:
+        """Place, shape (H, W)."""
+
+    @property
+    def y_mm(self) -> Float32Array:
+        """Place, shape (H, W)."""
+
+    @property
+    def normals(self) -> Float32Array:
+        """Unit normals, shape (H, W, 3)."""
+
+    @property
+    def alpha(self) -> Float32Array:
+        """Roughness, shape (H, W)."""
+
+    @property
+    def skin(self) -> NDArray[np.bool_]:
+        """Where light is taken away, shape (H, W)."""
+
+
+def remove_hidden(
+    packed: Float32Array,
+    elements: Elements,
+    horizon: tuple[Float32Array, Float32Array, float],
+    sphere: BuiltSphere,
+    led: int,
+    surface: Surface,
+) -> None:
+    """Take an LED away from where it stands behind the horizon, in place.
+
+    The part of its disc below the horizon is taken as linear in the horizon's elevation.
+
+    Parameters
+    ----------
+    packed
+        Moments, planar, shape (16, H, W): as `rigsim.light.lobe_moments.Moments.packed`.
+    elements
+        The surface.
+    horizon
+        Tangents of the horizon's elevation in two directions beside the LED's, shape (H, W), and
+        how far from the first to the second that is.
+    sphere, led
+        The LED; it stands above the plane of the patch.
+    surface
+        How the surface reflects.
+    """
+    place = sphere.position_mm[led]
+    distance = float(np.linalg.norm(place))
+    elevation = math.asin(min(max(float(place[2]) / distance, -1.0), 1.0))
+    radius = float(sphere.radius_mm[led]) / distance
+    half_deg = sphere.nominal.lights[led].half_intensity_deg
+    exponent = (
+        0.0 if half_deg is None else math.log(0.5) / math.log(math.cos(math.radians(half_deg)))
+    )
+    first, second, between = horizon
+    _remove(
+        packed.reshape(len(packed), -1),
+        elements.normals.reshape(-1, 3),
+        elements.x_mm.reshape(-1),
+        elements.y_mm.reshape(-1),
+        elements.alpha.reshape(-1),
+        elements.skin.reshape(-1),
+        first.reshape(-1),
+        second.reshape(-1),
+        np.float32(between),
+        np.float32(math.tan(max(elevation - radius, 0.0))),
+        elevation,
+        radius,
+        place,
+        sphere.absorbs[led],
+        float(sphere.intensity[led]) * REFERENCE_MM**2,
+        exponent,
+        sphere.weights[led],
+        np.array(surface.eye_mm, np.float64),
+        np.array(surface.image_right, np.float64),
+        surface.eta,
+        1.0 / surface.extinction,
+    )
+
+
+@njit(parallel=True, cache=True)
+def _remove(  # type: ignore[no-untyped-def]
+    packed, normals, x, y, alpha, skin, first, second, between, low, elevation, radius,
+    place, absorbs, intensity, exponent, weights, eye, right, eta, leak,
+):  # fmt: skip
+    distance = math.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
+    for i in prange(normals.shape[0]):
+        tangent = first[i] + between * (second[i] - first[i])
+        if tangent <= low or not skin[i]:
+            continue
+        part = min(0.5 + 0.5 * (math.atan(tangent) - elevation) / radius, 1.0)
+        n0, n1, n2 = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        l0, l1, l2 = place[0] - x[i], place[1] - y[i], place[2]
+        square = l0 * l0 + l1 * l1 + l2 * l2
+        length = math.sqrt(square)
+        l0, l1, l2 = l0 / length, l1 / length, l2 / length
+        nl = n0 * l0 + n1 * l1 + n2 * l2
+        if nl <= 0.0 or part <= 0.0:
+            continue
+        off = (l0 * place[0] + l1 * place[1] + l2 * place[2]) / distance
+        share = part * intensity * off**exponent / square
+        v0, v1, v2 = eye[0] - x[i], eye[1] - y[i], eye[2]
+        length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        v0, v1, v2 = v0 / length, v1 / length, v2 / length
+        s0, s1, s2 = specular_one(
+            n0, n1, n2, l0, l1, l2, v0, v1, v2, float(alpha[i]), eta, absorbs, right, leak, 0.0
+        )
+        entered = share * nl * entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
+        for m in range(4):
+            weight = weights[m] * share
+            packed[3 * m, i] -= weight * s0
+            packed[3 * m + 1, i] -= weight * s1
+            packed[3 * m + 2, i] -= weight * s2
+            packed[12 + m, i] -= weights[m] * entered

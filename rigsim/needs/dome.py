@@ -1,0 +1,195 @@
+"""What the dome's pictures of a face or a target must hold, and what they need not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, Vector, View
+from model import spectra
+from rigsim.light.interreflection_color import color_error
+from rigsim.light.subsurface_radiance import typical_kernels
+from rigsim.needs.effect_sizes import (
+    bounced,
+    edge_loss,
+    exchange_share,
+    most_irradiance,
+    spread_over_noise,
+)
+from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.flash import (
+    BOUNCES,
+    FAR_LIGHT,
+    LATERAL,
+    SHADOWS,
+    SPECTRAL,
+    bands,
+    brightest_rgb,
+    further_bounces,
+    lens,
+    polarization,
+    textures,
+    wrinkles,
+)
+from rigsim.render import Caster
+from rigsim.subject import Subject
+from rigsim.subject.head_motion import HeadMotion
+from rigsim.targets import Target
+
+
+def dome_needs(
+    rig: Rig,
+    subject: Subject | Target,
+    state: str,
+    *,
+    caster: Caster,
+    noise: Noise,
+    white_rgb: NDArray[np.floating] | None,
+    movement: bool,
+    motion: HeadMotion | None,
+    subsurface: bool | None,
+    interreflections: bool | None,
+    spectral: bool | None,
+    optics: bool | None,
+    relief_shadows: bool | None,
+    subpixels: int,
+) -> SceneNeeds:
+    """Decide what a scene in the dome builds.
+
+    Parameters
+    ----------
+    rig
+        The dome; of its cameras the first decides.
+    subject, state
+        Who stands there, in which state.
+    caster
+        The mesh.
+    noise
+        Of the sensors.
+    white_rgb
+        What a white plate in the origin gets in the plan's longest exposure from the brightest
+        light, full scales, shape (3,); None: the brightest skin is taken as full.
+    movement, motion
+        Whether the face moves with its state, and how the head does.
+    subsurface, interreflections, spectral, optics, relief_shadows
+        What is asked for; None lets the sizes decide.
+    subpixels
+        Rays along each side of a pixel.
+    """
+    view = rig.views[0]
+    made = [polarization(rig, view), bands(view)]
+    world = [
+        ("ambient light", "the room is dark"),
+        ("light from the dome's frame and from other LEDs' lenses", "they are black"),
+    ]
+    illuminant = rig.lights[0].illuminant
+    focus = lens(view, illuminant, caster, noise, 1.0, subpixels, optics)
+    if isinstance(subject, Target):
+        size = 0.0 if exchange_share(caster) == 0.0 else float("inf")
+        because = "the target is flat" if size == 0.0 else "the target has hollows"
+        flat = decide(BOUNCES, size, None, switch="interreflections", because=because)
+        opaque = [(LATERAL, f"{subject.name} is opaque")]
+        return SceneNeeds((*made, flat, focus, *absent([*opaque, *world]), *unmodeled(FAR_LIGHT)))
+    brightest = brightest_rgb(subject, state, view, illuminant)
+    if white_rgb is None:
+        white = spectra.camera_white(view.spectral_sensitivity, illuminant)
+        level = white * brightest / (white * brightest).max()
+    else:
+        near = max(_nearness(caster, light.position_mm) for light in rig.lights)
+        level = near * white_rgb * brightest
+    pixel_mm = view.distance_mm / view.focal_px
+    kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
+    lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
+    share = exchange_share(caster)
+    more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    more = np.minimum(more, 1.0)
+    unseen = more / noise.sigma(more)  # where nothing else shines
+    bounces = decide(
+        BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
+        because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+    )  # fmt: skip
+    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
+    made += [
+        *textures(subject, view, illuminant),
+        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
+        decide(
+            LATERAL, float(spread_over_noise(lost, level, noise).max()), subsurface,
+            switch="subsurface",
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
+        ),
+        bounces,
+        decide(
+            SPECTRAL, float(off.max()), spectral, switch="spectral",
+            because="a channel's mean of squares is not the square of its mean"
+            if bounces.built else "there is no such light",
+        ),
+        further_bounces(bounces, share * float(brightest.max())),
+        focus,
+        wrinkles(subject, noise, 1.0, relief_shadows),
+    ]  # fmt: skip
+    made += _movement(subject, movement, motion, view)
+    made += absent(
+        [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]
+    )
+    return SceneNeeds((*made, *_limits(made)))
+
+
+def _movement(
+    subject: Subject, movement: bool, motion: HeadMotion | None, view: View
+) -> list[Effect]:
+    name = "movement of the face with the state"
+    made = []
+    if not movement:
+        made.append(Effect(name, "asked", "movement=False asks for it", switch="movement"))
+    elif subject.pose is None:
+        made.append(Effect(name, "absent", "at rest nothing moves", switch="movement"))
+    else:
+        made.append(Effect(name, "built", "the state moves the face", switch="movement"))
+    head = "movement of the head"
+    if motion is None:
+        return [*made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]
+    pixel_mm = view.distance_mm / view.focal_px
+    blur = (
+        "blur by movement within an exposure",
+        f"0.06 s move 0.05 mm, a pixel {pixel_mm:.2f} mm",
+    )
+    made.append(Effect(head, "built", "the head drifts and twitches", switch="motion"))
+    return [
+        *made,
+        *unmodeled([("the twitch in light from inside", "it stays that of the still mouth"), blur]),
+    ]
+
+
+def _nearness(caster: Caster, place_mm: Vector) -> float:
+    """Return how much brighter a light shines on a mesh than in the origin at most, >= 1."""
+    squared = math.hypot(*place_mm) ** 2
+    return max(most_irradiance(caster.mesh, [place_mm], [squared]), 1.0)
+
+
+def _limits(made: list[Effect]) -> list[Effect]:
+    out = [
+        *FAR_LIGHT,
+        ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
+    ]
+    built = {effect.name for effect in made if effect.built}
+    if BOUNCES in built:
+        out.append(("highlights of skin on skin", "only light from inside goes on"))
+    if LATERAL in built:
+        out.append(("lateral kernels that vary over the face", "one, of its median skin"))
+    return unmodeled(out)
+
+
+def noise_of(sensors: list[Noise]) -> Noise:
+    """Return the least noise of some sensors.
+
+    Examples
+    --------
+    >>> noise_of([Noise(1e-4, 2e-7), Noise(2e-4, 1e-7)])
+    Noise(scale=0.0001, offset=1e-07)
+    """
+    return Noise(
+        float(np.min([noise.scale for noise in sensors])),
+        float(np.min([noise.offset for noise in sensors])),
+    )

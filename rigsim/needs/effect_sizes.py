@@ -1,0 +1,235 @@
+"""How much effects of light can change a pixel, told before anything is rendered.
+
+Each is a bound or a worst case, since what it decides is whether a scene must hold the effect: it
+may be too large, which costs time, but not too small, which would cost truth.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.geometry.mesh import Mesh
+from rigsim.needs.effects import Noise
+from rigsim.render import Caster
+from rigsim.tissue.skin_layers import ETA
+
+EXCHANGE_PATCHES = 32
+"""Texels along one side of the coarse texture on which exchange between skin is estimated."""
+
+
+def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> NDArray[np.float64]:
+    """Return how much of a lit pixel's light spreads out of it across the edge of a shadow.
+
+    Parameters
+    ----------
+    sigmas_mm, weights
+        Gaussians that stand for the lateral profile: standard deviations along an axis in mm,
+        shape (K,), and their weights, shape (C, K), rows summing to 1.
+    pixel_mm
+        Side of a pixel on the subject, mm, > 0. The edge lies along one side of the pixel.
+
+    Returns
+    -------
+    ndarray
+        Part of the pixel's light in each channel, shape (C,), 0 to 0.5.
+
+    Notes
+    -----
+    For one Gaussian the mean of ``Q(x / sigma)`` over ``0 < x < p``; for ``p`` far above ``sigma``
+    this is ``sigma / (p sqrt(2 pi))``: it falls with the pixel's size and no faster, so that a
+    pixel has to be hundreds of mean free paths wide before it forgets them.
+
+    Examples
+    --------
+    >>> edge_loss([1.0], [[1.0]], 100.0).round(5).tolist()
+    [0.00399]
+    >>> edge_loss([1.0], [[1.0]], 1e-4).round(3).tolist()
+    [0.5]
+    """
+    sigma = np.asarray(sigmas_mm, np.float64)
+    weight = np.atleast_2d(np.asarray(weights, np.float64))
+    if not pixel_mm > 0.0:
+        raise ValueError(f"pixel_mm: got {pixel_mm}, expected > 0")
+    if sigma.size == 0:
+        return np.zeros(len(weight))
+    q = pixel_mm / sigma
+    # int_0^q Q(t) dt / q with Q the upper tail of the normal distribution
+    tail = np.array([0.5 * math.erfc(t / math.sqrt(2.0)) for t in q])
+    density = np.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi)
+    mean = tail + (1.0 / math.sqrt(2.0 * math.pi) - density) / q
+    return np.asarray(weight @ mean, np.float64)
+
+
+def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> NDArray[np.float64]:
+    """Return how much spreading across a shadow's edge changes a pixel, over its noise.
+
+    Parameters
+    ----------
+    lost
+        What a lit pixel loses across the edge, of its light, see `edge_loss`, shape (C,).
+    level
+        The brightest pixel's signal, full scales, shape (C,); it may be over-full.
+    noise
+        Of the sensor.
+
+    Returns
+    -------
+    ndarray
+        Shape (C,). The pixel beyond the edge gains as much as the lit one loses, and where nothing
+        else shines on it, all that it has is this gain: its noise is the least.
+
+    Examples
+    --------
+    >>> spread_over_noise([0.1], [0.5], Noise(1e-4, 0.0)).round(3).tolist()
+    [22.361]
+    """
+    gained = np.minimum(np.asarray(lost, np.float64) * np.asarray(level, np.float64), 1.0)
+    return np.asarray(gained / noise.sigma(gained), np.float64)
+
+
+def exchange_share(caster: Caster) -> float:
+    """Return which part of the light that leaves a surface falls back onto its hollows at most.
+
+    Parameters
+    ----------
+    caster
+        The mesh; its texture coordinates must not overlap.
+
+    Returns
+    -------
+    float
+        The largest sum over patches of the exchange with one patch for a reflectance of 1, 0 to 1;
+        0 for what is flat or bulges outwards.
+    """
+    if is_flat(caster.mesh):
+        return 0.0
+    from rigsim.light.interreflection import SkinBounce
+
+    exchange = SkinBounce(caster, patches=EXCHANGE_PATCHES).exchange
+    return float(np.asarray(exchange.sum(axis=1)).max(initial=0.0))
+
+
+def is_flat(mesh: Mesh) -> bool:
+    """Return whether all of a mesh lies in one plane: then it neither shades nor lights itself."""
+    points = np.asarray(mesh.vertices_mm, np.float64)
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[-1] <= 1e-6 * max(spread[0], 1e-300))
+
+
+def bounced(share: float, reflectance: float) -> float:
+    """Return the light that comes by way of other skin over the brightest direct light.
+
+    Parameters
+    ----------
+    share
+        See `exchange_share`, 0 to below 1.
+    reflectance
+        The largest diffuse reflectance, 0 to 1.
+
+    Examples
+    --------
+    >>> round(bounced(0.2, 0.5), 4)
+    0.1111
+    """
+    once = share * reflectance
+    if not 0.0 <= once < 1.0:
+        raise ValueError(f"share, reflectance: got {share}, {reflectance}, expected 0 to 1")
+    return once / (1.0 - once)
+
+
+def steepest_slope(slope_x: NDArray[np.floating], slope_y: NDArray[np.floating]) -> float:
+    """Return the steepest slope of a relief: a light above that elevation shines everywhere.
+
+    Examples
+    --------
+    >>> steepest_slope(np.array([3.0, 0.0]), np.array([4.0, 0.0]))
+    5.0
+    """
+    return float(np.hypot(slope_x, slope_y).max(initial=0.0))
+
+
+def most_irradiance(mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
+    """Return a bound on the light that lights together send to any point of a mesh.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    places_mm
+        The lights, shape (L, 3).
+    weights_mm2
+        Energy of each over what a plate in the origin gets in all that faces the camera, mm^2,
+        shape (L,): a surface that faces light k from a distance d gets ``weight / d^2`` of that.
+
+    Returns
+    -------
+    float
+        Over the plate's light: of all lights as if each point faced each of them from as near as
+        any point is. Lights that graze the plate shine many times brighter on what faces them.
+
+    Examples
+    --------
+    >>> from rigsim.geometry.mesh import build_mesh
+    >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
+    >>> round(most_irradiance(plate, [[0, 0, 100]], [100.0**2]), 3)
+    1.0
+    """
+    points = np.asarray(mesh.vertices_mm, np.float64)
+    total = 0.0
+    for place, weight in zip(
+        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+    ):
+        squared = float(np.min(np.sum((place - points) ** 2, axis=1)))
+        total += float(weight) / max(squared, 1e-12)
+    return total
+
+
+def highlight(
+    mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
+) -> float:
+    """Return a bound on what a surface's facets reflect, over the light of a white plate.
+
+    Parameters
+    ----------
+    mesh
+        The surface.
+    places_mm, weights_mm2
+        Lights, as of `most_irradiance`.
+    camera_mm
+        The camera, shape (3,).
+    alpha
+        The least GGX roughness, 0 to 1.
+
+    Notes
+    -----
+    Of the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
+    ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
+    across the plane of incidence, at half the largest angle between light and camera; an analyser
+    passes all of such light, and half of a plate's.
+
+    Examples
+    --------
+    >>> from rigsim.geometry.mesh import build_mesh
+    >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
+    >>> bound = highlight(plate, [[0, 0, 1e4]], [1e8], [0, 0, 1e4], 0.5)
+    >>> round(bound / (2.0 * (0.4 / 2.4) ** 2 / (2.0 * 0.5**3)), 3)
+    1.0
+    """
+    points = np.asarray(mesh.vertices_mm, np.float64)
+    to_camera = np.asarray(camera_mm, np.float64) - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    total = 0.0
+    for place, weight in zip(
+        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+    ):
+        to_light = place - points
+        to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+        between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
+        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
+        inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
+        across = ((cosine - inside) / (cosine + inside)) ** 2
+        total += 2.0 * across * most_irradiance(mesh, [place], [weight])
+    return total / (2.0 * alpha**3)

@@ -1,0 +1,175 @@
+"""What the gradient sphere's pictures of a patch of skin must hold, and what they need not."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from capture.rig import Rig
+from rigsim import shading
+from rigsim.as_built.sphere import BuiltSphere
+from rigsim.light.relief_interreflection import hidden_share
+from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
+from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS, bands, polarization
+from rigsim.render.lens_blur import Lens
+from rigsim.scenes.gradient.lighting import lateral_kernel
+from rigsim.skin_patch.microrelief import MicroSkin
+from rigsim.tissue.skin_layers import ETA
+
+FloatArray = NDArray[np.float64]
+
+OPTICS: Final = "diffraction and defocus"
+RELIEF: Final = "relief of the skin"
+
+STEEPER: Final = 1.6
+"""How much compression steepens the relief at most: the skin buckles at 0.66 of its length."""
+
+LOOKED_AT: Final = 384
+"""Texels along one side of the part of the patch that is looked at."""
+
+SECTORS: Final = 8
+
+
+def gradient_needs(
+    rig: Rig,
+    subject: MicroSkin | str,
+    sphere: BuiltSphere,
+    lens: Lens,
+    *,
+    noise: Noise,
+    white: float,
+    moving: bool,
+    shadows: bool | None,
+    lateral: bool | None,
+    interreflections: bool | None,
+    optics: bool | None,
+) -> SceneNeeds:
+    """Decide what a scene in the gradient sphere builds.
+
+    Parameters
+    ----------
+    rig, sphere, lens
+        The rig, its LEDs as they stand, and the lens.
+    subject
+        A patch of skin, or the name of a target.
+    noise
+        Of the sensor. Highlights are taken as full.
+    white
+        What a white patch gets under all LEDs in the plan's longest exposure, full scales; inf:
+        so much that the brightest skin is full.
+    moving
+        Whether the patch moves.
+    shadows, lateral, interreflections, optics
+        What is asked for; None lets the sizes decide.
+    """
+    view = rig.views[0]
+    world = [
+        ("ambient light", "the room is dark"),
+        ("light from the sphere's frame and between its LEDs", "they are black"),
+    ]
+    made = [polarization(rig, view), bands(view), _optics(lens, optics, noise)]
+    limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
+    if not isinstance(subject, MicroSkin):
+        flat = "a ball bulges" if subject == "ball" else "the target is flat"
+        for name, switch in ((SHADOWS, "shadows"), (BOUNCES, "interreflections")):
+            made.append(decide(name, 0.0, None, switch=switch, because=flat))
+        made.append(Effect(LATERAL, "absent", f"{subject} is glass, gray or nothing"))
+        return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+    made += _of_skin(subject, sphere, lens, noise, white, shadows, lateral, interreflections)
+    if moving:
+        made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
+        pixel_um = lens.pixel_on_subject_um
+        limits.append(
+            (
+                "blur by movement within an exposure",
+                f"30 ms move 0.1 um; a pixel: {pixel_um:.1f} um",
+            )
+        )
+    else:
+        made.append(Effect("movement of the patch", "absent", "motion=None", switch="motion"))
+    limits += [
+        ("shadows of the caliper's jaws", "they are thin"),
+        ("hidden views", "the camera looks down within 1.2 degrees of the vertical"),
+        ("highlights of skin on skin", "only light from inside goes on to other walls"),
+        ("polarized single scattering", "light from inside is taken as depolarized"),
+        ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
+    ]
+    return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+
+
+def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:
+    nyquist_per_mm = 500.0 / lens.pixel_on_subject_um
+    kept = float(lens.transfer(np.array([nyquist_per_mm]))[0])
+    return decide(
+        OPTICS, noise.share(1.0 - kept), asked, switch="optics",
+        because=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
+    )  # fmt: skip
+
+
+def _of_skin(
+    skin: MicroSkin,
+    sphere: BuiltSphere,
+    lens: Lens,
+    noise: Noise,
+    white: float,
+    shadows: bool | None,
+    lateral: bool | None,
+    interreflections: bool | None,
+) -> list[Effect]:
+    middle = skin.height_um.shape[0] // 2
+    half = min(middle, LOOKED_AT // 2)
+    part = np.ascontiguousarray(
+        skin.height_um[middle - half : middle + half, middle - half : middle + half]
+    )
+    down, right = (np.asarray(slope) for slope in np.gradient(part, skin.texel_um))
+    steepest = STEEPER * steepest_slope(right, down)
+    place = sphere.position_mm[sphere.position_mm[:, 2] > 0.0]
+    lowest = float((place[:, 2] / np.hypot(place[:, 0], place[:, 1])).min())
+    length = np.sqrt(1.0 + right**2 + down**2)
+    normals = np.stack([-right / length, down / length, 1.0 / length], axis=-1)
+    hidden = shading.interior_scale(ETA) * hidden_share(
+        part, normals.astype(np.float32), margin=0, pixel_um=skin.texel_um, sectors=SECTORS,
+        boundaries=True,
+    )  # fmt: skip
+    sigmas, weights = lateral_kernel(skin)
+    if lateral is not False:  # what comes from other walls spreads as all light does
+        hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
+    # light that goes along the surface grows with the square of slopes
+    share = min(STEEPER**2 * float(np.quantile(hidden, 0.999)), 0.9)
+    brightest = float(skin.albedo.max())
+    more = bounced(share, brightest)
+    pixel_mm = 1e-3 * lens.pixel_on_subject_um
+    lost = float(edge_loss(sigmas, weights[None], pixel_mm).max())
+    level = min(1.0, white * brightest)
+    deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
+    return [
+        Effect(RELIEF, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
+        decide(
+            SHADOWS, noise.share(1.0) if steepest > lowest else 0.0, shadows, switch="shadows",
+            because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
+        ),
+        decide(
+            LATERAL, noise.share(lost, level), lateral, switch="lateral",
+            because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
+        ),
+        decide(
+            BOUNCES, noise.share(more, level), interreflections,
+            switch="interreflections",
+            because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
+        ),
+    ]  # fmt: skip
+
+
+def _spread(
+    hidden: NDArray[np.floating], sigmas_mm: FloatArray, weights: FloatArray, texel_mm: float
+) -> FloatArray:
+    """Return the light of a part of the patch after it has spread; beyond it goes on mirrored."""
+    axis = np.arange(len(hidden)) / (2.0 * len(hidden) * texel_mm)
+    square = 2.0 * np.pi**2 * (axis[:, None] ** 2 + axis[None, :] ** 2)
+    kernel = np.tensordot(weights, np.exp(-(sigmas_mm**2)[:, None, None] * square), axes=1)
+    return np.asarray(scipy.fft.idctn(scipy.fft.dctn(hidden) * kernel), np.float64)

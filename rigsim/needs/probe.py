@@ -1,0 +1,91 @@
+"""What the fibre probe's pictures must hold, and what they need not."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from capture.rig import Rig
+from rigsim.as_built.probe import ProbeBuild
+from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
+from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, unmodeled
+from rigsim.needs.flash import bands, polarization
+
+TRANSPORT: Final = "paths of photons between source and fibres"
+CROSSTALK: Final = "light that fibres pass to each other"
+WINGS: Final = "light beyond the spots, from the lens"
+COLOR: Final = "tissue traced color by color"
+LAYERS: Final = "layers of the tissue"
+DARK: Final = "dark current and hot pixels"
+
+
+def probe_needs(
+    rig: Rig, tissue: ProbedTissue, build: ProbeBuild, *, noise: Noise, hot: float
+) -> SceneNeeds:
+    """Decide what a scene under the probe builds.
+
+    Parameters
+    ----------
+    rig
+        The probe's rig.
+    tissue
+        What the head sits on.
+    build
+        The probe as it was built.
+    noise
+        Of the sensor, without dark current.
+    hot
+        Signal of the hottest pixel in the longest exposure, full scales.
+    """
+    view = rig.views[0]
+    others = np.array(build.crosstalk, np.float64)
+    np.fill_diagonal(others, 0.0)
+    leaked = float(others.max(initial=0.0))
+    made = [
+        polarization(rig, view),
+        bands(view),
+        Effect(TRANSPORT, "built", "photons are followed: all light in the fibres has been inside"),
+        _sized(CROSSTALK, leaked, noise, f"up to {100 * leaked:.2g} % of a neighbor's light"),
+        _sized(WINGS, build.wings, noise, f"{100 * build.wings:.2g} % of a spot's light"),
+        _sized(DARK, hot, noise, f"up to {100 * hot:.2g} % of full scale in the longest exposure"),
+        _color(tissue),
+    ]
+    if tissue.kind == "homogeneous":
+        made += absent([(LAYERS, "the tissue was asked for as homogeneous")])
+    elif tissue.kind == "layered":
+        made.append(Effect(LAYERS, "built", "epidermis above dermis, thinned by suction"))
+    else:
+        made += absent([(LAYERS, "fibrous tissue has one layer")])
+    world = [
+        ("bends and drift of the fibres' transmission", "they lie still in one head"),
+        ("movement of the head on the skin", "suction holds it; its coming off is told"),
+        ("reflections between the head's face and the skin", "the head is black"),
+        ("light that fibres pass on at angles of their own", "the camera takes all of it"),
+        ("pulse and breath in the skin's blood", "the simulated subject's blood rests"),
+    ]
+    limits = [
+        ("warming of the skin by light and contact", "1 mW for seconds"),
+        ("a lens's color error", "spots are summed"),
+    ]
+    if tissue.kind == "layered":
+        limits += [
+            ("another spot of skin at each repeat", "where a head lands again is not known"),
+            ("pressure's effect on scattering and oxygen", "blood's outweighs them"),
+            ("hair, pores and veins under the head", "layers are even within a centimeter"),
+        ]
+    return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+
+
+def _sized(name: str, change: float, noise: Noise, because: str) -> Effect:
+    """Return an effect of the probe as built that is there at any size."""
+    over = change / float(noise.sigma(change))
+    return Effect(name, "built", f"{because}: up to {over:.3g} times the noise", over)
+
+
+def _color(tissue: ProbedTissue) -> Effect:
+    if tissue.kind == "anisotropic":
+        return Effect(COLOR, "absent", "its direction is what is looked for; one color is traced")
+    if isinstance(tissue, HomogeneousTissue) and not tissue.wavelength_nm:
+        return Effect(COLOR, "negligible", "the tissue is gray: one color serves all bands", 0.0)
+    return Effect(COLOR, "built", "absorption differs from band to band")

@@ -1,0 +1,1 @@
+"""Simulated populations and subject files."""

@@ -1,0 +1,339 @@
+"""What cold, heat, sweat, lotion, makeup and powder do to a face.
+
+A condition changes what carries the appearance, never pictures: the radius of the vessels, the
+oil, the facets, and what lies on the skin (`rigsim.light.surface_brdf.Coating`). Amounts run from 0,
+which changes nothing at all, to 1.
+
+======== ========================================================================================
+normal   nothing
+cold     vessels narrow by 25 %, most in the cheeks and nose; half of the oil; facets 6 % rougher
+hot      vessels widen by 28 %, most in the cheeks; oil 1.6 times; a thin film of sweat on forehead,
+         nose and upper lip
+sweat    water (index 1.333) on 70 % of forehead and nose and on patches of the rest, very smooth
+lotion   an oily emulsion (index 1.45) on 75 %, smooth; facets 15 % smoother; vellus hair lies down
+makeup   pigment that covers 70 % of the diffuse color and evens it out, a satin film on 45 %, half
+         of the oil
+powder   grains on 45 %, which scatter back; a matte white part below them; a fifth of the oil
+======== ========================================================================================
+
+What grains scatter once goes every way, and eq. (6) takes the least of it for diffuse light: under
+powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.surface_floor`, the truth's map
+``r_d_floor``).
+
+All these amounts are chosen; what is known is their direction and order of size:
+
+- Sebum flows by 10 % less for each degree that the skin is colder (Cunliffe, Burton and Shuster
+  1970, British Journal of Dermatology 83, 650-654).
+- Vessels of the face narrow in cold and widen in heat; a vessel's blood goes with the square of its
+  radius (`rigsim.subject.perfusion`).
+- Water: index 1.333 (Hale and Querry 1973, doi:10.1364/AO.12.000555). Oils and emulsifiers of
+  lotions: 1.44 to 1.48; binders and esters of foundations: about 1.5 (handbook values).
+- Powder kills gloss and scatters back: Hapke 1981, doi:10.1029/JB086iB04p03039 for grains.
+- Dataset A of Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10, has these seven.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigsim.geometry.mesh import Float32Array
+from rigsim.geometry.surface_noise import smooth_noise
+from rigsim.light.surface_brdf import Coating, SkinSurface, skin_surface
+from rigsim.shading import interior_scale
+from rigsim.subject import Subject, face_regions
+from rigsim.tissue.skin_layers import ETA
+
+CONDITIONS: Final = ("normal", "cold", "hot", "sweat", "lotion", "makeup", "powder")
+"""The seven conditions of dataset A."""
+
+POWDER_MATTE: Final = np.array([0.55, 0.54, 0.52], np.float32)
+"""What grains scatter more than once, in the unit of R_d; with `POWDER_ALBEDO` below 1."""
+
+OIL_LIMIT: Final = 0.95
+ROUGHNESS_RANGE: Final = (0.1, 0.6)
+
+
+class ConditionError(ValueError):
+    """There is no such condition, or no such amount of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Film:
+    share: float
+    alpha: float
+    eta: float
+    shiny: float
+    """How much more of it lies where oil gathers and skin sweats, 0 (even) to 1."""
+    broken: float
+    """How much it breaks up into drops and patches, 0 (whole) to 1."""
+    cell_mm: float
+    """Size of its patches."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Change:
+    vessels: float = 0.0
+    oil: float = 1.0
+    roughness: float = 1.0
+    fuzz: float = 1.0
+    film: _Film | None = None
+    cover: float = 0.0
+    powder: float = 0.0
+
+
+_CHANGES: Final[Mapping[str, _Change]] = {
+    "normal": _Change(),
+    "cold": _Change(vessels=-0.25, oil=0.5, roughness=1.06),
+    "hot": _Change(vessels=0.28, oil=1.6, film=_Film(0.3, 0.12, 1.333, 1.0, 0.7, 3.0)),
+    "sweat": _Change(vessels=0.06, film=_Film(0.7, 0.09, 1.333, 0.6, 0.8, 3.5)),
+    "lotion": _Change(roughness=0.85, fuzz=0.4, film=_Film(0.75, 0.17, 1.45, 0.0, 0.15, 12.0)),
+    "makeup": _Change(oil=0.5, fuzz=0.7, cover=0.7, film=_Film(0.45, 0.3, 1.5, 0.0, 0.1, 9.0)),
+    "powder": _Change(oil=0.2, roughness=1.08, fuzz=0.8, powder=0.45),
+}
+
+
+def checked(conditions: Mapping[str, float]) -> dict[str, float]:
+    """Return conditions in the order in which they come upon a face.
+
+    Parameters
+    ----------
+    conditions
+        Name to amount, 0 to 1.
+
+    Raises
+    ------
+    ConditionError
+        A name or an amount is unknown.
+
+    Examples
+    --------
+    >>> checked({"powder": 1, "lotion": 0.6})
+    {'lotion': 0.6, 'powder': 1.0}
+    """
+    for name, amount in conditions.items():
+        if name not in CONDITIONS:
+            raise ConditionError(
+                f"condition: got {name!r}, expected one of {', '.join(CONDITIONS)}"
+            )
+        if not 0.0 <= amount <= 1.0:
+            raise ConditionError(f"amount of {name}: got {amount}, expected 0 to 1")
+    return {name: float(conditions[name]) for name in CONDITIONS if name in conditions}
+
+
+def conditioned_subject(subject: Subject, conditions: Mapping[str, float]) -> Subject:
+    """Return a face whose vessels answer to conditions; its surface stays.
+
+    Parameters
+    ----------
+    subject
+        The face.
+    conditions
+        Name to amount, 0 to 1.
+
+    Returns
+    -------
+    Subject
+        The same object where nothing changes.
+    """
+    change = sum(a * _CHANGES[name].vessels for name, a in checked(conditions).items())
+    if change == 0.0:
+        return subject
+    regions = subject.perfusion.regions
+    answer = 0.7 + 0.3 * np.maximum(regions["cheeks"], regions["nose"])
+    perfusion = subject.perfusion.dilated(change * answer)
+    rest = subject.rest
+    if rest is not None:
+        rest = dataclasses.replace(rest, perfusion=perfusion)
+    return dataclasses.replace(subject, perfusion=perfusion, rest=rest)
+
+
+def conditioned(
+    surface: SkinSurface,
+    condition: str,
+    amount: float = 1.0,
+    *,
+    points_mm: Float32Array | None = None,
+    foundation: ArrayLike | None = None,
+    seed: int = 0,
+) -> SkinSurface:
+    """Return a surface under a condition; its blood stays, see `conditioned_subject`.
+
+    Parameters
+    ----------
+    surface
+        The surface before; what lies on it already stays below, as a mean film.
+    condition
+        One of `CONDITIONS`.
+    amount
+        0 to 1; 0 returns the surface itself.
+    points_mm
+        The texels on the mean head, shape (N, N, 3): films gather and break up into patches, lips
+        keep their color. ``None`` spreads all evenly.
+    foundation
+        R_d of the makeup, shape (3,); ``None`` takes the median of the face.
+    seed
+        Seed of the patches.
+
+    Returns
+    -------
+    SkinSurface
+
+    Raises
+    ------
+    ConditionError
+        The condition or its amount is unknown.
+    """
+    (amount,) = checked({condition: amount}).values()
+    change = _CHANGES[condition]
+    if amount == 0.0 or change == _Change():
+        return surface
+
+    def part(factor: float) -> np.float32:
+        return np.float32(1.0 + amount * (factor - 1.0))
+
+    regions = None if points_mm is None else face_regions.region_masks(points_mm)
+    found = dataclasses.replace(
+        surface,
+        roughness=np.clip(surface.roughness * part(change.roughness), *ROUGHNESS_RANGE),
+        oil=np.clip(surface.oil * part(change.oil), 0.0, OIL_LIMIT),
+        fuzz=surface.fuzz * part(change.fuzz),
+    )
+    if change.cover > 0.0:
+        found = _painted(found, amount * change.cover, regions, foundation)
+    on = surface.coating
+    zero = np.zeros_like(surface.oil)
+    if on is None:
+        on = Coating(zero, zero + np.float32(0.2), zero + np.float32(ETA), zero)
+    if change.film is not None:
+        share = amount * _spread(change.film, surface, points_mm, regions, seed)
+        on = _over(on, change.film, np.asarray(share, np.float32))
+    if change.powder > 0.0:
+        grainy = np.float32(amount * change.powder) * surface.bare
+        below = grainy[..., None]
+        found = dataclasses.replace(
+            found,
+            r_d=np.asarray((1.0 - below) * found.r_d + below * POWDER_MATTE, np.float32),
+            reflectance=np.asarray(
+                (1.0 - below) * found.reflectance
+                + below * POWDER_MATTE / np.float32(interior_scale(ETA)),
+                np.float32,
+            ),
+        )
+        on = dataclasses.replace(on, powder=np.asarray(1.0 - (1.0 - on.powder) * (1.0 - grainy)))
+    return dataclasses.replace(found, coating=on)
+
+
+def conditioned_surface(
+    subject: Subject,
+    camera: str,
+    light: str,
+    conditions: Mapping[str, float],
+    *,
+    state: str = "neutral",
+) -> SkinSurface:
+    """Return how a face reflects under conditions: its vessels, its surface, what lies on it.
+
+    Parameters
+    ----------
+    subject
+        The face, as it is without.
+    camera, light
+        Names known to `model.spectra`.
+    conditions
+        Name to amount, 0 to 1.
+    state
+        State of the face's blood.
+    """
+    changed = conditioned_subject(subject, conditions)
+    return coated(changed, skin_surface(changed, camera, light, state=state), conditions)
+
+
+def coated(subject: Subject, surface: SkinSurface, conditions: Mapping[str, float]) -> SkinSurface:
+    """Return the surface of a face under conditions, in order, on its own points and seed."""
+    wanted = {name: a for name, a in checked(conditions).items() if a > 0.0 and name != "normal"}
+    if not wanted:
+        return surface
+    points = subject.perfusion.points_mm
+    for name, amount in wanted.items():
+        surface = conditioned(
+            surface, name, amount, points_mm=points, seed=subject.seed + CONDITIONS.index(name)
+        )
+    return surface
+
+
+def _painted(
+    surface: SkinSurface,
+    cover: float,
+    regions: Mapping[str, Float32Array] | None,
+    foundation: ArrayLike | None,
+) -> SkinSurface:
+    """Cover the diffuse color by a pigment; hair and, where they are known, lips stay."""
+    scale = np.float32(interior_scale(ETA))
+    if foundation is None:
+        skin = (surface.bare > 0.98) & (np.linalg.norm(surface.normal, axis=-1) > 0.5)
+        if not skin.any():
+            skin = np.ones_like(skin)
+        color = np.median(surface.r_d[skin], axis=0).astype(np.float32)
+    else:
+        color = np.asarray(foundation, np.float32)
+        if color.shape != (3,) or not (np.all(color >= 0.0) and np.all(color <= 1.0)):
+            raise ConditionError(f"foundation: got {color.tolist()}, expected 3 values, 0 to 1")
+    share = np.float32(cover) * surface.bare
+    if regions is not None:
+        share = share * (1.0 - regions["lips"])
+    share = share[..., None]
+    return dataclasses.replace(
+        surface,
+        r_d=np.asarray((1.0 - share) * surface.r_d + share * color, np.float32),
+        reflectance=np.asarray(
+            (1.0 - share) * surface.reflectance + share * color / scale, np.float32
+        ),
+    )
+
+
+def _spread(
+    film: _Film,
+    surface: SkinSurface,
+    points_mm: Float32Array | None,
+    regions: Mapping[str, Float32Array] | None,
+    seed: int,
+) -> Float32Array:
+    """Return the share that a film covers, shape (N, N), 0 to 1."""
+    share = np.full(surface.oil.shape, film.share, np.float32)
+    if points_mm is None or regions is None:
+        return share
+    wet = np.maximum(np.maximum(regions["forehead"], regions["nose"]), 0.7 * regions["chin"])
+    share *= 1.0 - np.float32(film.shiny) * (1.0 - wet)
+    patches = smooth_noise(points_mm, (film.cell_mm, 0.4 * film.cell_mm), seed=seed + 401)
+    whole = 1.0 / (1.0 + np.exp(-4.0 * (patches + 0.3)))
+    share *= 1.0 - np.float32(film.broken) * (1.0 - whole)
+    return np.asarray(np.clip(share, 0.0, 1.0), np.float32)
+
+
+def _over(below: Coating, film: _Film, share: Float32Array) -> Coating:
+    """Lay a film over a coating; where both lie, alpha and index are the mean by their shares."""
+    total = below.film + share
+    weight = np.where(total > 0.0, share / np.maximum(total, np.float32(1e-6)), 1.0)
+    return Coating(
+        film=np.asarray(1.0 - (1.0 - below.film) * (1.0 - share), np.float32),
+        film_alpha=np.asarray((1.0 - weight) * below.film_alpha + weight * film.alpha, np.float32),
+        film_eta=np.asarray((1.0 - weight) * below.film_eta + weight * film.eta, np.float32),
+        powder=below.powder,
+    )
+
+
+__all__ = [
+    "CONDITIONS",
+    "ConditionError",
+    "checked",
+    "coated",
+    "conditioned",
+    "conditioned_subject",
+    "conditioned_surface",
+]

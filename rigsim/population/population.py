@@ -1,0 +1,478 @@
+"""A simulated population: 87 members in the groups of table 1 of Weyrich et al. 2006.
+
+Members are draws from distributions of melanin, blood, oil, freckles, age and beard. The groups
+differ by nothing but the distributions below. **All of these are chosen** so that an analysis has
+something to find; they are no measurement, and nothing here is a statement about people.
+
+================= =========================================================================
+age               as the paper states each group's range; both ends occur, else even
+melanin           log-normal: median 0.016 (caucasian) or 0.032 (asian), sigma 0.35 or 0.30,
+                  drawn again outside 0.006 to 0.05 or 0.012 to 0.1; times 0.92 in women
+blood             log-normal, median 1, sigma 0.15; times 0.93 in women
+oil               log-normal, median 1, sigma 0.25; times 0.9 in women, less with age
+freckles          even from 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
+beard             men of 17 and older: even from 0.05 to 1 (caucasian) or 0.05 to 0.65 (asian)
+age spots         from 35 years on, up to 0.8 at 75
+mottle            uneven melanin: 0.03 at 15 to 0.12 at 75
+relief, roughness depth of furrows 0.7 to 1.45 times, roughness 0.95 to 1.12 times, 15 to 75 years
+conditions        none, or lotion, makeup or both in the groups that wear them, amounts 0.6 to 1
+================= =========================================================================
+
+Members share `HEADS` shapes of head, so that many faces are drawn quickly; everything else is
+each member's own. Their textures share one layout, and their landmarks differ with the head.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, table 1 and section 10 (groups and ages).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import Float32Array, Mesh
+from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
+from rigsim.light.surface_brdf import SkinSurface
+from rigsim.population.conditions import checked, conditioned_surface
+from rigsim.subject import Subject, face_regions, pigment, relief
+from rigsim.subject.head import build_head
+from rigsim.subject.perfusion import perfuse
+from rigsim.subject.person import SIZE_RANGE
+
+HEADS: Final = 6
+"""Shapes of head that the members share."""
+
+KEPT: Final = 6
+"""Heads that are kept laid out."""
+
+HAIR_LIMIT: Final = 0.02
+"""Texels with more hair than this part are not skin."""
+
+MELANIN_RANGE: Final = (0.004, 0.3)
+BEARD_FROM: Final = 0.35
+"""Members with at least this much stubble are labelled "beard"."""
+FRECKLED_FROM: Final = 0.45
+
+Sex = Literal["male", "female"]
+Ethnicity = Literal["caucasian", "asian"]
+
+
+class PopulationError(ValueError):
+    """A member or a shift of a population is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One person; the same fields make the same face."""
+
+    name: str
+    group: str
+    """One of `GROUPS`."""
+    sex: Sex
+    ethnicity: Ethnicity
+    age_years: float
+    melanin: float
+    """Volume fraction of melanosomes around which the map varies, 0.004 to 0.3."""
+    blood: float
+    """Factor of all blood, 0.1 to 4."""
+    oil: float
+    """Factor of the share that oil covers, 0 to 3."""
+    freckles: float
+    """0 to 1."""
+    beard: float
+    """Stubble, 0 to 1."""
+    seed: int
+    """Seed of everything that is drawn on the face."""
+    head: int
+    """Shape of the head, 0 to `HEADS` - 1."""
+    applied: tuple[tuple[str, float], ...] = ()
+    """Conditions of `rigsim.population.conditions.CONDITIONS` with their amounts."""
+    marks: frozenset[str] = frozenset()
+    """Names of traits that were added, see `shifted`."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for field, (low, high) in _RANGES.items():
+            value = getattr(self, field)
+            if not low <= value <= high:
+                raise PopulationError(
+                    f"{field} of {self.name}: got {value}, expected {low} to {high}"
+                )
+        if len({name for name, _ in self.applied}) < len(self.applied):
+            raise PopulationError(f"applied to {self.name}: got {self.applied}, one of them twice")
+        checked(dict(self.applied))
+
+    @property
+    def conditions(self) -> frozenset[str]:
+        """Names of the conditions that are not of amount 0."""
+        return frozenset(name for name, amount in self.applied if amount > 0.0)
+
+    @property
+    def labels(self) -> frozenset[str]:
+        """What a user would say of this face.
+
+        Sex, ethnicity, "beard" and "freckles" where there is much of either, conditions, marks.
+        """
+        seen = {self.sex, self.ethnicity, *self.conditions, *self.marks}
+        seen |= {"beard"} if self.beard >= BEARD_FROM else set()
+        seen |= {"freckles"} if self.freckles >= FRECKLED_FROM else set()
+        return frozenset(seen)
+
+    def face(self, size: int = 256) -> Subject:
+        """Return the face, without conditions (see `surface`).
+
+        Parameters
+        ----------
+        size
+            Texels along one side, 64 to 8192.
+        """
+        flat = self._flat(size)
+        points, regions = flat.perfusion.points_mm, flat.perfusion.regions
+        old = (self.age_years - 15.0) / 60.0
+        height = relief.height_um(points, regions, texel_mm=_texel_mm(flat.atlas), seed=self.seed)
+        height = np.asarray(height * np.float32(0.7 + 0.75 * old), np.float32)
+        roughness = relief.roughness_map(points, regions, seed=self.seed)
+        rougher = np.clip(roughness * np.float32(0.95 + 0.17 * old), 0.15, 0.5)
+        return dataclasses.replace(
+            flat,
+            roughness=np.asarray(rougher, np.float32),
+            height_um=height,
+            normal=relief.relief_normals(flat.atlas, height),
+        )
+
+    def _flat(self, size: int) -> Subject:
+        """Return the face without relief and of even roughness: all that its color needs."""
+        mesh, atlas, points, regions = _laid_out(self.head, size)
+        even = np.zeros((size, size), np.float32)
+        return Subject(
+            preset=_nearest_preset(self.melanin),
+            seed=self.seed,
+            mesh=mesh,
+            atlas=atlas,
+            melanin=self._melanin(points, regions),
+            perfusion=perfuse(points, regions, seed=self.seed, amount=self.blood),
+            roughness=even + np.float32(0.3),
+            height_um=even,
+            hair=relief.hair_map(points, seed=self.seed),
+            normal=atlas.normal,
+            beard=_stubble(points, regions, self.beard, _texel_mm(atlas), seed=self.seed),
+            oiliness=self.oil,
+        )
+
+    def surface(self, size: int, camera: str, light: str) -> SkinSurface:
+        """Return how the face reflects under its conditions.
+
+        Parameters
+        ----------
+        size
+            Texels along one side, 64 to 8192.
+        camera, light
+            Names known to `model.spectra`.
+        """
+        return conditioned_surface(self.face(size), camera, light, dict(self.applied))
+
+    def r_d(self, size: int, camera: str, light: str) -> tuple[Float32Array, NDArray[np.bool_]]:
+        """Return the texture of R_d.
+
+        Parameters
+        ----------
+        size
+            Texels along one side, 64 to 8192.
+        camera, light
+            Names known to `model.spectra`.
+
+        Returns
+        -------
+        r_d : ndarray of float32
+            Factor of eq. (6), white-balanced camera RGB, shape (N, N, 3).
+        mask : ndarray of bool
+            Bare skin, shape (N, N).
+        """
+        face = self._flat(size)
+        surface = conditioned_surface(face, camera, light, dict(self.applied))
+        return surface.r_d, face.atlas.covered & (face.hair < HAIR_LIMIT)
+
+    def _melanin(self, points: Float32Array, regions: Mapping[str, Float32Array]) -> Float32Array:
+        drawn = pigment.melanin_map(
+            points, regions, self.melanin, seed=self.seed, freckles=self.freckles
+        )
+        old = (self.age_years - 15.0) / 60.0
+        step = (0.03 + 0.09 * old) * smooth_noise(points, (11.0, 5.0), seed=self.seed + 501)
+        sunny = 0.2 + 0.8 * np.maximum(
+            np.maximum(regions["forehead"], regions["temples"]), regions["cheeks"]
+        )
+        amount = 0.8 * min(max((self.age_years - 35.0) / 40.0, 0.0), 1.0)
+        step += 0.8 * scattered_spots(
+            points,
+            0.5 * amount * sunny * (1.0 - regions["lips"]),
+            cell_mm=9.0,
+            radius_mm=(1.0, 3.2),
+            seed=self.seed + 502,
+            softness=6.0,
+        )
+        # Steps of log-odds against the limit, as those of the map itself.
+        odds = drawn / (pigment.MELANIN_LIMIT - drawn) * np.exp(step)
+        return np.asarray(pigment.MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
+
+
+_RANGES: Final[Mapping[str, tuple[float, float]]] = {
+    "age_years": (13.0, 90.0),
+    "melanin": MELANIN_RANGE,
+    "blood": (0.1, 4.0),
+    "oil": (0.0, 3.0),
+    "freckles": (0.0, 1.0),
+    "beard": (0.0, 1.0),
+    "head": (0, HEADS - 1),
+    "seed": (0, 2**31 - 1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """One row of table 1."""
+
+    name: str
+    count: int
+    sex: Sex
+    ethnicity: Ethnicity
+    age_years: tuple[int, int]
+    wears: bool = False
+    """Whether its members wear lotion or makeup."""
+
+
+GROUPS: Final = (
+    Group("caucasian male", 50, "male", "caucasian", (13, 59)),
+    Group("caucasian female", 5, "female", "caucasian", (24, 55)),
+    Group("caucasian female, lotion or makeup", 6, "female", "caucasian", (23, 56), wears=True),
+    Group("asian male", 20, "male", "asian", (22, 74)),
+    Group("asian female", 4, "female", "asian", (22, 65)),
+    Group("asian female, lotion or makeup", 2, "female", "asian", (24, 30), wears=True),
+)
+"""Table 1: 87 people, 70 of them male."""
+
+_WORN: Final = (("lotion",), ("makeup",), ("lotion", "makeup"))
+
+
+def table_1(*, seed: int = 0) -> tuple[Member, ...]:
+    """Draw the population of table 1.
+
+    Parameters
+    ----------
+    seed
+        Seed of all draws, >= 0.
+
+    Returns
+    -------
+    tuple of Member
+        87, group by group in the order of `GROUPS`.
+
+    Examples
+    --------
+    >>> people = table_1()
+    >>> len(people), sum(p.sex == "female" for p in people)
+    (87, 17)
+    >>> sorted(people[55].labels - {"freckles"})
+    ['caucasian', 'female', 'lotion']
+    """
+    if seed < 0:
+        raise PopulationError(f"seed: got {seed}, expected >= 0")
+    members: list[Member] = []
+    for row, group in enumerate(GROUPS):
+        rng = np.random.default_rng([seed, 600, row])
+        for index in range(group.count):
+            members.append(_drawn(group, index, len(members), rng))
+    return tuple(members)
+
+
+def member(name: str) -> Member:
+    """Return a member of `table_1` by name, "P01" to "P87".
+
+    Raises
+    ------
+    PopulationError
+        There is none of that name.
+
+    Examples
+    --------
+    >>> member("P56").group
+    'caucasian female, lotion or makeup'
+    """
+    found = {person.name: person for person in table_1()}
+    if name not in found:
+        raise PopulationError(f"member: got {name!r}, expected P01 to P{len(found)}")
+    return found[name]
+
+
+def shifted(
+    members: Sequence[Member],
+    trait: str,
+    *,
+    melanin: float = 1.0,
+    blood: float = 1.0,
+    apply: Mapping[str, float] | None = None,
+    share: float = 0.5,
+    rng: np.random.Generator,
+) -> tuple[Member, ...]:
+    """Add a known trait to a random part of a population.
+
+    Parameters
+    ----------
+    members
+        The population.
+    trait
+        Name of the trait, which becomes a label of the changed members.
+    melanin, blood
+        Factors of the changed members' melanin and blood: a tan is ``melanin=1.5``.
+    apply
+        Conditions with their amounts, 0 to 1, that the changed members get (instead of what
+        they had of the same).
+    share
+        Part of the population that is changed, 0 to 1; rounded to whole members.
+    rng
+        Chooses who.
+
+    Returns
+    -------
+    tuple of Member
+        The same people in the same order; nothing else about them changes, so the true trait of
+        each is the difference to the member of the same index.
+
+    Raises
+    ------
+    PopulationError
+        The share, or a changed member, is out of range.
+
+    Examples
+    --------
+    >>> people = table_1()
+    >>> tanned = shifted(people, "tan", melanin=1.5, rng=np.random.default_rng(1))
+    >>> sum("tan" in person.labels for person in tanned)
+    44
+    """
+    if not 0.0 <= share <= 1.0:
+        raise PopulationError(f"share: got {share}, expected 0 to 1")
+    chosen = set(rng.permutation(len(members))[: round(share * len(members))].tolist())
+    worn = checked({} if apply is None else apply)
+    return tuple(
+        dataclasses.replace(
+            member,
+            melanin=member.melanin * melanin,
+            blood=member.blood * blood,
+            applied=tuple(checked(dict(member.applied) | worn).items()),
+            marks=member.marks | {trait},
+        )
+        if index in chosen
+        else member
+        for index, member in enumerate(members)
+    )
+
+
+def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> Member:
+    low, high = group.age_years
+    age = float((low, high)[index] if index < 2 else rng.integers(low, high + 1))
+    male, pale = group.sex == "male", group.ethnicity == "caucasian"
+    bounds = (0.006, 0.05) if pale else (0.012, 0.1)
+    melanin = 0.0
+    while not bounds[0] <= melanin <= bounds[1]:
+        spread = float(rng.standard_normal())
+        melanin = 0.016 * np.exp(0.35 * spread) if pale else 0.032 * np.exp(0.3 * spread)
+        melanin *= 1.0 if male else 0.92
+    blood = float(np.exp(0.15 * rng.standard_normal())) * (1.0 if male else 0.93)
+    aging = 1.0 - 0.006 * max(age - 30.0, 0.0)
+    oil = float(np.exp(0.25 * rng.standard_normal())) * aging * (1.0 if male else 0.9)
+    freckles = float(rng.uniform(0.0, 0.9 if pale else 0.35))
+    stubble = float(rng.uniform(0.05, 1.0 if pale else 0.65))
+    amounts = rng.uniform(0.6, 1.0, 2)
+    worn = _WORN[index % len(_WORN)] if group.wears else ()
+    return Member(
+        name=f"P{number + 1:02d}",
+        group=group.name,
+        sex=group.sex,
+        ethnicity=group.ethnicity,
+        age_years=age,
+        melanin=float(melanin),
+        blood=min(max(blood, 0.1), 4.0),
+        oil=min(oil, 3.0),
+        freckles=freckles,
+        beard=stubble if male and age >= 17.0 else 0.0,
+        seed=int(rng.integers(0, 2**31 - 1)),
+        head=int(rng.integers(HEADS)),
+        applied=tuple((name, float(a)) for name, a in zip(worn, amounts, strict=False)),
+    )
+
+
+def _nearest_preset(melanin: float) -> str:
+    presets = pigment.MELANIN_PRESETS
+    return min(presets, key=lambda name: abs(np.log(presets[name] / melanin)))
+
+
+def _stubble(
+    points: Float32Array,
+    regions: Mapping[str, Float32Array],
+    amount: float,
+    texel_mm: float,
+    *,
+    seed: int,
+) -> Float32Array | None:
+    """Draw the stubble below the surface: follicles on chin, jaw and upper lip."""
+    if amount == 0.0:
+        return None
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    # The border runs from the ears down the cheeks to the corners of the mouth.
+    reach = np.clip((np.abs(x) - 24.0) / 34.0, 0.0, 1.0)
+    upper = -34.0 + 22.0 * reach**1.5 - y
+    moustache = np.exp(-((x / 26.0) ** 4) - ((y + 29.0) / 7.0) ** 4)
+    area = np.maximum(1.0 / (1.0 + np.exp(-upper / 3.0)), 0.9 * moustache)
+    area *= 1.0 / (1.0 + np.exp(-(z + 62.0) / 6.0))
+    area *= 1.0 / (1.0 + np.exp(-(y + 92.0) / 5.0))  # it ends on the neck
+    area *= (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["nose"])
+    area *= np.clip(1.0 + 0.25 * smooth_noise(points, (12.0, 5.0), seed=seed + 511), 0.3, 1.5)
+    dense = np.asarray(np.clip(amount * area, 0.0, 1.0), np.float32)
+    dots = scattered_spots(
+        points,
+        dense,
+        cell_mm=0.9,
+        radius_mm=(0.12, 0.22),
+        seed=seed + 512,
+        softness=4.0,
+        smallest_mm=0.7 * texel_mm,
+    )
+    # Half of the shadow is blurred: light spreads in skin further than between two follicles.
+    return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)
+
+
+def _texel_mm(atlas: Atlas) -> float:
+    along_u, along_v = atlas.texel_mm()
+    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
+
+
+@lru_cache(maxsize=HEADS)
+def _head_mesh(head: int) -> Mesh:
+    return build_head(np.random.default_rng([head, 600]))
+
+
+@lru_cache(maxsize=KEPT)
+def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
+    """Return a head, its texture, the texels on the mean head and its regions.
+
+    A head takes 8 MB at 256 texels, 120 MB at 1024.
+    """
+    if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
+        raise PopulationError(
+            f"size: got {size}, expected {SIZE_RANGE[0]} to {SIZE_RANGE[1]} texels"
+        )
+    mesh = _head_mesh(head)
+    atlas = unwrap(mesh, size)
+    points = face_regions.on_mean_head(atlas.position_mm, mesh)
+    return mesh, atlas, points, face_regions.region_masks(points)
+
+
+__all__ = ["GROUPS", "HEADS", "Group", "Member", "PopulationError", "member", "shifted", "table_1"]

@@ -1,0 +1,214 @@
+"""A mesh that rays are cast on, by one of two tracers.
+
+Mitsuba's LLVM variants trace where they work, else Embree through embreex, which needs no LLVM.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigsim.geometry.atlas import BoolArray
+from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh
+from rigsim.render.renderer import load, with_slack
+from rigsim.render.variant import VariantChoice, choose_variant
+
+RAYS_PER_CALL: Final = 1 << 22
+"""Rays traced in one call; bounds the memory that a ray batch takes."""
+
+
+class _Tracer(Protocol):
+    scene: Any
+
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]: ...
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray: ...
+
+
+class Caster:
+    """Traces rays against one mesh.
+
+    Parameters
+    ----------
+    mesh
+        The mesh; it is copied.
+    choice
+        Variant to use; ``None`` chooses one for this machine.
+    """
+
+    def __init__(self, mesh: Mesh, *, choice: VariantChoice | None = None) -> None:
+        self.mesh = mesh
+        self.choice = choose_variant("rgb") if choice is None else choice
+        self.attributes = np.concatenate([mesh.vertices_mm, mesh.normals, mesh.uv], axis=1)
+        self._face_normals: Float32Array | None = None
+        self._tracer: _Tracer
+        if self.choice.is_vectorized:
+            self._tracer = _MitsubaTracer(mesh, self.choice)
+        else:
+            self._tracer = _EmbreeTracer(mesh)
+
+    @property
+    def face_normals(self) -> Float32Array:
+        """Unit normals of the triangles, shape (F, 3); zero where one has no area."""
+        if self._face_normals is None:
+            corners = self.mesh.vertices_mm[self.mesh.faces]
+            edges = corners[:, 1:] - corners[:, :1]
+            self._face_normals = unit(np.cross(edges[:, 0], edges[:, 1]))
+        return self._face_normals
+
+    @property
+    def scene(self) -> Any:
+        """Mitsuba's scene of the mesh, for kernels that trace and shade at once, or None."""
+        return self._tracer.scene
+
+    def first_hit(
+        self, origins: ArrayLike, directions: ArrayLike
+    ) -> tuple[Int32Array, Float32Array]:
+        """Find the first triangle on each ray.
+
+        Parameters
+        ----------
+        origins
+            Start points in mm, shape (N, 3).
+        directions
+            Unit vectors, shape (N, 3).
+
+        Returns
+        -------
+        prim : ndarray of int32
+            Triangle met, shape (N,), -1 for none.
+        weight : ndarray of float32
+            Weights of the triangle's second and third corner, shape (N, 2).
+        """
+        start, way = _ray_arrays(origins, directions)
+        prim = np.empty(len(start), np.int32)
+        weight = np.empty((len(start), 2), np.float32)
+        for part in _parts(len(start)):
+            prim[part], weight[part] = self._tracer.first_hit(start[part], way[part])
+        return prim, weight
+
+    def blocked(self, origins: ArrayLike, directions: ArrayLike, length_mm: ArrayLike) -> BoolArray:
+        """Tell which rays meet a triangle before their end.
+
+        Parameters
+        ----------
+        origins
+            Start points in mm, shape (N, 3).
+        directions
+            Unit vectors, shape (N, 3).
+        length_mm
+            Length of each ray in mm, shape (N,).
+
+        Returns
+        -------
+        ndarray of bool
+            Shape (N,).
+        """
+        start, way = _ray_arrays(origins, directions)
+        length = np.ascontiguousarray(np.broadcast_to(length_mm, len(start)), np.float32)
+        out = np.empty(len(start), np.bool_)
+        for part in _parts(len(start)):
+            out[part] = self._tracer.blocked(start[part], way[part], length[part])
+        return out
+
+
+class _MitsubaTracer:
+    def __init__(self, mesh: Mesh, choice: VariantChoice) -> None:
+        self._choice = choice
+        mi = load(choice)
+        shape = mi.Mesh("mesh", len(mesh.vertices_mm), len(mesh.faces))
+        parameters = mi.traverse(shape)
+        parameters["vertex_positions"] = with_slack(np.ravel(mesh.vertices_mm))
+        parameters["faces"] = with_slack(np.ravel(mesh.faces).astype(np.uint32))
+        parameters.update()
+        self.scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
+
+    def _ray(
+        self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
+    ) -> Any:
+        start = mi.Point3f(*(with_slack(origins[:, k]) for k in range(3)))
+        way = mi.Vector3f(*(with_slack(directions[:, k]) for k in range(3)))
+        ray = mi.Ray3f(start, way)
+        if length is not None:
+            ray.maxt = mi.Float(with_slack(length))
+        return ray
+
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]:
+        mi = load(self._choice)
+        hit = self.scene.ray_intersect_preliminary(
+            self._ray(mi, origins, directions), coherent=True
+        )
+        _evaluate(hit)  # else each of the reads below would trace anew
+        valid = np.array(hit.is_valid())
+        prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
+        weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)
+        return prim, np.where(valid[:, None], weight, 0.0).astype(np.float32)
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray:
+        mi = load(self._choice)
+        hit = self.scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
+        return np.array(hit, np.bool_)
+
+
+class _EmbreeTracer:
+    def __init__(self, mesh: Mesh) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self.scene: Any = None
+        self._scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
+
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]:
+        if not len(origins):
+            return np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        hit = self._scene.run(origins, directions, output=True)
+        prim = np.asarray(hit["primID"], np.int32)
+        weight = np.stack([hit["u"], hit["v"]], axis=-1).astype(np.float32)
+        return prim, np.where(prim[:, None] >= 0, weight, np.float32(0.0))
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray:
+        if not len(origins):
+            return np.zeros(0, np.bool_)
+        hit = self._scene.run(origins, directions, dists=length.copy(), query="OCCLUDED")
+        return np.asarray(hit) != -1
+
+
+def _evaluate(result: Any) -> None:
+    import drjit as dr
+
+    dr.eval(result)
+
+
+def _ray_arrays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float32Array, Float32Array]:
+    start = np.ascontiguousarray(origins, np.float32)
+    way = np.ascontiguousarray(directions, np.float32)
+    if start.shape != way.shape or start.ndim != 2 or start.shape[1] != 3:
+        raise ValueError(f"rays: got shapes {start.shape} and {way.shape}, expected (N, 3) twice")
+    return start, way
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(at, min(at + RAYS_PER_CALL, count)) for at in range(0, count, RAYS_PER_CALL)]
+
+
+def unit(vectors: Float32Array) -> Float32Array:
+    """Return vectors of length 1; those of length 0 stay."""
+    squared = np.einsum("...i,...i->...", vectors, vectors)
+    inverse = np.zeros_like(squared)
+    np.divide(np.float32(1.0), np.sqrt(squared), out=inverse, where=squared > 0.0)
+    return vectors * inverse[..., None]

@@ -1,0 +1,379 @@
+"""What a lens does to points at many depths: each spreads over pixels by how far off focus it is.
+
+Rays through the middle of the pupil find the surface; here the light that they would see goes
+through the whole of the pupil. A point's light falls on pixels as diffraction and its own circle of
+confusion say, all of it; where near skin stands before far skin, the near covers the far.
+
+Notes
+-----
+Weights come from the OTF of a defocused circle (`rigsim.render.lens_blur.Lens`), times those of a pixel
+and of the square that a sample stands for: without blur they are what averaging over a pixel is. A
+pixel that sees nothing but one smooth surface gets weights of sum 1, since radiance does not change
+along rays: what the spreading alone would miss is the change of the circle along a slope, 1e-4 on
+a face. At an edge two layers are told apart by the widest gap in depth; the far one gets what the
+near one leaves free, also of what it hides from the pupil's middle, which looks as the rest does.
+Light further out than `LensSpread.radius` pixels is put back: the far rings of diffraction, and the
+glare of real lenses, are not in the picture.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import View
+from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh
+from rigsim.render.lens_blur import BlurError, Lens, lens_of
+
+FloatArray = NDArray[np.float64]
+UInt8Array = NDArray[np.uint8]
+
+STEP_PX: Final = 0.1
+MOST_EXACT: Final = 33
+"""Between depths at which weights are computed they are blended; those are so much blur apart, in
+pixels' diameters, or so many."""
+
+SLICES: Final = 256
+"""Depths that are told apart."""
+
+RINGS: Final = 4.0
+"""Wavelengths times f-number that the picture holds around a circle of confusion."""
+
+COLORS: Final = 3
+"""Wavelengths that stand for the spectrum."""
+
+GAP_MM: Final = 3.0
+GAP_PX: Final = 3.0
+"""Gap in depth, the wider of the two, at which one surface stands before another."""
+
+FINE: Final = 1.2
+"""Step of the ranges of depth for which tables are made."""
+
+BINS: Final = 64
+"""Depths that are told apart when a gap is looked for."""
+
+FASTEST: Final = 6.0
+"""Highest frequency in cycles per sample that weights are summed over; squares pass 0.2 % of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensSpread:
+    """Shares of a sample's light that fall on the pixels around it, by depth."""
+
+    radius: int
+    """Pixels on each side that are reached."""
+    subpixels: int
+    """Samples along each side of a pixel."""
+    table: Float32Array
+    """Shape (`SLICES`, (2 radius + 1)^2, subpixels^2): by depth, by the sample's pixel seen from
+    the one that gets the light, row by row, and by its place in its pixel, row by row. Over all
+    samples the sum is 1."""
+    distance_mm: float
+    """From the pupil to the plane in focus, mm."""
+    furthest: float
+    """Largest `off_focus` in the table."""
+    gap_mm: float
+    """Gap in depth at which one surface stands before another."""
+
+    def off_focus(self, toward_mm: ArrayLike) -> FloatArray:
+        """Return what the circle of confusion goes with, of points so far before the focus."""
+        depth = np.asarray(toward_mm, np.float64)
+        return depth / (self.distance_mm - depth)
+
+    def slices(self, toward_mm: ArrayLike) -> UInt8Array:
+        """Return the rows of the table for points so far before the plane in focus, mm."""
+        place = np.abs(self.off_focus(toward_mm)) * ((SLICES - 1) / max(self.furthest, 1e-12))
+        return np.asarray(np.clip(np.rint(place), 0, SLICES - 1), np.uint8)
+
+    def spilled(self, toward_mm: ArrayLike) -> float:
+        """Return which share of a pixel's light falls on others, at the worst of some depths.
+
+        Parameters
+        ----------
+        toward_mm
+            Depths before the plane in focus, mm, any shape.
+        """
+        own = self.table.shape[1] // 2
+        rows = np.unique(self.slices(toward_mm))
+        # a row's samples are weighed for all pixels: those of the own pixel sum to what it keeps
+        return float(1.0 - self.table[rows, own].sum(axis=1).min())
+
+
+def lens_spread(view: View, illuminant: str, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread:
+    """Return how a camera's lens spreads light of points between some depths.
+
+    Parameters
+    ----------
+    view
+        The camera.
+    illuminant
+        Name of the light's spectrum.
+    subpixels
+        Samples along each side of a pixel.
+    depths_mm
+        Places along the optical axis that the subject reaches, from the plane in focus towards the
+        camera, mm, any shape; only the extremes matter.
+
+    Returns
+    -------
+    LensSpread
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> cam = load_rig("flash").resized(768).view("cam")
+    >>> spread = lens_spread(cam, "D55", subpixels=2, depths_mm=[-85.0, 25.0])
+    >>> spread.radius, round(spread.spilled(-85.0), 2)
+    (2, 0.58)
+    """
+    return spread_of(lens_of(view, illuminant), subpixels=subpixels, depths_mm=depths_mm)
+
+
+def spread_of(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread:
+    """Return how a lens spreads light; see `lens_spread`.
+
+    Raises
+    ------
+    BlurError
+        Depths are none, not finite or behind the camera, or there are no samples.
+    """
+    depths = np.asarray(depths_mm, np.float64)
+    if subpixels < 1:
+        raise BlurError(f"subpixels: got {subpixels}, expected at least 1")
+    if not (depths.size and np.isfinite(depths).all() and depths.max() < lens.distance_mm):
+        raise BlurError(
+            f"depths_mm: got {depths.tolist()}, expected finite ones that end before the camera, "
+            f"{lens.distance_mm:g} mm before the plane in focus"
+        )
+    furthest = float(np.abs(depths / (lens.distance_mm - depths)).max())
+    if furthest > 0.0:  # in steps, so that cameras and faces that are alike share a table
+        furthest = FINE ** math.ceil(math.log(furthest, FINE) - 1e-9)
+    return _spread(_few_colors(lens), subpixels, furthest)
+
+
+@lru_cache(maxsize=8)  # a dome's cameras are alike, and the faces before them
+def _spread(lens: Lens, subpixels: int, furthest: float) -> LensSpread:
+    pixel_mm = 1e-3 * lens.pixel_on_subject_um
+    pupil_mm = 0.5 * lens.magnification * lens.distance_mm / lens.working_f_number
+    rings = RINGS * 1e-3 * lens.cutoff_period_um
+    radius = max(1, math.ceil((pupil_mm * furthest + rings) / pixel_mm))
+    count = math.ceil(2.0 * pupil_mm * furthest / pixel_mm / STEP_PX) + 2
+    nodes = np.linspace(0.0, furthest, min(count, MOST_EXACT) if furthest > 0.0 else 1)
+    exact = np.stack([_weights(lens, node * lens.distance_mm, radius, subpixels) for node in nodes])
+    place = np.linspace(0.0, len(nodes) - 1.0, SLICES)
+    low = np.minimum(place.astype(np.int64), max(len(nodes) - 2, 0))
+    high = np.minimum(low + 1, len(nodes) - 1)
+    share = (place - low)[:, None, None]
+    table = ((1.0 - share) * exact[low] + share * exact[high]).astype(np.float32)
+    return LensSpread(
+        radius, subpixels, table, lens.distance_mm, furthest, max(GAP_MM, GAP_PX * pixel_mm)
+    )
+
+
+def _few_colors(lens: Lens) -> Lens:
+    """Return the lens with `COLORS` wavelengths: means of equal parts of the spectrum."""
+    count = len(lens.wavelengths_nm)
+    if count <= COLORS:
+        return lens
+    weights = np.asarray(lens.weights)
+    part = np.minimum((np.cumsum(weights) - 0.5 * weights) * COLORS, COLORS - 1e-9).astype(int)
+    share = np.bincount(part, weights, COLORS)
+    mean = np.bincount(part, weights * np.asarray(lens.wavelengths_nm), COLORS) / share
+    return dataclasses.replace(
+        lens, wavelengths_nm=tuple(mean.tolist()), weights=tuple((share / share.sum()).tolist())
+    )
+
+
+def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> FloatArray:
+    """Return the table at one depth, shape ((2 r + 1)^2, k^2)."""
+    pixel_mm = 1e-3 * lens.pixel_on_subject_um
+    wide = 2 * radius + 1
+    offset = (np.arange(wide * subpixels) + 0.5) / subpixels - 0.5 * wide  # pixels
+    period = 4 * wide  # pixels after which the sum over frequencies repeats
+    cutoff = 1e6 * lens.magnification / (min(lens.wavelengths_nm) * lens.working_f_number)
+    most = min(cutoff * pixel_mm, FASTEST * subpixels)
+    frequency = np.arange(math.ceil(most * period) + 1) / period  # cycles per pixel
+    squares = np.sinc(frequency) * np.sinc(frequency / subpixels)
+    squares *= np.where(frequency > 0.0, 2.0, 1.0)  # those below 0 are the same
+    waves = np.cos(2.0 * np.pi * offset[:, None] * frequency) * squares
+    radial = np.hypot(frequency[:, None], frequency) / pixel_mm
+    otf = lens.transfer(radial, depth_mm=depth_mm)
+    found = np.maximum(waves @ otf @ waves.T, 0.0)
+    found /= found.sum()
+    by_pixel = found.reshape(wide, subpixels, wide, subpixels).transpose(0, 2, 1, 3)
+    return np.asarray(by_pixel.reshape(wide**2, subpixels**2), np.float64)
+
+
+def before_focus(view: View, points_mm: Float32Array) -> Float32Array:
+    """Return how far points stand before a camera's plane in focus, mm, shape (n,) of (n, 3)."""
+    back = np.asarray(view.axes[2])
+    focus = float(np.asarray(view.position_mm) @ back) - view.focus_distance_mm
+    return np.asarray(points_mm @ back.astype(np.float32) - np.float32(focus), np.float32)
+
+
+def facing_depths(view: View, mesh: Mesh) -> tuple[float, float]:
+    """Return between which depths before the plane in focus a mesh faces the camera, mm."""
+    way = np.asarray(view.position_mm, np.float32) - mesh.vertices_mm
+    facing = np.einsum("ij,ij->i", way, mesh.normals) > 0.0
+    depths = before_focus(view, mesh.vertices_mm[facing])
+    return float(depths.min(initial=0.0)), float(depths.max(initial=0.0))
+
+
+class LensPicture:
+    """The samples of one picture, ready to be seen through a lens with any light on them.
+
+    Parameters
+    ----------
+    spread
+        The lens.
+    shape
+        Rows and columns of the picture.
+    pixel
+        Pixels that hold samples, index into the flat picture, ascending, shape (P,).
+    first
+        First sample of each of these, shape (P + 1,).
+    slot
+        Each sample's place in its pixel, row by row, below subpixels^2, shape (n,).
+    toward_mm
+        How far each sample stands before the plane in focus, mm, shape (n,).
+    """
+
+    def __init__(
+        self,
+        spread: LensSpread,
+        shape: tuple[int, int],
+        pixel: Int32Array,
+        first: Int32Array,
+        slot: UInt8Array,
+        toward_mm: Float32Array,
+    ) -> None:
+        self.spread, self.shape = spread, shape
+        self._lookup = np.full(shape[0] * shape[1], -1, np.int32)
+        self._lookup[pixel] = np.arange(len(pixel), dtype=np.int32)
+        self._lookup = self._lookup.reshape(shape)
+        self._first, self._slot = np.asarray(first, np.int32), np.asarray(slot, np.uint8)
+        self._toward = np.asarray(toward_mm, np.float32)
+        self._slice = spread.slices(toward_mm)
+        self._cut = np.full(shape, np.inf, np.float32)
+        self._far = np.zeros(shape, np.float32)
+        _layers(
+            self._lookup, self._first, self._slot, self._slice, self._toward, spread.table,
+            spread.radius, np.float32(spread.gap_mm), self._cut, self._far,
+        )  # fmt: skip
+
+    def see(self, rows: Float32Array) -> Float32Array:
+        """Return the picture of samples of some radiance.
+
+        Parameters
+        ----------
+        rows
+            Radiance of each sample, shape (n, C).
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W, C); nothing but the samples shines.
+        """
+        out = np.zeros((*self.shape, rows.shape[1]), np.float32)
+        if len(rows):
+            _gather(
+                self._lookup, self._first, self._slot, self._slice, self._toward,
+                self.spread.table, self.spread.radius, self._cut, self._far,
+                np.ascontiguousarray(rows, np.float32), out,
+            )  # fmt: skip
+        return out
+
+
+@njit(parallel=True, cache=True)
+def _layers(  # type: ignore[no-untyped-def]
+    lookup, first, slot, slices, toward, table, radius, gap, cut, far
+):  # fmt: skip
+    """Find for each pixel which depths are far, and what their weights are multiplied with."""
+    height, width = lookup.shape
+    wide = 2 * radius + 1
+    per_pixel = table.shape[2]
+    for y in prange(height):
+        depth = np.empty(wide * wide * per_pixel, np.float32)
+        share = np.empty(wide * wide * per_pixel, np.float32)
+        filled = np.empty(BINS, np.uint8)
+        for x in range(width):
+            count, missing = 0, np.float32(0.0)
+            total, inside = np.float32(0.0), np.float32(0.0)
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            for b in range(wide * wide):
+                v, u = y + b // wide - radius, x + b % wide - radius
+                if v < 0 or v >= height or u < 0 or u >= width:
+                    continue  # beyond the picture it goes on as here
+                for s in range(per_pixel):
+                    inside += table[0, b, s]
+                q = lookup[v, u]
+                if q < 0:
+                    missing += np.float32(1.0)
+                    continue
+                missing += np.float32(per_pixel - first[q + 1] + first[q])
+                for i in range(first[q], first[q + 1]):
+                    w = table[slices[i], b, slot[i]]
+                    depth[count], share[count] = toward[i], w
+                    low, high = min(low, toward[i]), max(high, toward[i])
+                    total += w
+                    count += 1
+            if count == 0 or total <= 0.0:
+                continue
+            near = np.float32(0.0)
+            if high - low > gap:
+                # the widest run of empty bins is the gap, to the width of a bin
+                filled[:] = 0
+                per_mm = np.float32(BINS - 1) / (high - low)
+                for k in range(count):
+                    filled[int((depth[k] - low) * per_mm)] = 1
+                run, widest, end = 0, 0, 0
+                for k in range(BINS):
+                    run = 0 if filled[k] else run + 1
+                    if run > widest:
+                        widest, end = run, k
+                if widest > gap * per_mm:
+                    middle = np.float32(end + 1) - np.float32(0.5) * np.float32(widest)
+                    cut[y, x] = low + middle / per_mm
+                    for k in range(count):
+                        if depth[k] >= cut[y, x]:
+                            near += share[k]
+                    if near > inside:  # one steep slope: nothing is behind it
+                        cut[y, x], near = np.float32(np.inf), np.float32(0.0)
+            rest = total - near
+            free = max(inside - near, np.float32(0.0))
+            if rest <= np.float32(1e-9):
+                far[y, x] = np.float32(0.0)
+            elif missing > 0:  # nothing shines there
+                far[y, x] = min(np.float32(1.0), free / rest) / inside
+            else:
+                far[y, x] = free / rest / inside
+
+
+@njit(parallel=True, cache=True)
+def _gather(  # type: ignore[no-untyped-def]
+    lookup, first, slot, slices, toward, table, radius, cut, far, rows, out
+):  # fmt: skip
+    height, width = lookup.shape
+    wide = 2 * radius + 1
+    channels = rows.shape[1]
+    for y in prange(height):
+        for x in range(width):
+            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
+                for u in range(max(x - radius, 0), min(x + radius + 1, width)):
+                    q = lookup[v, u]
+                    if q < 0:
+                        continue
+                    b = (v - y + radius) * wide + u - x + radius
+                    for i in range(first[q], first[q + 1]):
+                        w = table[slices[i], b, slot[i]]
+                        if toward[i] < cut[y, x]:
+                            w *= far[y, x]
+                        for c in range(channels):
+                            out[y, x, c] += w * rows[i, c]

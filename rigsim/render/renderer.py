@@ -1,0 +1,82 @@
+"""The only module that imports Mitsuba: its start, its threads, and memory that it may read."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.render.variant import VariantChoice
+
+
+class RenderError(RuntimeError):
+    """Mitsuba gave an image that cannot be used, or cannot be started."""
+
+
+def load(choice: VariantChoice) -> Any:
+    """Import Mitsuba with a variant set.
+
+    Parameters
+    ----------
+    choice
+        Result of `rigsim.render.variant.choose_variant`; its library is set before the first import.
+
+    Returns
+    -------
+    module
+        ``mitsuba`` with the variant active.
+    """
+    mi = _import_mitsuba(choice.library)
+    if mi.variant() != choice.name:
+        try:
+            mi.set_variant(choice.name)
+        except ImportError as error:
+            raise RenderError(f"Mitsuba's variant {choice.name} is missing: {error}") from error
+    return mi
+
+
+@cache
+def _import_mitsuba(library: str) -> Any:
+    if library:
+        os.environ["DRJIT_LIBLLVM_PATH"] = library
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except ImportError as error:
+        raise RenderError(f"Mitsuba cannot be imported: {error}") from error
+    dr.set_thread_count(thread_count())
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+def thread_count() -> int:
+    """Return how many threads rendering may use: this process's cores, at most 16."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        cores = os.cpu_count() or 1
+    return max(1, min(cores, 16))
+
+
+SLACK: Final = 64
+
+
+def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
+    """Return a copy of a row of numbers whose memory goes on beyond its end.
+
+    The renderer works on NumPy's memory itself, in whole vectors of up to 16 numbers, and Embree
+    reads 16 bytes at a mesh's last corner: at the end of a page of memory either would read what
+    is not the process's, and end it.
+
+    Examples
+    --------
+    >>> row = with_slack(np.arange(5, dtype=np.float32))
+    >>> row.tolist(), row.base.size - row.size
+    ([0.0, 1.0, 2.0, 3.0, 4.0], 64)
+    """
+    held = np.zeros(values.size + SLACK, values.dtype)
+    held[: values.size] = values.reshape(-1)
+    return held[: values.size]

@@ -1,0 +1,206 @@
+"""What is rendered: radiance of described scenes, by the renderer's own materials and sampling.
+
+A mesh that rays are cast on (`rigsim.render.caster`), what rays meet (`rigsim.render.rays`) and the renderer's
+start (`rigsim.render.renderer`) are modules of their own; their names are found here, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.geometry.mesh import Mesh
+from rigsim.render.caster import Caster
+from rigsim.render.rays import OFFSET_MM, GBuffer, camera_rays, g_buffer, trace, visibility
+from rigsim.render.renderer import RenderError, load, thread_count, with_slack
+from rigsim.render.variant import Kind, VariantChoice, choose_variant
+
+__all__ = [
+    "OFFSET_MM",
+    "Caster",
+    "GBuffer",
+    "MovedLight",
+    "RenderError",
+    "VariantChoice",
+    "camera_rays",
+    "choose_variant",
+    "g_buffer",
+    "load",
+    "look_at",
+    "radiance",
+    "thread_count",
+    "trace",
+    "visibility",
+    "with_slack",
+]
+
+
+def radiance(
+    description: Mapping[str, Any],
+    *,
+    kind: Kind,
+    samples: int,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """Render a described scene.
+
+    Parameters
+    ----------
+    description
+        Mitsuba's scene dictionary, with numbers, texts and arrays only; a ``to_world`` is a 4 x 4
+        array, a ``bitmap`` an image; a shape of type ``mesh`` has a `rigsim.geometry.mesh.Mesh` as ``mesh``.
+    kind
+        Variant kind, see `rigsim.render.variant.choose_variant`.
+    samples
+        Samples per pixel.
+    seed
+        Seed of the sampler.
+
+    Returns
+    -------
+    ndarray of float32
+        The film, shape (H, W, channels).
+
+    Raises
+    ------
+    RenderError
+        A light's radiance is negative or not finite, which Mitsuba would render, or the image
+        holds values that are not finite.
+    """
+    _refuse_negative_light(description)
+    mi = load(choose_variant(kind))
+    scene = mi.load_dict(_with_transforms(mi, description))
+    image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
+    bad = int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
+    if bad:
+        raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
+    return image
+
+
+_EMISSION = ("radiance", "irradiance", "intensity")
+
+
+def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> None:
+    shines = ("bitmap",) if description.get("type") == "envmap" else _EMISSION
+    for name, entry in description.items():
+        value = entry
+        if isinstance(entry, Mapping):
+            _refuse_negative_light(entry, f"{where}{name}.")
+            value = entry.get("value")
+        if name in shines and isinstance(value, (int, float, list, tuple, np.ndarray)):
+            least, most = (
+                float(end(np.asarray(value, np.float64), initial=0.0)) for end in (np.min, np.max)
+            )
+            if not (least >= 0.0 and most < np.inf):
+                raise RenderError(
+                    f"{where}{name}: got values of {least:g} to {most:g}, expected finite light, "
+                    ">= 0"
+                )
+
+
+class MovedLight:
+    """A described scene whose one point light is moved from render to render.
+
+    Nothing is compiled or parsed anew when the light moves, so that the time of a call is the time
+    of rendering.
+
+    Parameters
+    ----------
+    description
+        As for `radiance`; the entry ``light`` must be a point light.
+    kind
+        Variant kind.
+    """
+
+    def __init__(self, description: Mapping[str, Any], *, kind: Kind) -> None:
+        self._choice = choose_variant(kind)
+        mi = load(self._choice)
+        self._scene = mi.load_dict(_with_transforms(mi, description))
+        self._parameters = mi.traverse(self._scene)
+
+    def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> NDArray[np.float32]:
+        """Render with the light at a place, shape (H, W, channels).
+
+        Parameters
+        ----------
+        light_mm
+            Where it stands, shape (3,).
+        samples, seed
+            As for `radiance`.
+        """
+        mi = load(self._choice)
+        self._parameters["light.position"] = mi.Point3f(*(float(x) for x in np.ravel(light_mm)))
+        self._parameters.update()
+        image = np.array(mi.render(self._scene, spp=samples, seed=seed).numpy(), np.float32)
+        if not np.isfinite(image).all():
+            raise RenderError(
+                f"light at {np.ravel(light_mm).tolist()} mm: got pixels that are not finite, "
+                "expected none; move it off the surface"
+            )
+        return image
+
+
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+    """Return the transform that puts a sensor or a rectangle somewhere, facing somewhere.
+
+    Parameters
+    ----------
+    origin, target
+        Where it stands and what it faces (with its local +z), shape (3,).
+    up
+        Direction of its local +y, as far as possible, shape (3,).
+
+    Returns
+    -------
+    ndarray
+        Shape (4, 4), for ``to_world``; Mitsuba's local +x points to the left seen from behind.
+    """
+    place = np.asarray(origin, np.float64)
+    forward = np.asarray(target, np.float64) - place
+    forward /= np.linalg.norm(forward)
+    left = np.cross(np.asarray(up, np.float64), forward)
+    left /= np.linalg.norm(left)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([left, np.cross(forward, left), forward, place])
+    return matrix
+
+
+def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in description.items():
+        if isinstance(value, Mapping) and value.get("type") == "mesh":
+            out[name] = _shape(mi, name, value)
+        elif isinstance(value, Mapping):
+            out[name] = _with_transforms(mi, value)
+        elif isinstance(value, np.ndarray) and name == "bitmap":
+            out[name] = mi.Bitmap(np.ascontiguousarray(value, np.float32))
+        elif name == "to_world":
+            out[name] = mi.ScalarTransform4f(np.asarray(value, np.float64))
+        else:
+            out[name] = value
+    return out
+
+
+def _shape(mi: Any, name: str, description: Mapping[str, Any]) -> Any:
+    """Return Mitsuba's mesh with normals, texture coordinates and a material."""
+    mesh: Mesh = description["mesh"]
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(_with_transforms(mi, description["bsdf"]))
+    shape = mi.Mesh(
+        name,
+        len(mesh.vertices_mm),
+        len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(shape)
+    parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
+    parameters["vertex_normals"] = np.ravel(mesh.normals)
+    parameters["vertex_texcoords"] = np.ravel(mesh.uv)
+    parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+    parameters.update()
+    return shape

@@ -1,0 +1,1 @@
+"""The simulated surface scanner: pods, flaws and fusion."""

@@ -1,0 +1,109 @@
+"""Exposures of the dome's cameras: the light of pulses that fell into them, summed on a sensor."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import View
+from rigsim.as_built.dome import BuiltDome
+from rigsim.geometry.mesh import Float32Array
+from rigsim.scenes.exposing import LitLight, full_power_s
+from rigsim.sensor import Sensor, expose
+
+POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of an LED's energy from pulse to pulse."""
+
+KEPT_FRAMES: Final = 16
+KEPT_BYTES: Final = 2**28
+"""Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
+
+
+class Pulse(LitLight, Protocol):
+    """A lit LED, as the world reports it, clipped to the exposure."""
+
+    @property
+    def led(self) -> int:
+        """Index of the light in the rig."""
+
+
+class Exposures:
+    """Exposures of one scene; frames of single lights are kept for the capture's next pass.
+
+    Parameters
+    ----------
+    dome
+        Whose LEDs answer as they are wired.
+    seed
+        Seeds what differs from pulse to pulse.
+    """
+
+    def __init__(self, dome: BuiltDome, *, seed: int) -> None:
+        self._dome = dome
+        self._seed = seed
+        self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+
+    def expose(
+        self,
+        view: View,
+        sensor: Sensor,
+        render: Callable[[View, int, float], Float32Array],
+        *,
+        pops: Sequence[Pulse],
+        exposure_s: float,
+        seed: int,
+        instant: Callable[[float], float],
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view, sensor
+            The camera and what it sees with.
+        render
+            The light on it, (H, W, 3), of a light alone, by index, at a world time in s.
+        pops
+            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+        instant
+            World time, s, to the time that decides how the scene stands.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        rng = np.random.default_rng([self._seed, seed])
+        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
+        for pulse in pops:
+            on_s = full_power_s(pulse, f"LED {pulse.led}")
+            energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            if energy > 0.0:
+                middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
+                led = self._dome.answering(pulse.led)
+                light += np.float32(energy) * self._frame(view, led, middle, render)
+        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+
+    def _frame(
+        self,
+        view: View,
+        light: int,
+        t_s: float,
+        render: Callable[[View, int, float], Float32Array],
+    ) -> Float32Array:
+        key = (view.name, light, t_s)
+        if key not in self._frames:
+            # a capture comes back to each light in its next pass
+            most = max(KEPT_FRAMES, KEPT_BYTES // (12 * view.width_px * view.height_px))
+            while len(self._frames) >= most:
+                self._frames.popitem(last=False)
+            self._frames[key] = render(view, light, t_s)
+        self._frames.move_to_end(key)
+        return self._frames[key]

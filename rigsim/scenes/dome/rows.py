@@ -1,0 +1,146 @@
+"""What the dome's cameras see of a subject that may move, as rows that any light can light."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import View
+from rigsim.as_built.dome import BuiltDome
+from rigsim.geometry.atlas import spread, unwrap
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.led_light import lobe_exponent
+from rigsim.light.olat import Hits, Lamp
+from rigsim.light.olat_vector import VectorLight
+from rigsim.render import Caster
+from rigsim.scenes.dome import views as dome_views
+from rigsim.scenes.exposing import SceneError
+from rigsim.subject import Subject
+from rigsim.subject.head_motion import HeadMotion
+from rigsim.targets import Target
+
+
+class DomeRows:
+    """Cameras' rows of one subject or target; those of a head that holds still are kept.
+
+    Parameters
+    ----------
+    dome
+        The dome as it stands.
+    subject
+        A face or a target.
+    caster
+        Its mesh at rest.
+    motion
+        How the head moves; None holds it still. Targets stand still.
+    illuminant
+        Spectrum of the lights, a name known to `model.spectra`.
+    optics
+        Whether lenses blur what is out of focus, and diffract.
+    subpixels
+        Rays along each side of a pixel.
+    """
+
+    def __init__(
+        self,
+        dome: BuiltDome,
+        subject: Subject | Target,
+        caster: Caster,
+        *,
+        motion: HeadMotion | None,
+        illuminant: str,
+        optics: bool,
+        subpixels: int,
+    ) -> None:
+        self._dome, self._subject, self._caster = dome, subject, caster
+        self._motion = motion if isinstance(subject, Subject) else None
+        self._illuminant, self._optics, self._subpixels = illuminant, optics, subpixels
+        self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
+        self._vector: dict[tuple[str, float], VectorLight] = {}
+
+    def instant(self, t_s: float) -> float:
+        """Return the time that decides how the subject stands, s; 0 of one that holds still."""
+        return 0.0 if self._motion is None else round(t_s, 4)
+
+    def lamp(self, light: int, t_s: float) -> Lamp:
+        """Return a light, by index, in the frame of the mesh."""
+        rotation, shift = self._pose(t_s)
+        led = self._dome.rig.lights[light]
+        return Lamp(
+            position_mm=(np.asarray(led.position_mm) - shift) @ rotation,
+            axis=self._dome.axis[light] @ rotation,
+            exponent=lobe_exponent(led),
+            radius_mm=led.radius_mm,
+        )
+
+    def seen(
+        self, view: View, t_s: float, texture: Callable[[View], Float32Array]
+    ) -> tuple[Hits, Caster]:
+        """Return a camera's rows and the mesh that casts shadows on them.
+
+        Parameters
+        ----------
+        view
+            The camera, of the dome as it stands.
+        t_s
+            World time, s.
+        texture
+            How the face reflects for a camera, with its normals, (N, N, C); of a target not asked.
+        """
+        key = (view.name, t_s)
+        if key not in self._hits:
+            # Still heads need every camera's rows again for every light; moving ones never do.
+            most = len(self._dome.rig.views) if self.instant(1.0) == 0.0 else 2
+            while len(self._hits) >= most:
+                old, _ = self._hits.popitem(last=False)
+                self._vector.pop(old, None)
+            self._hits[key] = self._look(view, t_s, texture)
+        self._hits.move_to_end(key)
+        return self._hits[key]
+
+    def vector_light(self, view: View, t_s: float, hits: Hits, caster: Caster) -> VectorLight:
+        """Return what lights rows of `seen` by compiled loops; kept as long as they are."""
+        key = (view.name, t_s)
+        if key not in self._vector:
+            self._vector[key] = VectorLight(hits, caster)
+        return self._vector[key]
+
+    def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
+
+    def _look(
+        self, view: View, t_s: float, texture_of: Callable[[View], Float32Array]
+    ) -> tuple[Hits, Caster]:
+        rotation, shift = self._pose(t_s)
+        moved = dataclasses.replace(
+            view,
+            position_mm=_vector((np.asarray(view.position_mm) - shift) @ rotation),
+            target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
+            up=_vector(np.asarray(view.up) @ rotation),
+        )
+        how = dome_views.Looking(
+            self._subpixels, self._dome.distortion.get(view.name), self._illuminant, self._optics
+        )
+        subject, caster = self._subject, self._caster
+        if isinstance(subject, Target):
+            if subject.kind == "source":
+                raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
+            return dome_views.at_target(caster, moved, subject, how), caster
+        amount = 0.0 if self._motion is None else self._motion.twitch(t_s)
+        texture = texture_of(view)
+        if amount > 0.0 and self._motion is not None:
+            mesh, atlas = self._motion.twitched(subject.mesh, amount), subject.atlas
+            caster = Caster(mesh, choice=caster.choice)
+            # The relief turns with the surface below it.
+            turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
+            texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
+        return dome_views.at_skin(caster, moved, texture, how), caster
+
+
+def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

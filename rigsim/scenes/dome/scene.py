@@ -1,0 +1,457 @@
+"""The light dome: LEDs lit one at a time around a face or a target, seen by many cameras.
+
+A camera's rays are traced once and serve all lights (see `rigsim.light.olat`). The unit of light
+is fixed by the rig alone, see `rigsim.light.led_light`.
+
+Notes
+-----
+For a camera c and a light l, before noise and vignetting, in fractions of full scale per second of
+on-time at level 1::
+
+    signal = gain_c I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
+
+averaged over the pixel, and over the LED's disc where it casts shadows. A dome stands as its
+drawing says, or as it was built (`rigsim.as_built.dome`): with other places and powers, bent images,
+responses that differ, dead LEDs and crossed wires.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import Light, Rig, RigError, View
+from model import spectra
+from model.skin import SkinAppearance
+from rigsim.as_built.dome import BuiltDome
+from rigsim.geometry.atlas import sample, spread
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light import olat, surface_brdf
+from rigsim.light.led_light import white_intensity
+from rigsim.light.olat import Hits, Lamp
+from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.surface_brdf import SkinSurface, skin_surface
+from rigsim.needs import flash as flash_needs
+from rigsim.needs.dome import dome_needs, noise_of
+from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
+from rigsim.population import conditions as skin_conditions
+from rigsim.render import Caster
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.dome import truth as dome_truth
+from rigsim.scenes.dome import views as dome_views
+from rigsim.scenes.dome.exposures import Exposures, Pulse
+from rigsim.scenes.dome.rows import DomeRows
+from rigsim.scenes.dome.subsurface_radiance import DomeGlow
+from rigsim.scenes.exposing import SceneError
+from rigsim.sensor import Sensor, sensor_of
+from rigsim.subject import Subject
+from rigsim.subject.head_motion import HeadMotion
+from rigsim.targets import Target
+
+
+class DomeScene:
+    """One subject or target inside the dome.
+
+    Parameters
+    ----------
+    rig
+        The drawing of the dome; its lights must share one spectrum and be LEDs.
+    subject
+        A face or a target (for the dome's own targets see `rigsim.scenes.dome.targets`).
+    dome
+        The dome as it stands; ``None`` stands as drawn.
+    motion
+        How the head moves; ``None`` holds it still. Targets stand still.
+    state
+        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression where the
+        state is one; targets have none.
+    movement
+        Whether the face moves and wrinkles with the state. A subject that is already posed
+        (`Subject.posed`) stays in its pose.
+    conditions
+        Conditions of the skin with their amounts, see `rigsim.population.conditions`; targets have none.
+    sensor
+        Sensor of every view; ``None`` takes what each view states.
+    seed
+        Seeds what differs from pulse to pulse.
+    interreflections
+        Whether light goes from skin to skin. This and the next two: ``None`` decides by how much it
+        changes pixels, see `needs`.
+    subsurface
+        Whether light spreads sideways inside the skin.
+    spectral
+        Whether light that went from skin to skin is reflected wavelength by wavelength.
+    last_bounce
+        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    relief_shadows
+        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
+    on_s
+        Longest on-time at full level of one light in the plan's exposures, s, by which sizes are
+        told; ``None``: such that the brightest skin is at full scale.
+    optics
+        Whether lenses blur what is out of focus, and diffract; ``None`` decides as above.
+    subpixels
+        Rays along each side of a pixel.
+    choice
+        Mitsuba variant; ``None`` chooses.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject | Target,
+        *,
+        dome: BuiltDome | None = None,
+        motion: HeadMotion | None = None,
+        state: str = "neutral",
+        movement: bool = True,
+        conditions: Mapping[str, float] | None = None,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        interreflections: bool | None = None,
+        subsurface: bool | None = None,
+        spectral: bool | None = None,
+        last_bounce: float | None = None,
+        optics: bool | None = None,
+        relief_shadows: bool | None = None,
+        on_s: float | None = None,
+        subpixels: int = 2,
+        choice: VariantChoice | None = None,
+    ) -> None:
+        spectra_names = {light.illuminant for light in rig.lights}
+        if len(spectra_names) > 1:
+            raise SceneError(
+                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+            )
+        for light in rig.lights:
+            if light.power_w is None:
+                raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if dome is None:
+            axes = np.array([_toward_origin(light) for light in rig.lights])
+            dome = BuiltDome(rig, rig, axes)
+        self.dome = dome
+        self.rig = dome.rig
+        self.conditions = skin_conditions.checked(conditions or {})
+        if isinstance(subject, Subject):
+            subject = skin_conditions.conditioned_subject(subject, self.conditions)
+        elif self.conditions:
+            raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
+        if movement and isinstance(subject, Subject) and subject.pose is None:
+            subject = subject.posed(state)
+        self.subject = subject
+        self.state = state
+        self.movement = movement
+        self.motion = motion
+        self.seed = seed
+        self.subpixels = subpixels
+        self._illuminant = rig.lights[0].illuminant
+        self._sensors = {
+            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+        }
+        self._caster = Caster(subject.mesh, choice=choice)
+        self._surfaces: dict[str, SkinSurface] = {}
+        self._textures: dict[str, Float32Array] = {}
+        self._exposures = Exposures(dome, seed=seed)
+        self.needs: SceneNeeds = dome_needs(
+            rig,
+            subject,
+            state,
+            caster=self._caster,
+            noise=noise_of([Noise.of(sensor) for sensor in self._sensors.values()]),
+            white_rgb=None if on_s is None else on_s * self._white_in_origin(),
+            movement=movement,
+            motion=motion,
+            subsurface=subsurface,
+            interreflections=interreflections,
+            spectral=spectral,
+            optics=optics,
+            relief_shadows=relief_shadows,
+            subpixels=subpixels,
+        )
+        """What is built, what is not, and why."""
+        self.interreflections = self.needs.builds(BOUNCES)
+        self.subsurface = self.needs.builds(LATERAL)
+        self.optics = self.needs.builds(LENS)
+        self._relief: ReliefShadow | None = None
+        if isinstance(subject, Subject) and self.needs.builds(WRINKLES):
+            self._relief = ReliefShadow(subject)
+        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self._glow: DomeGlow | None = None
+        if isinstance(subject, Subject) and (self.subsurface or self.interreflections):
+            self._glow = DomeGlow(
+                subject,
+                self._caster,
+                illuminant=self._illuminant,
+                subsurface=self.subsurface,
+                interreflections=self.interreflections,
+                spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                enough=summed if last_bounce is None else last_bounce,
+                relief=self._relief,
+            )
+        self._rows = DomeRows(
+            dome,
+            subject,
+            self._caster,
+            motion=motion,
+            illuminant=self._illuminant,
+            optics=self.optics,
+            subpixels=subpixels,
+        )
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
+
+    # light ------------------------------------------------------------------------------------
+
+    def white_rgb(self, view_name: str | None = None) -> Float32Array:
+        """Return the camera RGB of white under the LEDs, shape (3,), the strongest channel 1."""
+        view = self._view(view_name)
+        white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
+        return np.asarray(white / white.max(), np.float32)
+
+    def intensity(self, light: int, *, view_name: str | None = None) -> Float32Array:
+        """Return I_l of the module's equation, full scales per second times mm^2, shape (3,).
+
+        See Also
+        --------
+        rigsim.light.led_light.white_intensity : the unit; a dead light has none.
+        """
+        led = self.rig.lights[light]
+        if led.name in self.dome.dead:
+            return np.zeros(3, np.float32)
+        return white_intensity(led, self._view(view_name)).astype(np.float32)
+
+    def _white_in_origin(self) -> NDArray[np.float64]:
+        """Return full scales per second of a white plate that faces the brightest light."""
+        each = [
+            white_intensity(light, self.rig.views[0]) / float(np.square(light.position_mm).sum())
+            for light in self.rig.lights
+        ]
+        return np.asarray(np.max(each, axis=0), np.float64)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view."""
+        return self._sensors[self._view(view_name).name]
+
+    def radiance(
+        self, view_name: str, lights: Sequence[int] | None = None, *, t_s: float = 0.0
+    ) -> Float32Array:
+        """Return the light on a sensor for each LED alone, without noise and vignetting.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        lights
+            Indices into the rig's lights; ``None`` takes all.
+        t_s
+            World time, s; it matters to moving heads only.
+
+        Returns
+        -------
+        ndarray of float32
+            Camera RGB without white balance, shape (n, H, W, 3), fraction of full scale per second
+            of on-time at level 1.
+        """
+        view = self._view(view_name)
+        chosen = range(len(self.rig.lights)) if lights is None else lights
+        if len(chosen) == 1:  # the usual stream, one light after the other, is not copied
+            return self._render(view, chosen[0], self._rows.instant(t_s))[None]
+        out = np.empty((len(chosen), view.height_px, view.width_px, 3), np.float32)
+        for k, light in enumerate(chosen):
+            out[k] = self._render(view, light, self._rows.instant(t_s))
+        return out
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        view = self._view(view_name)
+        return self._exposures.expose(
+            view, self._sensors[view.name], self._render, pops=pops, exposure_s=exposure_s,
+            seed=seed, instant=self._rows.instant,
+        )  # fmt: skip
+
+    # truth ------------------------------------------------------------------------------------
+
+    def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
+        """Return what an estimator should find, at the sensor's resolution, at time 0.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
+
+            ``r_d``: factor of the diffuse term, white-balanced, see `rigsim.light.surface_brdf`;
+            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
+            ``roughness``, ``oil``, ``fuzz``: of the surface terms, under a condition also
+            ``film``, ``film_alpha``, ``film_eta``, ``powder`` (`rigsim.light.surface_brdf.Coating`);
+            ``uv``: (H, W, 2);
+            ``hair``: part covered by hair (brows, lashes);
+            ``mask``: bool, pixels wholly on skin.
+
+        Raises
+        ------
+        SceneError
+            A target stands there; only faces have these maps.
+        """
+        self._face()
+        hits, _ = self._rows.seen(self._view(view_name), 0.0, self._texture)
+        return dome_truth.maps_of(hits)
+
+    def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
+        """Return the truth on the face's own texture, at time 0.
+
+        Parameters
+        ----------
+        view_name
+            A camera, for its spectral sensitivity; ``None`` takes the first.
+
+        Returns
+        -------
+        SkinAppearance
+            ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
+            (`rigsim.light.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d even
+            without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``,
+            ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and wrinkles alone;
+            comparable between states texel by texel); of a face that has moved also
+            ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
+            skin. All is that of the skin under its conditions.
+        """
+        return dome_truth.appearance_of(
+            self._face(),
+            self.surface(self._view(view_name)),
+            conditions=self.conditions,
+            left_out=tuple(self.left_out),
+            seed=self.seed,
+        )
+
+    def brdf(
+        self,
+        uv: ArrayLike,
+        to_light: ArrayLike,
+        to_camera: ArrayLike,
+        *,
+        view_name: str | None = None,
+    ) -> tuple[Float32Array, Float32Array]:
+        """Evaluate the true reflection at points of the face.
+
+        Parameters
+        ----------
+        uv
+            Texture coordinates, shape (n, 2), (0, 0) is bottom left.
+        to_light, to_camera
+            Unit vectors in the rig frame away from the surface, shape (n, 3) or (3,); the face's
+            own normals with relief are used.
+        view_name
+            A camera, for its spectral sensitivity; ``None`` takes the first.
+
+        Returns
+        -------
+        total : ndarray of float32
+            f_r in 1/sr, white-balanced camera RGB, shape (n, 3).
+        specular : ndarray of float32
+            Its surface terms, shape (n,).
+        """
+        self._face()
+        texture = self._texture(self._view(view_name))
+        points = np.atleast_2d(np.asarray(uv, np.float32))
+        values = sample(texture, points, np.ones(len(points), np.bool_))
+        return surface_brdf.evaluate(
+            values[:, :-3], dome_views.unit(values[:, -3:]), to_light, to_camera
+        )
+
+    # inside -----------------------------------------------------------------------------------
+
+    def _face(self) -> Subject:
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
+        return self.subject
+
+    def _view(self, name: str | None) -> View:
+        if name is None:
+            return self.rig.views[0]
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise SceneError(str(error)) from error
+
+    def surface(self, view: View) -> SkinSurface:
+        """Return how the face reflects for a camera, under its conditions."""
+        camera = view.spectral_sensitivity
+        if camera not in self._surfaces:
+            face = self._face()
+            bare = skin_surface(face, camera, self._illuminant, state=self.state)
+            self._surfaces[camera] = skin_conditions.coated(face, bare, self.conditions)
+        return self._surfaces[camera]
+
+    def _texture(self, view: View) -> Float32Array:
+        """Return the surface and its normals with relief, shape (N, N, 10) or (N, N, 14)."""
+        camera = view.spectral_sensitivity
+        if camera not in self._textures:
+            atlas, surface = self._face().atlas, self.surface(view)
+            layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
+            self._textures[camera] = spread(layers, atlas.covered)
+        return self._textures[camera]
+
+    def _render(self, view: View, light: int, t_s: float) -> Float32Array:
+        if not 0 <= light < len(self.rig.lights):
+            raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
+        shape = (view.height_px, view.width_px, 3)
+        if isinstance(self.subject, Target) and self.subject.kind == "cap":
+            return np.zeros(shape, np.float32)
+        hits, caster = self._rows.seen(view, t_s, self._texture)
+        lamp = self._rows.lamp(light, t_s)
+        gain = np.float32(self.dome.gain.get(view.name, 1.0))
+        color = gain * self.intensity(light, view_name=view.name)
+        glow = None
+        if self._glow is not None and hits.kind == olat.SKIN:
+            glow = self._glow.on_rows(hits, lamp, view, self.surface, light=light, t_s=t_s)
+        diffuse = not (self.subsurface and glow is not None)
+        relief = self._relief_of(hits, lamp)
+        if hits.kind == olat.SKIN and caster.scene is not None:
+            rows = self._rows.vector_light(view, t_s, hits, caster)
+            return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
+        visible = olat.seen_from(hits, caster, lamp)
+        return olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
+
+    def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
+        """Return which part of a light the texture's relief leaves to each row."""
+        if self._relief is None or hits.kind != olat.SKIN:
+            return None
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
+
+
+def _toward_origin(light: Light) -> NDArray[np.float64]:
+    place = np.asarray(light.position_mm, np.float64)
+    return np.asarray(-place / np.linalg.norm(place))

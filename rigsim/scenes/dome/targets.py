@@ -1,0 +1,405 @@
+"""Calibration targets in the dome: a ChArUco board, mirror balls, a white plate.
+
+An operator puts the target into one place after the other; `TargetScene.show` is that hand. Places
+are drawn near those of `PLACES`: nobody holds a board to a tenth of a millimetre. Only the first
+place is exact: a jig holds the board in the rig's origin, facing +z, and so defines the rig frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, RigError, View
+from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
+from rigsim.light.led_light import lobe_exponent, white_intensity
+from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.scenes.dome.exposures import Pulse
+from rigsim.sensor import expose, sensor_of
+from rigsim.targets import mirror_ball, printed_plate
+from rigsim.targets.printed_plate import CELL_MM, Plate
+
+FloatArray = NDArray[np.float64]
+Kind: TypeAlias = Literal["charuco", "mirror", "white"]
+
+BALL_RADIUS_MM: Final = 50.0
+WHITE_SLOPE_DEG: Final = 0.05
+"""RMS slope of the white plate's surface in each direction."""
+LED_SIZES: Final = 2e-4
+"""By how much light of an LED's disc differs from that of its middle, relative, at most."""
+POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of an LED's energy from pulse to pulse."""
+
+BOARD_PLACES: Final = (
+    (0, 0, 0, 0, 0, 0),
+    (38, 5, 12, 10, 0, 0),
+    (-38, 5, -12, -10, 0, 0),
+    (5, 32, 90, 0, 10, 0),
+    (-62, 15, 8, 0, 0, 10),
+    (62, 15, -8, 0, 0, 10),
+    (-18, -24, 95, 0, -10, 0),
+    (20, 18, -90, 10, 10, -30),
+    (-45, 28, 20, -15, 10, 20),
+    (45, 28, -20, 15, 10, 20),
+    (-75, -8, 90, 0, 0, 0),
+    (75, -8, -90, 0, 0, 0),
+    (30, -20, 5, 20, 0, 40),
+    (-30, -20, -5, -20, 0, 40),
+)
+"""Azimuth and elevation of the front's normal, turn in its plane (degrees), middle (mm)."""
+
+PLATE_PLACES: Final = (
+    (0, 20, 0, 0, 0, 0),
+    (70, 20, 0, 0, 0, 0),
+    (-70, 20, 0, 0, 0, 0),
+    (20, -35, 90, 0, 0, 0),
+    (-30, 55, 90, 0, 0, 0),
+    (105, 5, 0, 0, 0, 0),
+    (-105, 5, 0, 0, 0, 0),
+)
+"""The same of the white plate; the first three face most lights."""
+
+BALL_PLACES: Final = (
+    (-85.0, 45.0, 30.0),
+    (85.0, -45.0, -30.0),
+    (-75.0, -50.0, -40.0),
+    (75.0, 50.0, 40.0),
+)
+"""Middle of the ball, mm."""
+
+PLACES: Final[dict[str, int]] = {
+    "charuco": len(BOARD_PLACES),
+    "mirror": len(BALL_PLACES),
+    "white": len(PLATE_PLACES),
+}
+"""How many places each target has."""
+
+HAND_MM: Final = 3.0
+HAND_DEG: Final = 2.0
+"""Standard deviations of where an operator puts a target."""
+
+
+class TargetError(ValueError):
+    """A target is asked for something that it is not."""
+
+
+class TargetScene:
+    """A calibration target in the middle of a dome that was built near its drawing.
+
+    Parameters
+    ----------
+    kind
+        "charuco", "mirror" or "white".
+    dome
+        The dome as it stands.
+    seed
+        Seeds where the operator puts the target, the plate's waves and the noise.
+    slope_deg
+        RMS slope of the white plate's surface, degrees.
+    """
+
+    def __init__(
+        self, kind: Kind, dome: BuiltDome, *, seed: int, slope_deg: float = WHITE_SLOPE_DEG
+    ) -> None:
+        if kind not in get_args(Kind):
+            raise TargetError(f"target: got {kind!r}, expected one of {', '.join(get_args(Kind))}")
+        self.kind = kind
+        self.dome = dome
+        self.rig = dome.rig
+        self.seed = seed
+        self.pose = 0
+        rng = np.random.default_rng([seed, len(kind)])
+        self._plate = (
+            printed_plate.white_plate(slope_deg=slope_deg, rng=rng)
+            if kind == "white"
+            else printed_plate.charuco_board()
+        )
+        self._hand = rng.standard_normal((max(PLACES.values()), 6))
+        self._rays: dict[str, FloatArray] = {}
+        lights = self.rig.lights
+        self._lamp_mm = np.array([light.position_mm for light in lights])
+        self._exponent = np.array([lobe_exponent(light) for light in lights])
+
+    @property
+    def needs(self) -> SceneNeeds:
+        """What is built, what is not, and why."""
+        noise = Noise.of(sensor_of(self.rig.views[0]))
+        sizes = noise.share(LED_SIZES)
+        mirror = self.kind == "mirror"
+        effects = [
+            Effect(
+                "images of the LEDs in the target",
+                "built" if mirror else "absent",
+                "the ball mirrors them" if mirror else "paper is matt",
+            ),
+            decide(
+                "sizes of the LEDs in the light on plates", sizes, None, switch="",
+                because=f"{100 * LED_SIZES:g} % of the light",
+            ),
+            *absent(
+                [
+                    ("the stand of the ball", "the ball floats"),
+                    ("LEDs seen past boards and plates", "the dome behind them is dark"),
+                ]
+            ),
+            *unmodeled(
+                [
+                    ("light from the cloth on boards and plates", "0.1 % of the direct light"),
+                    ("blur of the lenses", "every pixel averages over its own square"),
+                ]
+            ),
+        ]  # fmt: skip
+        return SceneNeeds(tuple(effects))
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
+
+    def show(self, pose: int) -> None:
+        """Put the target into its place number ``pose``."""
+        if not 0 <= pose < PLACES[self.kind]:
+            raise TargetError(f"pose: got {pose}, expected 0 to {PLACES[self.kind] - 1}")
+        self.pose = pose
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        view = self._view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        on_s = np.zeros(len(self.rig.lights))
+        for pulse in pops:
+            if not 0.0 <= pulse.level <= 1.0:
+                raise TargetError(f"level of LED {pulse.led}: got {pulse.level}, expected 0 to 1")
+            light = self.dome.answering(pulse.led)
+            if self.rig.lights[light].name not in self.dome.dead:
+                energy = pulse.level * (pulse.t_off_s - pulse.t_on_s)
+                on_s[light] += energy * (1.0 + POWER_DEVIATION * rng.standard_normal())
+        return expose(self.light(view_name, on_s), sensor=sensor_of(view), rng=rng,
+                      exposure_s=exposure_s)  # fmt: skip
+
+    def light(self, view_name: str, on_s: Sequence[float] | FloatArray) -> NDArray[np.float32]:
+        """Return the light on a sensor without noise and vignetting, camera RGB, (H, W, 3).
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        on_s
+            Seconds that each light was on, times its level, shape (L,).
+        """
+        view = self._view(view_name)
+        rays = self._corner_rays(view)
+        seconds = np.asarray(on_s, np.float64)
+        lit = np.nonzero(seconds > 0)[0]
+        if not lit.size:
+            return np.zeros((view.height_px, view.width_px, 3), np.float32)
+        rgb = np.array([white_intensity(self.rig.lights[i], view) for i in lit])
+        color = rgb[0] / rgb[0].max()
+        strength = seconds[lit] * rgb.max(axis=1) * self.dome.gain.get(view_name, 1.0)
+        lamps = (self._lamp_mm[lit], self.dome.axis[lit], self._exponent[lit], strength)
+        eye = np.array(view.position_mm)
+        if self.kind == "mirror":
+            gray = self._ball(view, rays, eye, lit, lamps)
+        else:
+            rotation, place = self.plate_pose()
+            plate = self._plate
+            gray = printed_plate.plate_light(
+                rays, eye, rotation, place, plate.reflectance, CELL_MM, plate.waviness,
+                *lamps, EDGE_SUBPIXELS,
+            )  # fmt: skip
+        return np.asarray(gray[..., None] * color.astype(np.float32))
+
+    def plate_pose(self, pose: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return how a plate stands: rotation to the rig frame, place of its top left corner, mm.
+
+        A plate's own axes are x right and y down as seen from its front, z into it.
+        """
+        number = self.pose if pose is None else pose
+        places = BOARD_PLACES if self.kind == "charuco" else PLATE_PLACES
+        values = np.array(places[number], np.float64)
+        if number > 0 or self.kind == "white":
+            hand = self._hand[number]
+            values = values + hand * [HAND_DEG, HAND_DEG, HAND_DEG, HAND_MM, HAND_MM, HAND_MM]
+        azimuth, elevation, turn = np.radians(values[:3])
+        front = np.array(
+            [
+                math.cos(elevation) * math.sin(azimuth),
+                math.sin(elevation),
+                math.cos(elevation) * math.cos(azimuth),
+            ]
+        )
+        right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+        down = -np.cross(front, right)
+        x = math.cos(turn) * right + math.sin(turn) * down
+        rotation = np.stack([x, np.cross(-front, x), -front], axis=1)
+        width, height = self._plate.size_mm
+        return rotation, values[3:] - rotation @ np.array([width / 2, height / 2, 0.0])
+
+    def ball_mm(self, pose: int | None = None) -> FloatArray:
+        """Return the middle of the mirror ball."""
+        number = self.pose if pose is None else pose
+        return np.array(BALL_PLACES[number]) + HAND_MM * self._hand[number, :3]
+
+    def truth(self) -> dict[str, Any]:
+        """Return what calibration should find; lengths in mm, rig frame.
+
+        Returns
+        -------
+        dict
+            ``position_mm`` (L, 3), ``axis`` (L, 3), ``exponent`` (L,) of the lights in the order
+            of the rig; ``intensity`` (L, 3) in the unit of `rigsim.light.led_light.white_intensity`, 0
+            where dead; ``gain`` by view; ``ball_mm`` (places, 3) or ``plate_pose`` (a list of
+            rotation and place).
+        """
+        view = self.rig.views[0]
+        alive = np.array([light.name not in self.dome.dead for light in self.rig.lights])
+        intensity = np.array([white_intensity(light, view) for light in self.rig.lights])
+        out: dict[str, Any] = {
+            "position_mm": self._lamp_mm.copy(),
+            "axis": self.dome.axis.copy(),
+            "exponent": self._exponent.copy(),
+            "intensity": intensity * alive[:, None],
+            "gain": dict(self.dome.gain),
+        }
+        places = range(PLACES[self.kind])
+        if self.kind == "mirror":
+            out["ball_mm"] = np.array([self.ball_mm(k) for k in places])
+        else:
+            out["plate_pose"] = [self.plate_pose(k) for k in places]
+        return out
+
+    def _view(self, name: str) -> View:
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise TargetError(str(error)) from error
+
+    def _corner_rays(self, view: View) -> FloatArray:
+        if view.name not in self._rays:
+            distortion = self.dome.distortion.get(view.name, np.zeros(5))
+            self._rays[view.name] = pixel_corner_rays(view, distortion)
+        return self._rays[view.name]
+
+    def _ball(
+        self,
+        view: View,
+        rays: FloatArray,
+        eye: FloatArray,
+        lit: NDArray[np.intp],
+        lamps: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> NDArray[np.float32]:
+        ball = self.ball_mm()
+        cloth = mirror_ball.light_on_cloth(*lamps)
+        image = mirror_ball.surroundings(
+            rays, eye, ball, BALL_RADIUS_MM, mirror_ball.REFLECTANCE, cloth, EDGE_SUBPIXELS
+        )
+        for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
+            radius = self.rig.lights[index].radius_mm
+            for reflected in (True, False):
+                box = self._box(view, eye, ball, lamp, axis, radius, reflected=reflected)
+                if box is None:
+                    continue
+                mirror_ball.add_lamp(
+                    image, rays, box, eye, ball, BALL_RADIUS_MM, mirror_ball.REFLECTANCE,
+                    lamp, axis, float(exponent), radius, float(strength), reflected,
+                    SPOT_SUBPIXELS,
+                )  # fmt: skip
+        return np.asarray(image)
+
+    def _box(
+        self,
+        view: View,
+        eye: FloatArray,
+        ball: FloatArray,
+        lamp: FloatArray,
+        axis: FloatArray,
+        radius: float,
+        *,
+        reflected: bool,
+    ) -> NDArray[np.int64] | None:
+        """Return rows and columns that an LED can cover, or None outside the image."""
+        if not reflected and (eye - lamp) @ axis <= 0.0:
+            return None
+        side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+        side /= np.linalg.norm(side)
+        across = np.cross(axis, side)
+        rim = [lamp + 1.3 * radius * v for v in (side, -side, across, -across)]
+        if reflected:
+            rim = [mirror_ball.reflection_point(eye, place, ball, BALL_RADIUS_MM) for place in rim]
+        distortion = self.dome.distortion.get(view.name, np.zeros(5))
+        px = image_of(view, distortion, np.array(rim))
+        if not np.isfinite(px).all():
+            return None
+        low = np.floor(px.min(axis=0)) - 1
+        high = np.ceil(px.max(axis=0)) + 2
+        size = np.array([view.width_px, view.height_px])
+        if (high <= 0).any() or (low >= size).any():
+            return None
+        low, high = np.clip(low, 0, size), np.clip(high, 0, size)
+        return np.array([low[1], high[1], low[0], high[0]], np.int64)
+
+
+EDGE_SUBPIXELS: Final = 8
+"""Rays along each side of pixels that an edge crosses."""
+SPOT_SUBPIXELS: Final = 12
+"""Rays along each side of pixels near an LED's image."""
+
+
+def target_scene(kind: Kind, rig: Rig, *, seed: int, dome: BuiltDome | None = None) -> TargetScene:
+    """Return a target in a dome built after a drawing.
+
+    Parameters
+    ----------
+    kind
+        "charuco", "mirror" or "white".
+    rig
+        The drawing.
+    seed
+        Seeds the dome as built (unless given) and the scene.
+    dome
+        The dome as it stands; None builds one with the usual tolerances.
+
+    Returns
+    -------
+    TargetScene
+    """
+    return TargetScene(kind, dome or build(rig, seed=seed), seed=seed)
+
+
+def plate_normals() -> list[tuple[float, float, float]]:
+    """Return where the white plate's front looks in each place, before the operator's hand."""
+    out = []
+    for azimuth, elevation in np.radians([place[:2] for place in PLATE_PLACES]):
+        x, z = math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth)
+        out.append((x, math.sin(elevation), z))
+    return out
+
+
+def board(kind: Literal["charuco", "white"]) -> Plate:
+    """Return the printed target of a kind, its surface flat."""
+    if kind == "charuco":
+        return printed_plate.charuco_board()
+    return printed_plate.white_plate(slope_deg=0.0, rng=np.random.default_rng(0))

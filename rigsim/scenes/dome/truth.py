@@ -1,0 +1,100 @@
+"""What an estimator should find in the dome: the face's maps as a camera sees them, and its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import UNITS, SkinAppearance, SkinMap
+from rigsim.light import olat, surface_brdf
+from rigsim.light.olat import Hits
+from rigsim.light.surface_brdf import SkinSurface
+from rigsim.scenes.dome.views import unit
+from rigsim.subject import Subject
+
+HAIR_LIMIT: Final = 0.02
+"""Pixels with more hair than this part are not skin."""
+
+COATING: Final = ("film", "film_alpha", "film_eta", "powder")
+"""Names of the maps of a coating, in the order of `rigsim.light.surface_brdf.SkinSurface.packed`."""
+
+
+def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
+    """Return the maps of `rigsim.scenes.dome.scene.DomeScene.truth`: means over pixels, no lens."""
+    surface = olat.unpack_surface(hits.surface)
+    normals = unit(hits.scatter(hits.normals()))
+    maps = hits.scatter(surface)
+    hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
+    coverage = hits.coverage()
+    uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+    coating = dict(zip(COATING, np.moveaxis(maps, -1, 0)[7:], strict=False))
+    return {
+        **coating,
+        "r_d": maps[..., :3],
+        "normals": normals,
+        "position_mm": hits.scatter(hits.position_mm),
+        "roughness": maps[..., 3],
+        "oil": maps[..., 4],
+        "fuzz": maps[..., 5],
+        "uv": hits.scatter(uv),
+        "hair": hair,
+        "mask": (coverage > 1.0 - 1e-6) & (hair < HAIR_LIMIT),
+    }
+
+
+def appearance_of(
+    subject: Subject,
+    surface: SkinSurface,
+    *,
+    conditions: Mapping[str, float],
+    left_out: tuple[tuple[str, str], ...],
+    seed: int,
+) -> SkinAppearance:
+    """Return the truth on a face's own texture, see `rigsim.scenes.dome.scene.DomeScene`."""
+    valid = subject.atlas.covered & (subject.hair < HAIR_LIMIT)
+    floor = np.zeros(valid.shape, np.float32)
+    floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
+    white = "camera RGB over that of a perfect white, without hair"
+    maps = {
+        "position": (subject.atlas.position_mm, UNITS["position"], "rig frame"),
+        "normals": (surface.normal, UNITS["normals"], "rig frame, with relief"),
+        "r_d": (surface.r_d, "1", f"factor of the diffuse term, {white}"),
+        "r_d_floor": (floor, "1", "least surface term in the unit of r_d, within 70 degrees"),
+        "reflectance": (surface.reflectance, "1", f"at normal incidence, {white}"),
+        "roughness": (surface.roughness, UNITS["roughness"], "Beckmann, skin below the oil"),
+        "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
+        "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
+        "normals_tangent": (
+            subject.tangent_normal(),
+            "1",
+            "texture frame, relief and wrinkles: +x along u, +y along v, +z off the mesh",
+        ),
+    }
+    if surface.coating is not None:
+        on = surface.coating
+        maps |= {
+            "film": (on.film, "1", "share of the surface under a film"),
+            "film_alpha": (on.film_alpha, "1", "GGX alpha of the film"),
+            "film_eta": (on.film_eta, "1", "refractive index of the film"),
+            "powder": (on.powder, "1", "share of the surface under grains"),
+        }
+    if subject.rest is not None:
+        where = "rig frame, the same skin before it moved"
+        maps["position_at_rest"] = (subject.rest.atlas.position_mm, "mm", where)
+    return SkinAppearance(
+        {
+            name: SkinMap(values, unit, valid=valid, description=text)
+            for name, (values, unit, text) in maps.items()
+        },
+        "simulated",
+        parameters={
+            "preset": subject.preset,
+            "subject_seed": subject.seed,
+            "conditions": dict(conditions),
+        },
+        left_out=left_out,
+        seed=seed,
+    )

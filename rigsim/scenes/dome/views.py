@@ -1,0 +1,91 @@
+"""What a camera of the dome meets: a face by its texture, or a target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import View
+from rigsim.geometry.atlas import sample
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light import olat
+from rigsim.light.olat import Hits
+from rigsim.render import Caster, GBuffer
+from rigsim.targets import Target
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looking:
+    """How cameras look."""
+
+    subpixels: int
+    """Rays along each side of a pixel."""
+    distortion: ArrayLike | None
+    """Of the lens, see `rigsim.render.camera_rays`."""
+    illuminant: str
+    """Spectrum of the lights."""
+    optics: bool
+    """Whether the lens blurs."""
+
+
+def at_skin(caster: Caster, view: View, texture: Float32Array, how: Looking) -> Hits:
+    """Look at a face.
+
+    Parameters
+    ----------
+    caster
+        Its mesh.
+    view
+        The camera, in the frame of the mesh.
+    texture
+        Surface and normals with relief in the last three, shape (N, N, 10) or (N, N, 14).
+    how
+        Rays and lens.
+    """
+
+    def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+        uv = buffers.uv.reshape(-1, 2)[rows]
+        values = sample(texture, uv, np.ones(len(rows), np.bool_))
+        return unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
+
+    return olat.find_hits(
+        caster,
+        view,
+        look_up,
+        subpixels=how.subpixels,
+        distortion=how.distortion,
+        illuminant=how.illuminant if how.optics else None,
+    )
+
+
+def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
+    """Look at a target that reflects."""
+    rgb = target.rgb(view.spectral_sensitivity, how.illuminant)
+
+    def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+        uv = buffers.uv.reshape(-1, 2)[rows]
+        surface = np.zeros((len(rows), 7), np.float32)
+        size = rgb.shape[0]
+        column = np.clip((uv[:, 0] * size).astype(np.int64), 0, size - 1)
+        row = np.clip(((1.0 - uv[:, 1]) * size).astype(np.int64), 0, size - 1)
+        surface[:, :3] = rgb[row, column]
+        surface[:, 3] = target.alpha
+        return buffers.normal.reshape(-1, 3)[rows], surface
+
+    return olat.find_hits(
+        caster,
+        view,
+        look_up,
+        subpixels=how.subpixels,
+        kind=olat.METAL if target.kind == "metal" else olat.MATT,
+        distortion=how.distortion,
+        illuminant=how.illuminant if how.optics else None,
+    )
+
+
+def unit(vectors: Float32Array) -> Float32Array:
+    """Return vectors of length 1, shape (..., 3); those of length 0 stay."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)

@@ -1,0 +1,201 @@
+"""A face before the flash rig whose blood follows a course in time.
+
+The light of a picture is a smooth function of the level of the blood: it is rendered at three
+levels of each pose, and taken from the parabola through them in between. So a sequence of any
+number of pictures costs three renders, six where the face moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig
+from rigsim.geometry.mesh import Float32Array
+from rigsim.needs.effects import SceneNeeds, unmodeled
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.flash.scene import POWER_DEVIATION, FlashScene
+from rigsim.sensor import expose
+from rigsim.subject import Subject, landmarks
+from rigsim.subject.perfusion_course import Course, with_blood
+
+LEVELS: Final = (0.0, 0.5, 1.0)
+"""Levels of the blood that are rendered."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlashTime:
+    """What a flash met."""
+
+    token: str
+    """Name of the flash."""
+    t_s: float
+    """World time, s."""
+    level: float
+    """Level of the state's blood, 0 to 1."""
+    pose: str
+    """State that the face showed by its movement."""
+
+
+class FlashCourseScene:
+    """A face before the flash rig; see `rigsim.scenes.flash.scene.FlashScene`.
+
+    Parameters
+    ----------
+    rig
+        The flash rig.
+    subject
+        The face at rest.
+    course
+        What its blood does.
+    seed
+        Seeds what differs from pop to pop.
+    movement
+        Whether the face moves with the expression, or only its blood changes.
+    lateral
+        Whether light spreads inside the skin; None: where it changes pixels.
+    subpixels
+        Rays along each side of a pixel.
+    on_flash
+        Called with each flash that a camera saw.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject,
+        course: Course,
+        *,
+        seed: int = 0,
+        movement: bool = True,
+        lateral: bool | None = None,
+        subpixels: int = 2,
+        on_flash: Callable[[FlashTime], None] | None = None,
+    ) -> None:
+        self.rig = rig
+        self.subject = subject
+        self.course = course
+        self.seed = seed
+        self.movement = movement
+        self._on_flash = on_flash
+        self._lateral, self._subpixels = lateral, subpixels
+        self._scenes: dict[tuple[str, float], FlashScene] = {}
+        self._images: dict[tuple[object, ...], Float32Array] = {}
+
+    def at(self, pose: str, level: float) -> FlashScene:
+        """Return the scene of a pose and one of `LEVELS`; all of one pose share what they trace."""
+        shown = pose if self.movement else "neutral"
+        key = (shown, level)
+        if key not in self._scenes:
+            self._scenes[key] = FlashScene(
+                self.rig,
+                with_blood(self.subject, self.course.state, level),
+                state=shown,
+                seed=self.seed,
+                lateral=self._lateral,
+                subpixels=self._subpixels,
+            )
+        return self._scenes[key]
+
+    @property
+    def needs(self) -> SceneNeeds:
+        """What is built, what is not, and why."""
+        name = "the movement between two expressions"
+        between = unmodeled([(name, "the face is in one or the other")])
+        return SceneNeeds((*self.at(self.course.state, 1.0).needs, *between))
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What the scene does not build, with the reason."""
+        return self.needs.left_out
+
+    def radiance(
+        self,
+        pose: str,
+        level: float,
+        polarizer: str = "crossed",
+        analyser_deg: float | None = None,
+        *,
+        view_name: str | None = None,
+    ) -> Float32Array:
+        """Return the light on the sensor at power 1 with blood at any level, shape (H, W, 3)."""
+        total = None
+        for node, weight in zip(LEVELS, parabola_weights(level), strict=True):
+            if weight == 0.0:
+                continue
+            key = (pose if self.movement else "", node, polarizer, analyser_deg, view_name)
+            if key not in self._images:
+                scene = self.at(pose, node)
+                self._images[key] = scene.radiance(polarizer, analyser_deg, view_name=view_name)
+            part = np.float32(weight) * self._images[key]
+            total = part if total is None else total + part
+        if total is None:  # the weights sum to one
+            raise SceneError(f"level: got {level}, expected 0 to 1")
+        return np.maximum(total, 0.0)
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[object], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once, with the blood of the time of each pop; see `FlashScene`."""
+        view = self.rig.view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
+        for pop in pops:
+            power, t_s = float(pop.power), float(pop.t_s)  # type: ignore[attr-defined]
+            if not 0.0 <= power <= 1.0:
+                raise SceneError(f"power: got {power}, expected 0 to 1")
+            level, pose = self.course.level(t_s), self.course.pose(t_s)
+            energy = power * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            light += np.float32(energy) * self.radiance(
+                pose, level, pop.polarizer, pop.analyser_deg,  # type: ignore[attr-defined]
+                view_name=view_name,
+            )  # fmt: skip
+            if self._on_flash is not None:
+                self._on_flash(FlashTime(str(pop.token), t_s, level, pose))  # type: ignore[attr-defined]
+        sensor = self.at("neutral", LEVELS[0]).sensor(view_name)
+        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+
+    def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
+        """Return where named points of the skin are in the first camera's image of a pose.
+
+        Returns
+        -------
+        dict
+            Name to (x, y), px of the sensor, also of points that something stands before.
+        """
+        face = self.at(pose, LEVELS[0]).subject
+        if not isinstance(face, Subject):
+            raise SceneError(f"landmarks: got {face.name!r}, expected a face")
+        points = face.surface_landmarks()
+        pixels = landmarks.project(points.on(face.mesh), self.rig.views[0])
+        return {n: (float(x), float(y)) for n, (x, y) in zip(points.names, pixels, strict=True)}
+
+    def hemoglobin(self, pose: str, levels: Sequence[float]) -> Float32Array:
+        """Return the true blood seen by the first camera, shape (len(levels), H, W), 0 to 0.32."""
+        nodes = np.stack([self.at(pose, node).truth()["hemoglobin"] for node in LEVELS])
+        weights = np.array([parabola_weights(level) for level in levels])
+        return np.tensordot(weights, nodes, axes=1).astype(np.float32)
+
+    def truth(self, pose: str, level: float) -> Mapping[str, NDArray[np.generic]]:
+        """Return the truth maps of a pose at one of `LEVELS`; see `FlashScene.truth`."""
+        return self.at(pose, level).truth()
+
+
+def parabola_weights(level: float) -> tuple[float, float, float]:
+    """Return the weights of what is known at `LEVELS` for a level from 0 to 1; they sum to 1.
+
+    Examples
+    --------
+    >>> parabola_weights(0.25)
+    (0.375, 0.75, -0.125)
+    """
+    a, b, c = LEVELS
+    return (
+        (level - b) * (level - c) / ((a - b) * (a - c)),
+        (level - a) * (level - c) / ((b - a) * (b - c)),
+        (level - a) * (level - b) / ((c - a) * (c - b)),
+    )

@@ -1,0 +1,510 @@
+"""The cross-polarized flash rig: two flashes and a camera before a face or a target.
+
+Light that enters the skin is gathered in the face's texture, spread there, and seen by the camera
+through the surface; the surface's own reflection is added per pixel. Both are kept as Stokes
+vectors, so that every angle of the analyser is one weighted sum away.
+
+The unit of light is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces
+the camera gives `METER_LEVEL` of full scale in the strongest channel at power 1, behind parallel as
+behind crossed films, whatever stands there later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, RigError, View
+from model import spectra
+from rigsim import shading
+from rigsim.as_built.polarizers import Films, films_of
+from rigsim.geometry.mesh import Float32Array, Mesh
+from rigsim.light.lateral import line_spread_mm
+from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.subsurface_radiance import SkinGlow, SurfaceLight, light_skin, light_surface
+from rigsim.needs import flash as flash_needs
+from rigsim.needs.effects import Noise, SceneNeeds, strictest
+from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
+from rigsim.render import camera_rays
+from rigsim.render.depth_of_field import facing_depths, lens_spread
+from rigsim.render.variant import VariantChoice
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.flash import truth as flash_truth
+from rigsim.scenes.flash.image import Look, Picture
+from rigsim.scenes.flash.stage import stage_of
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.subject import Subject, landmarks
+from rigsim.targets import Target
+
+METER_LEVEL: Final = 0.8
+"""Fraction of full scale of the white reference in its strongest channel at power 1."""
+
+FLAT_LEVEL: Final = 0.9
+"""Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
+
+POWER_DEVIATION: Final = 0.002
+"""Relative standard deviation of a flash's energy from pop to pop."""
+
+
+class Pop(Protocol):
+    """A fired flash, as the world reports it."""
+
+    @property
+    def token(self) -> object:
+        """What the host called it."""
+
+    @property
+    def power(self) -> float:
+        """Fraction of full energy, 0 to 1."""
+
+    @property
+    def polarizer(self) -> str:
+        """State of the analyser: "parallel" or "crossed"."""
+
+    @property
+    def analyser_deg(self) -> float | None:
+        """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
+
+
+class FlashScene:
+    """One subject or target before the flash rig, in one state.
+
+    Scenes that differ in the blood alone share what they trace, as long as one of them lives.
+
+    Parameters
+    ----------
+    rig
+        The flash rig; its lights must share one spectrum.
+    subject
+        A face or a target.
+    state
+        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression where the
+        state is one; targets have none.
+    movement
+        Whether the face moves and wrinkles with the state; else it stays as it is given. A subject
+        that is already posed (`Subject.posed`) stays in its pose.
+    sensor
+        Sensor of every view; ``None`` takes what each view states.
+    films
+        The polarizing films; ``None`` takes the rig's own, which its serial numbers decide.
+    seed
+        Seeds what differs from pop to pop.
+    lateral
+        Whether light spreads inside the skin. This and the next two: ``None`` decides by how much
+        it changes pixels, see `needs`.
+    interreflections
+        Whether light goes from skin to skin.
+    spectral
+        Whether that light is reflected wavelength by wavelength.
+    spectral_step
+        At every how many of the table's wavelengths; ``None``: as `needs` says.
+    last_bounce
+        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    relief_shadows
+        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
+    power
+        Highest power of a flash in the plan, above 0 to 1, by which sizes are told.
+    optics
+        Whether the lens blurs what is out of focus, and diffracts; ``None`` decides as above.
+    subpixels
+        Rays along each side of a pixel.
+    choice
+        Mitsuba variant; ``None`` chooses.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject | Target,
+        *,
+        state: str = "neutral",
+        movement: bool = True,
+        sensor: Sensor | None = None,
+        films: Films | None = None,
+        seed: int = 0,
+        lateral: bool | None = None,
+        interreflections: bool | None = None,
+        spectral: bool | None = None,
+        spectral_step: int | None = None,
+        last_bounce: float | None = None,
+        optics: bool | None = None,
+        relief_shadows: bool | None = None,
+        power: float = 1.0,
+        subpixels: int = 2,
+        choice: VariantChoice | None = None,
+    ) -> None:
+        spectra_names = {light.illuminant for light in rig.lights}
+        if len(spectra_names) > 1:
+            raise SceneError(
+                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+            )
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if not 0.0 < power <= 1.0:
+            raise SceneError(f"power: got {power}, expected above 0 to 1")
+        if movement and isinstance(subject, Subject) and subject.pose is None:
+            subject = subject.posed(state)
+        self.rig = rig
+        self.subject = subject
+        self.state = state
+        self.movement = movement
+        self.films = films_of(rig) if films is None else films
+        self.seed = seed
+        self.subpixels = subpixels
+        self._illuminant = rig.lights[0].illuminant
+        self._sensors = {
+            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+        }
+        self._weights = _light_weights(rig)
+        self._choice = choice
+        self._stage = stage_of(subject, choice)
+        self._caster = self._stage.caster
+        self._glow: dict[str, SkinGlow] = {}
+        self._pictures: dict[str, Picture] = {}
+        self._blurs: dict[str, Mapping[str, Float32Array]] = {}
+        self._spreads: dict[str, Mapping[str, Float32Array]] = {}
+        self.needs: SceneNeeds = strictest(
+            [
+                flash_needs.flash_needs(
+                    rig,
+                    subject,
+                    state,
+                    view=view,
+                    caster=self._caster,
+                    noise=Noise.of(self._sensors[view.name]),
+                    white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
+                    weights_mm2=self._weights,
+                    movement=movement,
+                    lateral=lateral,
+                    interreflections=interreflections,
+                    spectral=spectral,
+                    optics=optics,
+                    relief_shadows=relief_shadows,
+                    subpixels=subpixels,
+                    share=self._stage.share(),
+                )
+                for view in rig.views
+            ]
+        )
+        """What is built, what is not, and why."""
+        self.lateral = self.needs.builds(LATERAL)
+        self.interreflections = self.needs.builds(BOUNCES)
+        self.optics = self.needs.builds(LENS)
+        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self._last_bounce = summed if last_bounce is None else last_bounce
+        self._step = spectral_step
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
+
+    def white_rgb(self, view_name: str | None = None) -> Float32Array:
+        """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
+        view = self._view(view_name)
+        white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
+        return np.asarray(METER_LEVEL * white / white.max(), np.float32)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view."""
+        return self._sensors[self._view(view_name).name]
+
+    def radiance(
+        self,
+        polarizer: str = "crossed",
+        analyser_deg: float | None = None,
+        *,
+        view_name: str | None = None,
+    ) -> Float32Array:
+        """Return the light on the sensor at power 1, without noise and vignetting.
+
+        Parameters
+        ----------
+        polarizer
+            "parallel" or "crossed".
+        analyser_deg
+            Reading of the analyser's rotator in degrees; ``None`` takes that of the state.
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        ndarray of float32
+            Camera RGB without white balance, shape (H, W, 3), fraction of full scale.
+        """
+        view = self._view(view_name)
+        passes_deg = self.films.passes_deg(view, polarizer, analyser_deg)
+        white = self.white_rgb(view.name)
+        shape = (view.height_px, view.width_px, 3)
+        if isinstance(self.subject, Target) and self.subject.kind == "cap":
+            return np.zeros(shape, np.float32)
+        if isinstance(self.subject, Target) and self.subject.kind == "source":
+            level = np.float32(FLAT_LEVEL / METER_LEVEL) * white
+            return np.broadcast_to(level, shape).copy()
+        picture = self._picture(view)
+        diffuse = self._analysed(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
+        specular = self._analysed(picture.specular, view, passes_deg)
+        return np.maximum((diffuse + specular[..., None]) * white, 0.0)
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Pop], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The flashes that fired while the shutter was open; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        view = self._view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
+        for pop in pops:
+            if not 0.0 <= pop.power <= 1.0:
+                raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
+            energy = pop.power * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            image = self.radiance(pop.polarizer, pop.analyser_deg, view_name=view.name)
+            light += np.float32(energy) * image
+        sensor = self._sensors[view.name]
+        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+
+    def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
+        """Return what an estimator should find, at the sensor's resolution.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
+
+            ``melanin``, ``hemoglobin``: volume fractions, sharp;
+            ``melanin_blurred``, ``hemoglobin_blurred``: the fractions of even skin that would look
+            as the skin looks after its light has spread, all else known;
+            ``reflectance``, ``reflectance_blurred``: white-balanced diffuse reflectance, (H, W, 3);
+            ``shading``: what reflectance times `white_rgb` is multiplied with in the crossed image
+            at power 1, without specular leak, spreading of light and light from other skin;
+            ``irradiance``: light of the flashes on the surface over that on the white reference;
+            ``diffuse``, ``specular``: camera RGB without analyser at power 1 in fraction of full
+            scale, light from inside and from the surface, (H, W, 3), through the lens, which blurs
+            no other map; crossed is about half the first, parallel half the first and the second;
+            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
+            ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
+            ``hair``: part covered by hair (brows, lashes);
+            ``mask``: bool, pixels wholly on skin, whose light comes from skin within
+            `rigsim.scenes.flash.truth.LENS_LIMIT`.
+
+            All are of the face as it has moved. For a state other than "neutral" there are also
+            ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
+            be seen on the face at rest, sharp; ``melanin_blurred_at_rest``,
+            ``hemoglobin_blurred_at_rest``: those of even skin, blurred on the face as it has moved;
+            ``mask_at_rest``: bool, for all four. Where the face has moved also
+            ``position_at_rest_mm``: where the skin in a pixel is at rest, rig frame.
+
+        Raises
+        ------
+        SceneError
+            A target stands there; only faces have these maps.
+        """
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
+        view = self._view(view_name)
+        picture = self._picture(view)
+        passes_deg = self.films.passes_deg(view, "crossed", None)
+        truth = flash_truth.maps_of(
+            picture,
+            self._blurred(view, picture),
+            shading=self._analysed(picture.shading, view, passes_deg),
+            white_rgb=self.white_rgb(view.name),
+        )
+        if self.state != "neutral":
+            truth |= self._at_rest(view, truth)
+        return truth
+
+    def landmarks_px(self, view_name: str | None = None) -> dict[str, tuple[float, float]]:
+        """Return where named points of the skin are in the image.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Name to (x, y) on the sensor, px: x to the right, y down, the centre of pixel (0, 0) is
+            (0, 0); see `rigsim.subject.landmarks.POINTS_MM`. Points that the camera does not see are
+            missing. They go with the skin from state to state.
+
+        Raises
+        ------
+        SceneError
+            A target stands there.
+        """
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"landmarks: got the target {self.subject.name!r}, expected a face")
+        view = self._view(view_name)
+        points = self.subject.surface_landmarks()
+        places = points.on(self.subject.mesh)
+        pixels = landmarks.project(places, view)
+        visible = landmarks.seen(places, view, self._caster)
+        return {
+            name: (float(x), float(y))
+            for name, (x, y), shown in zip(points.names, pixels, visible, strict=True)
+            if shown
+        }
+
+    def resolution_mm(self, view_name: str | None = None) -> NDArray[np.float64]:
+        """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
+        glow = self._skin_glow(self._view(view_name))
+        return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
+
+    def _view(self, name: str | None) -> View:
+        if name is None:
+            return self.rig.views[0]
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise SceneError(str(error)) from error
+
+    def _analysed(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
+        """Apply the analyser to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
+        to_camera = -camera_rays(view)[1]
+        right, up, _ = view.axes
+        if stokes.ndim == 4:
+            to_camera = to_camera[:, :, None]
+        return shading.analyse(
+            stokes,
+            to_camera,
+            passes_deg=passes_deg,
+            image_right=right,
+            image_up=up,
+            extinction=self.films.analyser_extinction,
+        )
+
+    def _skin_glow(self, view: View) -> SkinGlow:
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"skin: got the target {self.subject.name!r}, expected a face")
+        camera = view.spectral_sensitivity
+        if camera not in self._glow:
+            self._glow[camera] = light_skin(
+                self.subject,
+                self.state,
+                self._surface_light(self.subject),
+                camera=camera,
+                illuminant=self._illuminant,
+                lateral_transport=self.lateral,
+                bounce=self._stage.exchange() if self.interreflections else None,
+                spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                step=self._spectral_step(self.subject, view),
+                enough=self._last_bounce,
+            )
+        return self._glow[camera]
+
+    def _spectral_step(self, subject: Subject, view: View) -> int:
+        if self._step is not None:
+            return self._step
+        bounces = self.needs[BOUNCES]
+        return flash_needs.spectral_step(subject, self.state, view, self._illuminant, bounces)[0]
+
+    def _surface_light(self, subject: Subject) -> SurfaceLight:
+        wrinkled = self.needs.builds(WRINKLES)
+        key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
+        known = self._stage.light
+        if key not in known:
+            known[key] = light_surface(
+                subject,
+                self.rig.lights,
+                self._weights,
+                self.films,
+                caster=self._caster,
+                relief=ReliefShadow(subject) if wrinkled else None,
+            )
+        return known[key]
+
+    def _blurred(self, view: View, picture: Picture) -> Mapping[str, Float32Array]:
+        """Return the maps that are blurred as the light is; nothing but the truth needs them."""
+        subject = self.subject
+        if not self.lateral or not isinstance(subject, Subject):
+            return flash_truth.unblurred_maps(picture)
+        if view.name not in self._blurs:
+            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            seen = look.at_maps(self._stage.caster, subject, self._spread(view, subject))
+            self._blurs[view.name] = seen.maps
+        return self._blurs[view.name]
+
+    def _spread(self, view: View, subject: Subject) -> Mapping[str, Float32Array]:
+        """Return the textures of those maps, of the face as it has moved."""
+        if view.name not in self._spreads:
+            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            self._spreads[view.name] = look.blurred_maps(subject, self.state, self._skin_glow(view))
+        return self._spreads[view.name]
+
+    def _at_rest(
+        self, view: View, moved: dict[str, NDArray[np.generic]]
+    ) -> dict[str, NDArray[np.generic]]:
+        """Return the fractions of this state as seen on the face at rest."""
+        subject = self.subject
+        if not isinstance(subject, Subject) or subject.rest is None:
+            return flash_truth.unmoved_maps(moved)
+        rest = subject.rest
+        caster = stage_of(rest, self._choice).caster
+        spread = self._spread(view, subject) if self.lateral else None
+        look = self._look(view, rest.mesh)
+        return flash_truth.maps_at_rest(look, caster, rest, self.state, spread)
+
+    def _look(self, view: View, mesh: Mesh) -> Look:
+        spread = None
+        if self.optics:
+            depths = facing_depths(view, mesh)
+            spread = lens_spread(view, self._illuminant, subpixels=self.subpixels, depths_mm=depths)
+        return Look(self.rig, view, self.films, self._weights, self.subpixels, spread)
+
+    def _picture(self, view: View) -> Picture:
+        if view.name not in self._pictures:
+            look = self._look(view, self.subject.mesh)
+            if isinstance(self.subject, Subject):
+                picture = look.at_skin(
+                    self._caster,
+                    self.subject,
+                    self.state,
+                    self._skin_glow(view),
+                )
+            else:
+                picture = look.at_target(self._caster, self.subject)
+            self._pictures[view.name] = picture
+        return self._pictures[view.name]
+
+
+def _light_weights(rig: Rig) -> NDArray[np.float64]:
+    """Return each light's energy over the sum that a plate at the origin gets, mm^2."""
+    energy, share = [], []
+    view_axis = np.asarray(rig.views[0].axes[2])
+    for light in rig.lights:
+        if light.energy_ws is None:
+            raise SceneError(f"light {light.name!r}: is no flash, it has no energy_ws")
+        place = np.asarray(light.position_mm)
+        squared = float(place @ place)
+        energy.append(light.energy_ws)
+        share.append(light.energy_ws * float(place @ view_axis) / squared**1.5)
+    total = float(np.sum(share))
+    if not total > 0.0:
+        raise SceneError("lights: none shines on a plate at the origin that faces the camera")
+    return np.asarray(energy) / total

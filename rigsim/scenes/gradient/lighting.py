@@ -1,0 +1,247 @@
+"""What the gradient rig's LEDs make of a patch of skin: twelve images for every state.
+
+For one state the whole picture is made once, as Stokes vectors for each of the four moments of the
+light (see `rigsim.light.lobe_moments`); patterns and analysers are sums of these.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from rigsim import shading
+from rigsim.as_built.sphere import BuiltSphere
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.lobe_moments import MomentTable, Surface, build_table, direct_moments
+from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.self_shadow import horizon_tangent
+from rigsim.light.shadowed_lights import remove_hidden
+from rigsim.light.subsurface_radiance import SIGMAS_MM
+from rigsim.scenes.gradient.patch import PatchSurface
+from rigsim.skin_patch.microrelief import BAND_NM, MicroSkin
+from rigsim.tissue.skin_layers import ETA
+from rigsim.tissue.skin_table import SkinTable
+
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+BLOOD: Final = 0.035
+"""Volume fraction of blood that decides how far light spreads in the patch."""
+
+BLOCK_ROWS: Final = 128
+"""Rows that are looked up at once, which bounds memory."""
+
+SMOOTH_ALPHA: Final = 0.15
+"""Roughness from which on the smaller of the two default tables errs by less than 0.2 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lighting:
+    """Everything about the light that does not change with the state."""
+
+    sphere: BuiltSphere
+    surface: Surface
+    table: MomentTable
+    leds: tuple[int, ...]
+    """LEDs in the table; with shadows only those above the patch's plane."""
+    sectors: int
+    """Directions whose horizons are found; between them they are interpolated. 0: no shadows."""
+    sigmas_mm: FloatArray
+    """Widths of the lateral kernel of light in skin; none: light leaves where it entered."""
+    weights: FloatArray
+    """Their shares, sum 1."""
+    furrow_sectors: int = 0
+    """Directions in which the sky is looked for, for light from furrow to furrow; 0: none."""
+
+    def stokes(
+        self, patch: PatchSurface, height_um: Float32Array, *, margin: int, pitch_um: float
+    ) -> Float32Array:
+        """Return the picture of a patch, before the lens.
+
+        Parameters
+        ----------
+        patch
+            The surface.
+        height_um
+            Heights with ``margin`` more samples on all sides, which cast shadows.
+        margin
+            See there.
+        pitch_um
+            Distance of samples, um.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (12, H, W): Stokes vector of each moment, radiance.
+        """
+        rows, columns = patch.skin.shape
+        packed = np.empty((16, rows, columns), np.float32)
+        for first in range(0, rows, BLOCK_ROWS):
+            part = slice(first, first + BLOCK_ROWS)
+            found = self._unshadowed(patch, part)
+            packed[:, part] = found.T.reshape(16, -1, columns)
+        if self.sectors:
+            self._remove_hidden(patch, height_um, margin, pitch_um, packed)
+        packed[:12, ~patch.skin] = 0.0
+        entering = self._spread(packed[12:], patch.skin, 1e-3 * pitch_um)
+        if self.furrow_sectors:
+            hidden = hidden_share(
+                height_um, patch.normals, margin=margin, pixel_um=pitch_um,
+                sectors=self.furrow_sectors, boundaries=True,
+            )  # fmt: skip
+            entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
+        right = self.surface.image_right
+        eye = np.asarray(self.surface.eye_mm, np.float32)
+        scale = np.float32(shading.interior_scale(ETA) / math.pi)
+        out = packed[:12]
+        for first in range(0, rows, BLOCK_ROWS):
+            part = slice(first, first + BLOCK_ROWS)
+            n = patch.normals[part].reshape(-1, 3)
+            to_camera = eye - np.stack(
+                [patch.x_mm[part], patch.y_mm[part], np.zeros_like(patch.x_mm[part])], axis=-1
+            ).reshape(-1, 3)
+            to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+            leaves = shading.exit_stokes(n, to_camera, eta=ETA, image_right=right)
+            leaves = leaves.T.reshape(3, -1, columns) * (scale * patch.albedo[part])
+            for m in range(4):
+                out[3 * m : 3 * m + 3, part] += leaves * entering[m, part]
+        return out
+
+    def _unshadowed(self, patch: PatchSurface, part: slice) -> Float32Array:
+        n = patch.normals[part].reshape(-1, 3)
+        x, y = patch.x_mm[part].ravel(), patch.y_mm[part].ravel()
+        alpha = patch.alpha[part].ravel()
+        found = self.table.lookup(n, x, y, alpha)
+        steep = np.flatnonzero(~self.table.covers(n))
+        if steep.size:
+            places = np.column_stack([x[steep], y[steep], np.zeros(steep.size)])
+            found[steep] = direct_moments(
+                n[steep], places, self.sphere, self.surface, leds=self.leds, alpha=alpha[steep]
+            ).packed()
+        return found
+
+    def _remove_hidden(
+        self,
+        patch: PatchSurface,
+        height_um: Float32Array,
+        margin: int,
+        pitch_um: float,
+        packed: Float32Array,
+    ) -> None:
+        """Take away, LED by LED, what stands behind the relief."""
+        place = self.sphere.position_mm
+        azimuth = np.arctan2(place[:, 1], place[:, 0]) % (2.0 * np.pi)
+        where = azimuth / (2.0 * np.pi) * self.sectors
+        inner = slice(margin, -margin or None)
+        tangents: dict[int, Float32Array] = {}
+        for led in sorted(self.leds, key=lambda k: float(where[k])):
+            sector = int(where[led]) % self.sectors
+            pair = (sector, (sector + 1) % self.sectors)
+            tangents = {k: t for k, t in tangents.items() if k in pair}
+            for k in pair:
+                if k not in tangents:
+                    angle = 2.0 * math.pi * k / self.sectors
+                    full = horizon_tangent(height_um, pixel_um=pitch_um, azimuth_rad=angle)
+                    tangents[k] = np.ascontiguousarray(full[inner, inner])
+            horizon = (tangents[pair[0]], tangents[pair[1]], float(where[led]) - int(where[led]))
+            remove_hidden(packed, patch, horizon, self.sphere, led, self.surface)
+
+    def _from_furrows(
+        self, hidden: Float32Array, entering: Float32Array, patch: PatchSurface, pitch_mm: float
+    ) -> Float32Array:
+        """Return what enters by way of other walls of the relief, shape (4, H, W)."""
+        if not patch.skin.any():
+            return np.zeros_like(entering)
+        once = (
+            shading.interior_scale(ETA)
+            * float(patch.albedo[patch.skin].mean())
+            * hidden
+            * patch.skin
+        )
+        further = 1.0 / (1.0 - float(once[patch.skin].mean()))
+        return self._spread(np.float32(further) * once.astype(np.float32) * entering, patch.skin,
+                            pitch_mm)  # fmt: skip
+
+    def _spread(self, entering: Float32Array, skin: BoolArray, pitch_mm: float) -> Float32Array:
+        """Spread light inside the skin; beyond the picture it goes on mirrored."""
+        if not self.sigmas_mm.size:
+            return entering
+        rows, columns = skin.shape
+        fy = np.arange(rows) / (2.0 * rows * pitch_mm)
+        fx = np.arange(columns) / (2.0 * columns * pitch_mm)
+        square = (2.0 * np.pi**2 * (fy[:, None] ** 2 + fx[None, :] ** 2)).astype(np.float32)
+        kernel = np.zeros_like(square)
+        for sigma, weight in zip(self.sigmas_mm, self.weights, strict=True):
+            kernel += np.float32(weight) * np.exp(-np.float32(sigma**2) * square)
+        out = np.empty_like(entering)
+        for m in range(4):
+            # under the jaws no light enters, but what spreads there is lost
+            field = np.where(skin, entering[m], 0.0)
+            spectrum = scipy.fft.dctn(field, type=2, workers=2)
+            spectrum *= kernel
+            out[m] = scipy.fft.idctn(spectrum, type=2, workers=2)
+            out[m][~skin] = entering[m][~skin]
+        return out
+
+
+def light_skin(
+    skin: MicroSkin,
+    sphere: BuiltSphere,
+    surface: Surface,
+    *,
+    half_field_mm: float,
+    sectors: int,
+    table_size: int | None,
+    lateral: bool = True,
+    furrow_sectors: int = 0,
+) -> Lighting:
+    """Tabulate the light on a patch of skin.
+
+    Parameters
+    ----------
+    skin
+        The patch: its roughness and its pigment.
+    sphere
+        The LEDs.
+    surface
+        The camera and the films; the roughness is the patch's.
+    half_field_mm
+        Half the side of the field, mm.
+    sectors
+        Directions of horizons; 0 leaves shadows out, and then light comes from below the patch's
+        plane too where the relief leans that way.
+    table_size
+        Nodes along each axis of the normals; None chooses by roughness.
+    lateral
+        Whether light spreads inside the skin.
+    furrow_sectors
+        Directions in which the sky is looked for, for light from furrow to furrow; 0: none.
+    """
+    leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
+    alphas = (float(skin.alpha.min()), float(skin.alpha.max()))
+    table = build_table(
+        sphere,
+        surface,
+        half_field_mm=half_field_mm,
+        alpha_range=alphas,
+        size=table_size or (65 if alphas[0] >= SMOOTH_ALPHA else 129),
+        fields=2 if half_field_mm < 1.6 else 3,
+        leds=leds,
+    )
+    sigmas, weights = lateral_kernel(skin) if lateral else (np.zeros(0), np.zeros(0))
+    return Lighting(sphere, surface, table, leds, sectors, sigmas, weights, furrow_sectors)
+
+
+def lateral_kernel(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
+    """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
+    table = SkinTable.load()
+    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    weights = (band / band.sum())[:, None]
+    kernels = table.lateral_kernels(skin.melanin_fraction, BLOOD, weights)
+    gaussians = kernels.gaussians(SIGMAS_MM)
+    return gaussians.sigmas_mm, gaussians.weights[0]

@@ -1,0 +1,244 @@
+"""A patch of skin between the caliper's jaws, where the gradient rig's camera looks in one state.
+
+Frame: mm, origin at the middle of the patch. The camera's samples are points of the plane z = 0;
+where the skin is higher, what is seen there stands a little nearer the axis.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import View
+from rigsim.geometry.mesh import Float32Array
+from rigsim.skin_patch.motion import Pose
+
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+JAW_REFLECTANCE: Final = 0.03
+"""Of the jaws' matt black."""
+
+BULGE_MM: Final = 0.1
+"""How far relaxed skin bulges between the jaws."""
+
+BULGE_EXPONENT: Final = 4.0
+"""The bulge falls as e^(-4 (r - 1)) with the skin's stretch r."""
+
+BULGE_WIDTH_MM: Final = 8.0
+"""Half width of the bulge across the jaws' axis."""
+
+FOLD_MM: Final = 0.4
+"""Height of the fold of buckled skin."""
+
+FOLD_WIDTH: Final = 0.35
+"""Half width of the fold over the aperture."""
+
+SHADOW_MARGIN_PX: Final = 40
+"""Pixels around the picture whose relief casts shadows into it."""
+
+
+class Grip(Protocol):
+    """What the caliper holds, see `rigsim.world.taped_skin.GripState`."""
+
+    @property
+    def angle_deg(self) -> float:
+        """Direction of the jaws' axis, from +x towards +y."""
+
+    @property
+    def step(self) -> int:
+        """Step of the caliper."""
+
+    @property
+    def aperture_mm(self) -> float:
+        """Distance of the jaws."""
+
+    @property
+    def stretch(self) -> float:
+        """The skin's own stretch along the axis."""
+
+    @property
+    def attached(self) -> bool:
+        """Whether the tape holds."""
+
+    @property
+    def buckled(self) -> bool:
+        """Whether the skin has left its plane."""
+
+
+class Sampled(Protocol):
+    """A relief at points, see `rigsim.skin_patch.stretch.SurfaceSample`."""
+
+    @property
+    def height_um(self) -> NDArray[np.floating]:
+        """Height, um."""
+
+    @property
+    def slope_x(self) -> NDArray[np.floating]:
+        """Slope dh/dx, dimensionless."""
+
+    @property
+    def slope_y(self) -> NDArray[np.floating]:
+        """Slope dh/dy, y up."""
+
+    @property
+    def albedo(self) -> NDArray[np.floating]:
+        """Diffuse reflectance."""
+
+    @property
+    def inside(self) -> BoolArray:
+        """Whether there is skin."""
+
+
+class Relief(Protocol):
+    """Skin in one state, see `rigsim.skin_patch.stretch.StretchedSkin`."""
+
+    def sample(self, x_mm: ArrayLike, y_mm: ArrayLike) -> Sampled:
+        """Return the relief at points of the skin's frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchSurface:
+    """What stands at the camera's samples."""
+
+    x_mm: Float32Array
+    """Place of each sample's point of the surface, mm, rig frame, shape (H, W)."""
+    y_mm: Float32Array
+    """The same, y up."""
+    relief_um: Float32Array
+    """Height of the relief, um."""
+    bulge_um: Float32Array
+    """Height of what bulges or folds below it, um; 0 in the patch's middle without a fold."""
+    normals: Float32Array
+    """Unit normals of both, rig frame, shape (H, W, 3)."""
+    albedo: Float32Array
+    """Diffuse reflectance."""
+    alpha: Float32Array
+    """GGX roughness."""
+    skin: BoolArray
+    """Skin, neither jaw nor beyond what is known."""
+
+    @property
+    def height_mm(self) -> Float32Array:
+        """Height above the plane in focus, mm."""
+        return np.asarray((self.relief_um + self.bulge_um) * np.float32(1e-3))
+
+    def inner(self, margin: int) -> PatchSurface:
+        """Return the patch without ``margin`` samples on all sides."""
+        part = slice(margin, -margin or None)
+        cut = (
+            np.ascontiguousarray(getattr(self, field.name)[part, part])
+            for field in dataclasses.fields(self)
+        )
+        return PatchSurface(*cut)
+
+
+def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[FloatArray, FloatArray]:
+    """Return x (W s,) and y (H s,) of the camera's samples in the plane z = 0, mm."""
+    pitch = view.distance_mm / view.focal_px
+    places = []
+    for count in (view.width_px, view.height_px):
+        n = (count + 2 * border_px) * subpixels
+        places.append((np.arange(n) - 0.5 * (n - 1)) / subpixels * pitch)
+    return places[0], -places[1]
+
+
+def stand(
+    relief: Relief, grip: Grip, pose: Pose, x_mm: FloatArray, y_mm: FloatArray, *,
+    eye_mm: float, alpha: float,
+) -> PatchSurface:  # fmt: skip
+    """Return what the camera's samples meet.
+
+    Parameters
+    ----------
+    relief
+        The skin in this state, in its own frame.
+    grip
+        The caliper, which moves with the skin.
+    pose
+        Where the skin lies.
+    x_mm, y_mm
+        The samples, as `sample_grid` gives them.
+    eye_mm
+        Distance of the camera, mm.
+    alpha
+        Roughness where the relief states none.
+    """
+    ideal_x, ideal_y = np.meshgrid(x_mm, y_mm)
+    cosine, sine = math.cos(pose.turn_rad), math.sin(pose.turn_rad)
+    x, y = ideal_x, ideal_y
+    # tilts and view angles shrink the step to the surface's point 30-fold: once is enough
+    for last in (False, True):
+        own_x = cosine * (x - pose.x_mm) + sine * (y - pose.y_mm)
+        own_y = cosine * (y - pose.y_mm) - sine * (x - pose.x_mm)
+        found = relief.sample(own_x, own_y)
+        bulge_mm, bulge_x, bulge_y = bulge(grip, own_x, own_y)
+        if not last:
+            nearer = 1.0 - (1e-3 * found.height_um + bulge_mm) / eye_mm
+            x, y = ideal_x * nearer, ideal_y * nearer
+    slope_u, slope_v = found.slope_x + bulge_x, found.slope_y + bulge_y
+    slope_x, slope_y = cosine * slope_u - sine * slope_v, sine * slope_u + cosine * slope_v
+    normals = np.empty((*x.shape, 3), np.float32)
+    length = np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    normals[..., 0], normals[..., 1], normals[..., 2] = (
+        -slope_x / length,
+        -slope_y / length,
+        (1.0 / length),
+    )
+    angle = math.radians(grip.angle_deg)
+    along = math.cos(angle) * own_x + math.sin(angle) * own_y
+    skin = np.asarray(found.inside, bool) & (np.abs(along) < 0.5 * grip.aperture_mm)
+    normals[~skin] = (0.0, 0.0, 1.0)
+    rough = getattr(found, "alpha", None)
+    return PatchSurface(
+        x.astype(np.float32),
+        y.astype(np.float32),
+        np.where(skin, found.height_um, 0.0).astype(np.float32),
+        np.where(skin, 1e3 * bulge_mm, 0.0).astype(np.float32),
+        normals,
+        np.where(skin, found.albedo, JAW_REFLECTANCE).astype(np.float32),
+        np.full(x.shape, alpha, np.float32)
+        if rough is None
+        else np.where(skin, rough, alpha).astype(np.float32),
+        skin,
+    )
+
+
+def bulge(
+    grip: Grip, x_mm: FloatArray, y_mm: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how far skin stands out of its plane in mm, and its slopes in x and y.
+
+    Skin between jaws bulges, the more the less it is stretched; buckled skin has a fold besides,
+    beside the middle. The camera is focused on the middle of the patch.
+    """
+    angle = math.radians(grip.angle_deg)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    along, across = cosine * x_mm + sine * y_mm, cosine * y_mm - sine * x_mm
+    height = np.zeros(np.shape(along))
+    d_along, d_across = np.zeros_like(height), np.zeros_like(height)
+    if grip.attached:
+        half = 0.5 * grip.aperture_mm
+        size = BULGE_MM * math.exp(-BULGE_EXPONENT * (grip.stretch - 1.0))
+        a, da = _hump(along, half)
+        b, db = _hump(across, BULGE_WIDTH_MM)
+        height += size * (a * b - 1.0)
+        d_along += size * da * b
+        d_across += size * a * db
+        if grip.buckled:
+            a, da = _hump(along - 0.2 * half, FOLD_WIDTH * grip.aperture_mm)
+            height += FOLD_MM * a * b
+            d_along += FOLD_MM * da * b
+            d_across += FOLD_MM * a * db
+    return height, cosine * d_along - sine * d_across, sine * d_along + cosine * d_across
+
+
+def _hump(x: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
+    """Return cos^2 that ends at plus and minus ``half``, and its derivative."""
+    phase = np.clip(0.5 * np.pi * x / half, -0.5 * np.pi, 0.5 * np.pi)
+    return np.cos(phase) ** 2, -0.5 * np.pi / half * np.sin(2.0 * phase)

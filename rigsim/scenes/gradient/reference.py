@@ -1,0 +1,301 @@
+"""The gradient rig by other means, to judge `GradientScene` by: traced shadows, and Mitsuba.
+
+Mitsuba knows no film before each of many lights here, so what is compared is the light of both
+analysers together under LEDs without films. The patch is even in pigment and roughness, its LEDs
+are points, and light leaves the skin where it entered.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from rigsim import shading
+from rigsim.as_built.polarizers import Films
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
+from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
+from rigsim.light.lobe_moments import led_moments
+from rigsim.render import Caster, MovedLight, look_at
+from rigsim.scenes.dome.reference import plastic_scale
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
+from rigsim.tissue.skin_layers import ETA
+from rigsim.world.taped_skin import GripState
+
+FloatArray = NDArray[np.float64]
+
+NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
+NO_FILM: Final = Films(1.0 + 1e-9, math.inf, 0.0)
+"""Films that let everything through; the analyser's other half is the other state's."""
+
+ALBEDO: Final = 0.2
+MESH_MARGIN_PX: Final = 64
+LIFT_MM: Final = 1e-4
+"""How far shadow rays begin above the surface; they begin at corners of its triangles."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way to make the pictures."""
+
+    seconds: float
+    """Processor time of all conditions of a state, s."""
+    error: float
+    """Root mean square error over the mean."""
+    mean_ratio: float
+    """Mean over that of the reference."""
+    mean_ratio_stderr: float
+    """Its standard error, from blocks of pixels."""
+
+
+def plain_skin(size_mm: float, *, alpha: float = 0.25, seed: int = 0) -> MicroSkin:
+    """Return a patch of cheek, even in pigment and roughness."""
+    skin = make_micro_skin("cheek", size_mm=size_mm, seed=seed)
+    even = np.ones_like(skin.height_um)
+    return dataclasses.replace(
+        skin, albedo=np.float32(ALBEDO) * even, alpha=np.float32(alpha) * even
+    )
+
+
+def plain_scene(
+    skin: MicroSkin,
+    *,
+    width_px: int,
+    subpixels: int = 2,
+    sectors: int = 32,
+    table_size: int | None = None,
+    shadows: bool = True,
+    interreflections: bool = False,
+) -> GradientScene:
+    """Return the patch under LEDs that are points without films, without lens and spreading."""
+    rig = load_rig("gradient").cropped(width_px)
+    lights = tuple(
+        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
+    )
+    return GradientScene(
+        dataclasses.replace(rig, lights=lights),
+        skin,
+        films=NO_FILM,
+        optics=False,
+        lateral=False,
+        subpixels=subpixels,
+        sectors=sectors,
+        table_size=table_size,
+        shadows=shadows,
+        interreflections=interreflections,
+    )
+
+
+def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
+    """Return the patch as triangles between its samples, mm, with its own normals."""
+    patch = scene.surface(NEUTRAL, subpixels=subpixels, border_px=MESH_MARGIN_PX)
+    rows, columns = patch.skin.shape
+    vertices = np.stack([patch.x_mm, patch.y_mm, patch.height_mm], axis=-1).reshape(-1, 3)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, below, across = corner + 1, corner + columns, corner + columns + 1
+    faces = np.concatenate(
+        [np.stack([corner, below, right], -1), np.stack([right, below, across], -1)]
+    )
+    v, u = np.mgrid[0:rows, 0:columns] / max(rows, columns)
+    uv = np.stack([u, v], axis=-1).reshape(-1, 2)
+    return build_mesh(vertices, faces, uv, patch.normals.reshape(-1, 3))
+
+
+def traced(
+    scene: GradientScene, pixels: NDArray[np.intp], *, subpixels: int = 4
+) -> tuple[FloatArray, FloatArray]:
+    """Sum over LEDs one by one, with a shadow ray to each, in some pixels.
+
+    Parameters
+    ----------
+    scene
+        A plain scene.
+    pixels
+        Flat indices, shape (n,).
+    subpixels
+        Samples along each side of a pixel.
+
+    Returns
+    -------
+    light : ndarray
+        Shape (n, 4): S0 of each moment, in the unit of `GradientScene.stokes`.
+    hidden : ndarray
+        Part of the LEDs' light that is hidden, of moment 1, shape (n,).
+    """
+    view = scene.rig.views[0]
+    patch = scene.surface(NEUTRAL, subpixels=subpixels)
+    row, column = np.divmod(pixels, view.width_px)
+    inside = np.arange(subpixels)
+    rows = (subpixels * row)[:, None, None] + inside[:, None]
+    columns = (subpixels * column)[:, None, None] + inside
+    at = np.broadcast_arrays(rows, columns)
+    points = np.stack([patch.x_mm[*at], patch.y_mm[*at], patch.height_mm[*at]], -1).reshape(-1, 3)
+    normals = patch.normals[*at].reshape(-1, 3)
+    caster = Caster(relief_mesh(scene, subpixels=subpixels))
+    surface = scene.optical_surface(float(np.median(scene.skin.alpha)))
+    eye = np.asarray(surface.eye_mm)
+    to_camera = eye - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    leaves = shading.exit_stokes(normals, to_camera, eta=ETA, image_right=surface.image_right)
+    leaves = leaves[:, 0] * ALBEDO * shading.interior_scale(ETA) / math.pi
+    start = points + LIFT_MM * normals
+    total, lost = np.zeros((len(points), 4)), np.zeros(len(points))
+    flat = np.column_stack([points[:, :2], np.zeros(len(points))])
+    for led, place in enumerate(scene.sphere.position_mm):
+        if place[2] <= 0.0:
+            continue
+        stokes, entry = led_moments(normals, flat, scene.sphere, led, surface)
+        light = stokes[:, 0] + leaves * entry
+        way = place - points
+        length = np.linalg.norm(way, axis=1)
+        lit = np.flatnonzero(light > 0.0)
+        dark = caster.blocked(start[lit], way[lit] / length[lit, None], length[lit])
+        lost[lit] += dark * light[lit]
+        light[lit[dark]] = 0.0
+        total += light[:, None] * scene.sphere.weights[led]
+    shape = (len(pixels), subpixels**2)
+    mean = total.reshape(*shape, 4).mean(axis=1) * scene.unit
+    gone = lost.reshape(shape).mean(axis=1) * scene.unit
+    return mean, gone / (mean[:, 0] + gone)
+
+
+def picture(scene: GradientScene, pixels: NDArray[np.intp]) -> FloatArray:
+    """Return `GradientScene`'s own light in some pixels, as `traced` gives it."""
+    light = scene.stokes(NEUTRAL)[:, 0]
+    return np.asarray(light.reshape(4, -1)[:, pixels].T, np.float64)
+
+
+def describe(
+    scene: GradientScene, pattern: str, *, depth: int = 2, gloss: bool = True
+) -> dict[str, Any]:
+    """Return Mitsuba's scene of the patch under a pattern, at half the skin's strength.
+
+    Its blend averages the two parts of the reflection. Without gloss light from inside is all, at
+    full strength, so that light of many bounces is too; a depth of 2 is direct light.
+    """
+    view = scene.rig.views[0]
+    r_d = ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
+    inside = {
+        "type": "plastic",
+        "int_ior": ETA,
+        "ext_ior": 1.0,
+        "specular_reflectance": 0.0,
+        "diffuse_reflectance": {"type": "rgb", "value": [float(r_d)] * 3},
+    }
+    description: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
+        "sensor": {
+            "type": "perspective",
+            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
+            "fov_axis": "x",
+            "near_clip": 1.0,
+            "far_clip": 1e4,
+            "to_world": look_at(view.position_mm, view.target_mm, view.up),
+            "sampler": {"type": "stratified", "sample_count": 4},
+            "film": {
+                "type": "hdrfilm",
+                "width": view.width_px,
+                "height": view.height_px,
+                "pixel_format": "luminance",
+                "rfilter": {"type": "box"},
+            },
+        },
+        "patch": {
+            "type": "mesh",
+            "mesh": relief_mesh(scene),
+            "bsdf": {
+                "type": "blendbsdf",
+                "weight": 0.5,
+                "inside": inside,
+                # a conductor without absorption reflects as a dielectric does
+                "surface": {
+                    "type": "roughconductor",
+                    "distribution": "ggx",
+                    "alpha": float(np.median(scene.skin.alpha)),
+                    "eta": ETA,
+                    "k": 0.0,
+                },
+            }
+            if gloss
+            else inside,
+        },
+    }
+    shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
+    name = "light"  # the entry that `MovedLight` moves, to where it is
+    for place, power, share in zip(
+        scene.sphere.position_mm, scene.sphere.intensity, shares, strict=True
+    ):
+        if place[2] <= 0.0 or share <= 0.0:
+            continue
+        strength = float(power * share * REFERENCE_MM**2)
+        description[name] = {
+            "type": "point",
+            "position": [float(x) for x in place],
+            "intensity": {"type": "rgb", "value": [strength] * 3},
+        }
+        name = f"led{len(description)}"
+    return description
+
+
+def rendered(
+    scene: GradientScene,
+    pattern: str,
+    *,
+    samples: int,
+    seed: int = 0,
+    depth: int = 2,
+    gloss: bool = True,
+) -> tuple[Float32Array, float]:
+    """Render a pattern by Mitsuba's path tracer.
+
+    Parameters
+    ----------
+    scene
+        A plain scene.
+    pattern
+        A lit pattern.
+    samples, seed
+        Of Mitsuba.
+    depth, gloss
+        See `describe`.
+
+    Returns
+    -------
+    image : ndarray of float32
+        Shape (H, W), in the unit of `traced`.
+    seconds : float
+        Processor time of the second rendering: all is built and compiled before.
+    """
+    description = describe(scene, pattern, depth=depth, gloss=gloss)
+    light_mm = description["light"]["position"]
+    renderer = MovedLight(description, kind="rgb")
+    renderer.radiance(light_mm, samples=samples, seed=seed + 1)
+    begin = time.process_time()
+    image = renderer.radiance(light_mm, samples=samples, seed=seed)
+    spent = time.process_time() - begin
+    strength = 2.0 if gloss else 1.0
+    return np.asarray(strength * scene.unit * image[..., 0], np.float32), spent
+
+
+def judge(found: FloatArray, reference: FloatArray, seconds: float, *, blocks: int = 40) -> Way:
+    """Compare a picture with the reference, both of shape (n,) or (n, k)."""
+    difference = found - reference
+    error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
+    parts = [
+        (a.mean(), b.mean())
+        for a, b in zip(
+            np.array_split(found.reshape(len(found), -1)[:, 0], blocks),
+            np.array_split(reference.reshape(len(reference), -1)[:, 0], blocks),
+            strict=True,
+        )
+    ]
+    ratios = np.array([a / b for a, b in parts])
+    return Way(seconds, error, float(ratios.mean()), float(ratios.std(ddof=1) / math.sqrt(blocks)))

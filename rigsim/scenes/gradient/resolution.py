@@ -1,0 +1,143 @@
+"""What detail the gradient rig resolves: waves of known slope through the whole simulated chain.
+
+Nagano et al. 2015 (doi 10.1145/2766894) state 10 um of detail for 6 um a pixel. A circular pupil at
+the working f-number N' passes no period below N' times the wavelength, here 18 um on the skin in
+green; so 10 um is the pixels' pitch, twice over, but not what the lens resolves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import load_rig
+from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.motion import Pose
+from rigsim.skin_patch.stretch import SurfaceSample
+from rigsim.world.taped_skin import GripState
+
+FloatArray = NDArray[np.float64]
+
+LONG_UM: Final = 240.0
+"""Period of waves without lens and pixels that give the scale of the others."""
+
+FIELD_PX: Final = 96
+NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """Even skin with waves along x; see `rigsim.scenes.gradient.patch.Relief`."""
+
+    period_um: float
+    """Period, um, > 0."""
+    slope: float
+    """Largest slope, dimensionless."""
+    albedo: float = 0.2
+    """Diffuse reflectance."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if not self.period_um > 0.0:
+            raise ValueError(f"period_um: got {self.period_um}, expected > 0")
+
+    def sample(self, x_mm: ArrayLike, y_mm: ArrayLike) -> SurfaceSample:
+        """Return the waves at points, mm."""
+        x = np.asarray(x_mm, np.float64)
+        k = 2.0 * math.pi / self.period_um
+        height = self.slope / k * np.sin(1e3 * k * x)
+        level = np.zeros(x.shape, np.float32)
+        return SurfaceSample(
+            height.astype(np.float32),
+            (self.slope * np.cos(1e3 * k * x)).astype(np.float32),
+            level,
+            np.full(x.shape, self.albedo, np.float32),
+            np.full(x.shape, ALPHA, np.float32),
+            np.ones(x.shape, np.bool_),
+        )
+
+
+ALPHA: Final = 0.25
+"""Roughness of the waves."""
+
+
+class WavyScene(GradientScene):
+    """The rig with waves instead of skin; set `waves`, then call `show`."""
+
+    waves = Waves(LONG_UM, 0.05)
+
+    def show(self, waves: Waves) -> None:
+        """Put other waves into the patch's place."""
+        self.waves = waves
+        self.forget()
+
+    def surface(
+        self, grip: Grip, *, subpixels: int = 1, border_px: int = 0,
+        jump_mm: tuple[float, float] = (0.0, 0.0),
+    ) -> PatchSurface:  # fmt: skip
+        """Return the waves at the camera's samples."""
+        view = self.rig.views[0]
+        x, y = sample_grid(view, subpixels=subpixels, border_px=border_px)
+        pose = Pose(*jump_mm, 0.0)
+        return stand(self.waves, grip, pose, x, y, eye_mm=view.distance_mm, alpha=ALPHA)
+
+
+def wavy_scene(*, optics: bool = True) -> WavyScene:
+    """Return the gradient rig with waves, as drawn, two samples along a pixel's side."""
+    skin = make_micro_skin("cheek", size_mm=0.1)  # gives the pigment that spreads light
+    even = np.full_like(skin.height_um, ALPHA)
+    rig = load_rig("gradient").cropped(FIELD_PX)
+    return WavyScene(rig, dataclasses.replace(skin, alpha=even), optics=optics, subpixels=2)
+
+
+def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> FloatArray:
+    """Return which part of a wave's slope the pictures hold.
+
+    Parameters
+    ----------
+    periods_um
+        Periods of waves along x, um; those below two pixels, 12 um, are aliased.
+    slope
+        Largest slope of each wave.
+
+    Returns
+    -------
+    ndarray
+        Shape (n,): amplitude of the wave in the ratio of the surface reflection's moments x and 1,
+        over its slope, relative to waves of `LONG_UM` without lens and pixels.
+    """
+    scale = _amplitude(wavy_scene(optics=False), Waves(LONG_UM, slope))
+    scene = wavy_scene()
+    return np.array([_amplitude(scene, Waves(float(p), slope)) / scale for p in periods_um])
+
+
+def resolved_period_um(least: float = 0.1) -> float:
+    """Return the period at which a part ``least`` of slopes is left, um, by interpolation."""
+    periods = np.array([60.0, 45.0, 36.0, 30.0, 26.0, 23.0, 21.0, 19.0])
+    left = slope_transfer(periods.tolist())
+    return float(1.0 / np.interp(least, left[::-1], 1.0 / periods[::-1]))
+
+
+def _amplitude(scene: WavyScene, waves: Waves) -> float:
+    scene.show(waves)
+    moments = scene.moments(NEUTRAL)
+    specular = (moments["parallel"] - moments["crossed"]).astype(np.float64)
+    ratio = specular[1] / specular[0]
+    x = scene.surface(NEUTRAL).x_mm[FIELD_PX // 2] * 1e3
+    # whole periods in the middle; the bulge and the view's own tilt are a parabola
+    count = max(int(0.8 * FIELD_PX * 6.0 / waves.period_um), 1)
+    inside = np.abs(x) <= 0.5 * count * waves.period_um
+    phase = 2.0 * math.pi * x[inside] / waves.period_um
+    t = x[inside] / np.abs(x).max()
+    design = np.column_stack([np.cos(phase), np.sin(phase), np.ones_like(t), t, t * t])
+    row = ratio[10:-10].mean(axis=0)[inside]
+    cosine, sine = np.linalg.lstsq(design, row, rcond=None)[0][:2]
+    return float(math.hypot(cosine, sine) / waves.slope)

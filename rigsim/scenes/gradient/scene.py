@@ -1,0 +1,544 @@
+"""The gradient rig: a patch of skin in a caliper, or a target, lit by patterns of polarized LEDs.
+
+Every state of the skin is pictured once, as Stokes vectors of the light's four moments after the
+lens; patterns and positions of the analyser are sums of these twelve images.
+
+The unit of light is fixed by the rig alone: a perfect white diffuser in the patch's place that
+faces the camera gives `METER_RATE_PER_S` full scales per second under all LEDs at level 1, behind
+the parallel analyser as behind the crossed one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Final, Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, RigError
+from model.skin import SkinAppearance
+from rigsim import shading
+from rigsim.as_built.polarizers import Films, films_of
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.lobe_moments import Surface
+from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS
+from rigsim.needs.gradient import OPTICS, gradient_needs
+from rigsim.render.lens_blur import Lens, blur, lens_of
+from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
+from rigsim.scenes.gradient.lighting import Lighting, light_skin
+from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.skin_patch.microrelief import MicroSkin
+from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
+from rigsim.skin_patch.stretch import StretchedSkin, deform
+from rigsim.targets.glass_ball import ball_center_mm, ball_stokes
+from rigsim.tissue.skin_layers import ETA
+
+TargetName: TypeAlias = Literal["ball", "flat", "dark"]
+
+METER_RATE_PER_S: Final = 100.0
+"""Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
+full scale."""
+
+FLAT_REFLECTANCE: Final = 0.3
+"""Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
+
+POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of the LEDs' common energy from pattern to pattern."""
+
+DRIFT_MARGIN_PX: Final = 8
+"""Pixels around the picture that may drift into it."""
+
+KEPT_BYTES: Final = 2**29
+"""Pictures of states that are kept; one at least."""
+
+
+KEPT_LIGHTINGS: Final = 2
+"""Tables of light that are kept: LEDs may change by gains and failures."""
+
+FURROW_SECTORS: Final = 16
+"""Directions in which the sky is looked for, for light from furrow to furrow."""
+
+KEPT_RELIEFS: Final = 4
+"""Stretched patches that are kept."""
+
+
+class Pattern(LitLight, Protocol):
+    """A stretch of light, see `rigsim.boxes.gradient_sphere.PatternLight`."""
+
+    @property
+    def pattern(self) -> str:
+        """One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`."""
+
+    @property
+    def analyser_deg(self) -> float:
+        """Reading of the analyser's rotator, degrees."""
+
+    @property
+    def led_shares(self) -> tuple[float, ...]:
+        """What each LED gave of what the pattern asks of it; empty: all of it."""
+
+
+class GradientScene:
+    """One patch of skin or one target in the gradient rig.
+
+    Parameters
+    ----------
+    rig
+        The drawing.
+    subject
+        A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in the
+        patch's place) or "dark" (a cap on the lens).
+    compensation
+        How stretched skin narrows, see `rigsim.skin_patch.stretch.deform`.
+    films
+        The polarizing films; None takes the rig's own, which its serial numbers decide.
+    sphere
+        The LEDs as they stand; None: as drawn.
+    motion
+        How the patch moves; None holds it still.
+    sensor
+        The camera's sensor; None takes what the rig states.
+    seed
+        Seeds what differs from exposure to exposure.
+    shadows
+        Whether the relief hides LEDs from itself. This and the next three: None decides by how much
+        it changes pixels, see `needs`.
+    lateral
+        Whether light spreads inside the skin.
+    interreflections
+        Whether light goes from furrow to furrow.
+    optics
+        Whether lens and pixels blur; without, every pixel is the mean of its samples.
+    on_s
+        Longest exposure of the plan, s, by which sizes are told; None: such that the brightest
+        skin is at full scale.
+    sectors
+        Directions in which horizons are found, a multiple of 4.
+    subpixels
+        Samples along each side of a pixel.
+    table_size
+        Nodes of the table of moments along each axis of the normals; None chooses by roughness.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: MicroSkin | TargetName,
+        *,
+        compensation: Literal["volume", "none"] | float = "volume",
+        films: Films | None = None,
+        sphere: BuiltSphere | None = None,
+        motion: PatchMotion | None = None,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        shadows: bool | None = None,
+        optics: bool | None = None,
+        lateral: bool | None = None,
+        interreflections: bool | None = None,
+        on_s: float | None = None,
+        sectors: int = 32,
+        subpixels: int = 1,
+        table_size: int | None = None,
+    ) -> None:
+        if len(rig.views) != 1:
+            raise SceneError(f"views: got {len(rig.views)}, expected 1")
+        if isinstance(subject, str) and subject not in ("ball", "flat", "dark"):
+            raise SceneError(f"subject: got {subject!r}, expected ball, flat, dark or skin")
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if sectors < 4 or sectors % 4:
+            raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
+        self.rig, self.subject, self.compensation = rig, subject, compensation
+        self.films = films_of(rig) if films is None else films
+        self.sphere = as_drawn(rig) if sphere is None else sphere
+        self.motion, self.seed = motion, seed
+        self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
+        self._view = rig.views[0]
+        self._sensor = sensor_of(self._view) if sensor is None else sensor
+        self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
+        # behind two ideal films, one of which the unit of radiance holds already
+        white = float(diffuser_radiance(as_drawn(rig), np.zeros(1), np.zeros(1))[0, 0])
+        # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
+        self.unit = METER_RATE_PER_S / (0.5 * white)
+        self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
+        self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
+        self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
+        self.needs: SceneNeeds = gradient_needs(
+            rig,
+            subject,
+            self.sphere,
+            self.lens,
+            noise=Noise.of(self._sensor),
+            white=math.inf if on_s is None else METER_RATE_PER_S * on_s,
+            moving=motion is not None,
+            shadows=shadows,
+            lateral=lateral,
+            interreflections=interreflections,
+            optics=optics,
+        )
+        """What is built, what is not, and why."""
+        self.shadows, self.optics = self.needs.builds(SHADOWS), self.needs.builds(OPTICS)
+        self.lateral = self.needs.builds(LATERAL)
+        self.interreflections = self.needs.builds(BOUNCES)
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
+
+    @property
+    def lens(self) -> Lens:
+        """Return the camera's lens."""
+        return lens_of(self._view, self.rig.lights[0].illuminant)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the camera's sensor."""
+        self._check_view(view_name)
+        return self._sensor
+
+    # pictures -----------------------------------------------------------------------------------
+
+    def stokes(self, grip: Grip | None = None) -> Float32Array:
+        """Return the light on the sensor for each moment, before the analyser.
+
+        Parameters
+        ----------
+        grip
+            What the caliper holds; targets need none.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (4, 3, H, W): moments 1, x, y, z; Stokes parameters in full scales per second at
+            level 1 (behind an analyser half of it comes through, see `moments`); without drift.
+        """
+        h, w = self._view.height_px, self._view.width_px
+        wide = self._picture(grip)
+        border = (wide.shape[1] - h) // 2
+        return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
+
+    def moments(self, grip: Grip | None = None) -> dict[str, Float32Array]:
+        """Return the four moments behind the parallel and the crossed analyser.
+
+        Parameters
+        ----------
+        grip
+            What the caliper holds; targets need none.
+
+        Returns
+        -------
+        dict
+            "parallel" and "crossed": shape (4, H, W), float32, moments 1, x, y, z in full scales
+            per second at level 1, without noise, vignetting and drift.
+        """
+        stokes = self.stokes(grip)
+        return {
+            name: np.stack([self._analysed(s, reading) for s in stokes])
+            for name, reading in (("parallel", 0.0), ("crossed", 90.0))
+        }
+
+    def radiance(
+        self,
+        pattern: str,
+        *,
+        grip: Grip | None = None,
+        analyser_deg: float = 0.0,
+        t_s: float | None = None,
+        led_shares: tuple[float, ...] = (),
+    ) -> Float32Array:
+        """Return the light on the sensor under a pattern, without noise and vignetting.
+
+        Parameters
+        ----------
+        pattern
+            One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`.
+        grip
+            What the caliper holds; targets need none.
+        analyser_deg
+            Reading of the analyser's rotator, degrees.
+        t_s
+            World time, s, which decides drift and jumps; None: neither.
+        led_shares
+            What each LED gives of what the sphere says; empty: all of it.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W), full scales per second at level 1, >= 0.
+        """
+        shape = (self._view.height_px, self._view.width_px)
+        weights = np.array(_weights(pattern), np.float32)
+        if not weights.any():
+            return np.zeros(shape, np.float32)
+        jump, drift = (0.0, 0.0), (0.0, 0.0)
+        if self.motion is not None and t_s is not None and isinstance(self.subject, MicroSkin):
+            jump, drift = self.motion.jump_mm(t_s), self.motion.drift_mm(t_s)
+        wide = self._picture(grip, jump_mm=jump, shares=led_shares)
+        border = (wide.shape[1] - shape[0]) // 2
+        reach = border if any(drift) else 0
+        part = slice(border - reach, wide.shape[1] - border + reach)
+        column = slice(border - reach, wide.shape[2] - border + reach)
+        stokes = np.zeros((3, wide.shape[1] - 2 * (border - reach),
+                           wide.shape[2] - 2 * (border - reach)), np.float32)  # fmt: skip
+        for m in np.flatnonzero(weights):
+            stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
+        image = self._analysed(stokes, analyser_deg, border_px=reach)
+        if reach:
+            pixel_um = self.lens.pixel_on_subject_um
+            image = shifted(image, drift, pixel_um=pixel_um, border_px=reach)
+        # light taken away LED by LED leaves rounding errors where none is left
+        return np.maximum(image, np.float32(0.0))
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Pattern],
+        exposure_s: float,
+        seed: int,
+        grip: Grip | None = None,
+    ) -> NDArray[np.uint16]:
+        """Expose the camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The patterns that shone, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+        grip
+            What the caliper held when it began; skin needs one.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        self._check_view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
+        for pop in pops:
+            energy = full_power_s(pop, f"pattern {pop.pattern!r}")
+            energy *= 1.0 + POWER_DEVIATION * rng.standard_normal()
+            if energy > 0.0 and any(_weights(pop.pattern)):
+                light += np.float32(energy) * self.radiance(
+                    pop.pattern,
+                    grip=grip,
+                    analyser_deg=pop.analyser_deg,
+                    t_s=0.5 * (pop.t_on_s + pop.t_off_s),
+                    led_shares=pop.led_shares,
+                )
+        return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
+
+    def forget(self) -> None:
+        """Drop the pictures that are kept, which the subject's states are made again from."""
+        self._pictures.clear()
+
+    # truth --------------------------------------------------------------------------------------
+
+    def surface(
+        self, grip: Grip, *, subpixels: int = 1, border_px: int = 0,
+        jump_mm: tuple[float, float] = (0.0, 0.0),
+    ) -> PatchSurface:  # fmt: skip
+        """Return what stands at the camera's samples in a state, without drift."""
+        skin = self.skin
+        x, y = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
+        pose = self.pose(grip)
+        moved = Pose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.turn_rad)
+        return stand(
+            self.relief(grip), grip, moved, x, y,
+            eye_mm=self._view.distance_mm, alpha=float(np.median(skin.alpha)),
+        )  # fmt: skip
+
+    def relief(self, grip: Grip) -> StretchedSkin:
+        """Return the skin in a state, in its own frame."""
+        skin = self.skin
+        key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
+        if key not in self._reliefs:
+            while len(self._reliefs) >= KEPT_RELIEFS:
+                self._reliefs.popitem(last=False)
+            self._reliefs[key] = deform(
+                skin, stretch=key[0], angle_deg=key[1], compensation=self.compensation
+            )
+        self._reliefs.move_to_end(key)
+        return self._reliefs[key]
+
+    def pose(self, grip: Grip) -> Pose:
+        """Return where the skin lies in a state, drift and jumps aside."""
+        if self.motion is None:
+            return Pose(0.0, 0.0, 0.0)
+        return self.motion.pose(grip.angle_deg, grip.step)
+
+    def truth_appearance(self, grips: Sequence[Grip]) -> SkinAppearance:
+        """Return the truth of some states at the camera's own pixels.
+
+        See Also
+        --------
+        rigsim.scenes.gradient.truth.appearance : the maps and parameters.
+        """
+        from rigsim.scenes.gradient.truth import appearance
+
+        return appearance(self, grips)
+
+    # inside -------------------------------------------------------------------------------------
+
+    def _check_view(self, name: str | None) -> None:
+        if name is not None:
+            try:
+                self.rig.view(name)
+            except RigError as error:
+                raise SceneError(str(error)) from error
+
+    @property
+    def skin(self) -> MicroSkin:
+        """Return the patch of skin."""
+        if not isinstance(self.subject, MicroSkin):
+            raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
+        return self.subject
+
+    def _analysed(
+        self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
+    ) -> Float32Array:
+        """Apply the analyser to Stokes vectors of shape (3, H, W)."""
+        cos2, sin2 = self._frame(reading_deg, border_px)
+        leak = 1.0 / self.films.analyser_extinction
+        turned = stokes[1] * cos2 + stokes[2] * sin2
+        return np.asarray(
+            np.float32(0.5 * (1.0 + leak)) * stokes[0] + np.float32(0.5 * (1.0 - leak)) * turned
+        )
+
+    def _frame(self, reading_deg: float, border_px: int) -> tuple[Float32Array, Float32Array]:
+        key = (reading_deg, border_px)
+        if key not in self._frames:
+            if len(self._frames) >= 4:
+                self._frames.clear()
+            passes_deg = self.films.passes_deg(self._view, "parallel", reading_deg)
+            x, y = sample_grid(self._view, subpixels=1, border_px=border_px)
+            right, up, _ = self._view.axes
+            to_camera = np.empty((len(y), len(x), 3), np.float32)
+            to_camera[..., 0], to_camera[..., 1] = -x[None, :], -y[:, None]
+            to_camera[..., 2] = self._view.distance_mm
+            to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
+            self._frames[key] = shading.analyser_frame(
+                to_camera, passes_deg=passes_deg, image_right=right, image_up=up
+            )
+        return self._frames[key]
+
+    def _picture(
+        self,
+        grip: Grip | None,
+        *,
+        jump_mm: tuple[float, float] = (0.0, 0.0),
+        shares: tuple[float, ...] = (),
+    ) -> Float32Array:
+        """Return the twelve images with a border, shape (12, H + 2 b, W + 2 b)."""
+        if all(share == 1.0 for share in shares):
+            shares = ()
+        if isinstance(self.subject, MicroSkin):
+            if grip is None:
+                raise SceneError("grip: got none, expected what the caliper holds")
+            held = (grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch)
+            key: tuple[object, ...] = (*held, grip.attached, grip.buckled, *jump_mm, shares)
+        else:
+            key = (self.subject, shares)
+        if key not in self._pictures:
+            if isinstance(self.subject, MicroSkin) and grip is not None:
+                picture = self._render(grip, jump_mm, shares)
+            else:
+                picture = self._target(shares)
+            picture *= np.float32(self.unit)
+            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_BYTES:
+                self._pictures.popitem(last=False)
+            self._pictures[key] = picture
+        self._pictures.move_to_end(key)
+        return self._pictures[key]
+
+    def _render(
+        self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
+    ) -> Float32Array:
+        s = self.subpixels
+        margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
+        wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
+        patch = wide.inner(s * margin)
+        raw = self.lighting(shares).stokes(
+            patch,
+            wide.relief_um + wide.bulge_um,
+            margin=s * margin,
+            pitch_um=self.lens.pixel_on_subject_um / s,
+        )
+        if self.optics:
+            return blur(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
+        k, h, w = raw.shape
+        return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
+
+    def lighting(self, shares: tuple[float, ...] = ()) -> Lighting:
+        """Return what the light does to this skin in any state.
+
+        Parameters
+        ----------
+        shares
+            What each LED gives of what the sphere says; empty: all of it.
+        """
+        if shares not in self._lighting:
+            while len(self._lighting) >= KEPT_LIGHTINGS:
+                self._lighting.popitem(last=False)
+            self._lighting[shares] = light_skin(
+                self.skin,
+                self._lit(shares),
+                self.optical_surface(float(np.median(self.skin.alpha))),
+                half_field_mm=0.5 * max(self._view.field_mm) + 0.1,
+                sectors=self.sectors if self.shadows else 0,
+                table_size=self.table_size,
+                lateral=self.lateral,
+                furrow_sectors=FURROW_SECTORS if self.interreflections else 0,
+            )
+        self._lighting.move_to_end(shares)
+        return self._lighting[shares]
+
+    def _lit(self, shares: tuple[float, ...]) -> BuiltSphere:
+        if not shares:
+            return self.sphere
+        if len(shares) != len(self.sphere.intensity) or min(shares) < 0.0:
+            raise SceneError(f"led_shares: got {len(shares)} numbers, expected one >= 0 per LED")
+        return dataclasses.replace(self.sphere, intensity=self.sphere.intensity * np.array(shares))
+
+    def optical_surface(self, alpha: float) -> Surface:
+        """Return how a surface of a roughness reflects, and who looks at it."""
+        return Surface(
+            alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
+        )
+
+    def _target(self, shares: tuple[float, ...]) -> Float32Array:
+        sphere = self._lit(shares)
+        if self.subject == "ball":
+            raw = ball_stokes(
+                self._view,
+                sphere,
+                extinction=self.films.light_extinction,
+                center_mm=ball_center_mm(self.seed),
+            )
+            return blur(raw, self.lens, averaged=True) if self.optics else raw
+        out = np.zeros((12, self._view.height_px, self._view.width_px), np.float32)
+        if self.subject == "flat":
+            x, y = sample_grid(self._view, subpixels=1, border_px=0)
+            out[::3] = FLAT_REFLECTANCE * diffuser_radiance(
+                sphere, x[None, :], y[:, None], extinction=self.films.light_extinction
+            )
+        return out
+
+
+def _weights(pattern: str) -> tuple[float, float, float, float]:
+    if pattern not in PATTERN_WEIGHTS:
+        raise SceneError(f"pattern: got {pattern!r}, expected one of {', '.join(PATTERN_WEIGHTS)}")
+    return PATTERN_WEIGHTS[pattern]

@@ -1,0 +1,202 @@
+"""What estimators of the gradient rig should find: maps of each state on the camera's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import UNITS, SkinAppearance, SkinMap
+from rigsim import shading
+from rigsim.as_built.sphere import BuiltSphere
+from rigsim.geometry.mesh import Float32Array
+from rigsim.light.lobe_moments import Surface, led_moments
+from rigsim.render.lens_blur import blur
+from rigsim.scenes.gradient.patch import Grip, PatchSurface
+
+if TYPE_CHECKING:
+    from rigsim.scenes.gradient.scene import GradientScene
+
+FloatArray = NDArray[np.float64]
+
+
+def state_name(angle_deg: float, step: int) -> str:
+    """Return the name of a state of the caliper.
+
+    Examples
+    --------
+    >>> state_name(45.0, -2), state_name(0.0, 0), state_name(135.0, 3)
+    ('a045_m2', 'a000_n0', 'a135_p3')
+    """
+    sign = "n" if step == 0 else "m" if step < 0 else "p"
+    return f"a{round(angle_deg):03d}_{sign}{abs(step)}"
+
+
+def appearance(scene: GradientScene, grips: Sequence[Grip]) -> SkinAppearance:
+    """Return the truth of some states.
+
+    Parameters
+    ----------
+    scene
+        A patch of skin.
+    grips
+        The states; the first with step 0 is the neutral one that the others are told against.
+
+    Returns
+    -------
+    SkinAppearance
+        Maps of each state's pixel middles, without drift: ``height_<state>``, the relief alone in
+        um; ``bulged_height_<state>`` with what bulges or folds below it; ``normals_<state>``, of
+        both; ``normals_seen_<state>``, their slopes averaged as lens and pixels average light;
+        ``albedo_<state>``. The neutral state's are also ``height`` and ``normals``. Valid on skin.
+        ``parameters``: ``states``, ``lights``, ``lens``.
+
+    Raises
+    ------
+    ValueError
+        None of the states is neutral.
+    """
+    neutral = next((grip for grip in grips if grip.step == 0), None)
+    if neutral is None:
+        raise ValueError("grips: got no state with step 0, expected the neutral one")
+    maps: dict[str, SkinMap] = {}
+    states = []
+    names = set()
+    first = _placement(scene, neutral)
+    for grip in grips:
+        name = state_name(grip.angle_deg, grip.step)
+        if name in names:
+            continue
+        names.add(name)
+        patch = scene.surface(grip)
+        for kind, skin_map in _maps(scene, patch).items():
+            maps[f"{kind}_{name}"] = skin_map
+            if grip is neutral and kind in ("height", "normals"):
+                maps[kind] = skin_map
+        relief, pose = scene.relief(grip), scene.pose(grip)
+        states.append(
+            {
+                "name": name,
+                "angle_deg": grip.angle_deg,
+                "step": grip.step,
+                "aperture_mm": grip.aperture_mm,
+                "stretch_s": relief.stretch_s,
+                "stretch_t": relief.stretch_t,
+                "gradient": (_placement(scene, grip) @ np.linalg.inv(first)).tolist(),
+                "shift_mm": [pose.x_mm, pose.y_mm],
+                "rotation_rad": pose.turn_rad,
+                "membrane_strain": relief.membrane_strain,
+                "attached": grip.attached,
+                "buckled": grip.buckled,
+            }
+        )
+    lens = scene.lens
+    skin = scene.skin
+    rough = float(np.median(skin.alpha))
+    parameters: dict[str, object] = {
+        "states": states,
+        "site": skin.site,
+        "preset": skin.preset,
+        "subject_seed": skin.seed,
+        "alpha": rough,
+        "lights": lights(scene.sphere, scene.optical_surface(rough)),
+        "lens": {
+            "working_f_number": lens.working_f_number,
+            "pixel_um": lens.pixel_on_subject_um,
+            "cutoff_period_um": lens.cutoff_period_um,
+            "mean_wavelength_nm": lens.mean_wavelength_nm,
+        },
+        "analyser_zero_deg": scene.films.analyser_zero_deg,
+        "drift_um": 0.0 if scene.motion is None else scene.motion.drift_um,
+    }
+    return SkinAppearance(
+        maps,
+        "simulated",
+        parameters=parameters,
+        left_out=tuple(scene.left_out),
+        seed=scene.seed,
+    )
+
+
+def _placement(scene: GradientScene, grip: Grip) -> FloatArray:
+    """Return the gradient of the map from relaxed skin to the rig, turn included, (2, 2)."""
+    turn = scene.pose(grip).turn_rad
+    c, s = np.cos(turn), np.sin(turn)
+    return np.asarray(np.array([[c, -s], [s, c]]) @ np.asarray(scene.relief(grip).gradient))
+
+
+def _maps(scene: GradientScene, patch: PatchSurface) -> dict[str, SkinMap]:
+    skin = patch.skin
+
+    def one(values: Float32Array, unit: str, text: str) -> SkinMap:
+        return SkinMap(values, unit, valid=skin, description=text)
+
+    slopes = -patch.normals[..., :2] / patch.normals[..., 2:]
+    seen = blur(np.moveaxis(slopes, -1, 0), scene.lens, depth_mm=patch.height_mm)
+    normals = np.stack([-seen[0], -seen[1], np.ones_like(seen[0])], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return {
+        "height": one(patch.relief_um, "um", "relief without bulge and fold, points"),
+        "bulged_height": one(patch.relief_um + patch.bulge_um, "um", "with bulge and fold"),
+        "normals": one(patch.normals, UNITS["normals"], "rig frame, with bulge and fold, points"),
+        "normals_seen": one(normals, "1", "slopes averaged as the lens and the pixels do"),
+        "albedo": one(patch.albedo, "1", "diffuse reflectance in the camera's band"),
+    }
+
+
+def lights(sphere: BuiltSphere, surface: Surface) -> list[dict[str, object]]:
+    """Return the LEDs' truth, to judge their calibration by.
+
+    Parameters
+    ----------
+    sphere
+        As it stands.
+    surface
+        The reflection; its roughness does not matter, as facets that mirror the LED are looked at.
+
+    Returns
+    -------
+    list of dict
+        In the order of the rig: ``name``; ``direction``, unit, from the origin; ``intensity``, the
+        irradiance at the origin over its mean over all LEDs; ``leakage``, what an ideal analyser
+        lets pass at reading 90 over that at 0, of a mirroring facet, with the camera above; NaN is
+        given as None where no facet mirrors the LED.
+    """
+    place = sphere.position_mm
+    distance = np.linalg.norm(place, axis=1)
+    power = sphere.intensity / distance**2
+    power = power / power.mean()
+    eye = np.array(surface.eye_mm) / np.linalg.norm(surface.eye_mm)
+    out: list[dict[str, object]] = []
+    for led, light in enumerate(sphere.nominal.lights):
+        direction = place[led] / distance[led]
+        facet = direction + eye
+        leakage = None
+        if np.linalg.norm(facet) > 1e-3 and sphere.intensity[led] > 0.0:
+            facet /= np.linalg.norm(facet)
+            stokes, _ = led_moments(facet[None], np.zeros((1, 3)), sphere, led, surface)
+            through = _through(stokes, eye, surface)
+            leakage = float(through[1] / through[0])
+        out.append(
+            {
+                "name": light.name,
+                "direction": direction.tolist(),
+                "intensity": float(power[led]),
+                "leakage": leakage,
+            }
+        )
+    return out
+
+
+def _through(stokes: Float32Array, eye: FloatArray, surface: Surface) -> tuple[float, float]:
+    right = np.array(surface.image_right)
+    up = np.cross(eye, right)
+    parallel, crossed = (
+        float(
+            shading.analyse(stokes, eye[None], passes_deg=angle, image_right=right, image_up=up)[0]
+        )
+        for angle in (90.0, 180.0)
+    )
+    return parallel, crossed

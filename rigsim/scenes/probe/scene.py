@@ -1,0 +1,280 @@
+"""The fibre probe: light from the source fibre through tissue, and the fibres' other ends.
+
+The unit of light is fixed by the rig alone: fibres of nominal transmission on tissue of R_f = 2
+per mm^2 give 0.8 of full scale in the middle of an even spot, in the strongest channel, in the
+shortest of the usual exposures at full level. The channels' ratio is that of a white under the
+source's LED.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig
+from model import spectra
+from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
+from rigsim.fiber.probe_profile import Profile, Profiles
+from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
+from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.probe import probe_needs
+from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.world.suction import HeadState
+
+if TYPE_CHECKING:
+    from model.skin import SkinAppearance
+    from rigsim.scenes.probe.truth import Probing
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
+"""Full scales per second in a spot's middle per R_f in 1/mm^2."""
+
+DARK_E_PER_S: Final = 0.3
+"""Dark current at `DARK_C`, electrons per second and pixel."""
+DARK_C: Final = 5.0
+DARK_DOUBLES_K: Final = 6.5
+"""Warming that doubles the dark current, kelvin; typical of silicon near room temperature."""
+
+HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
+"""Share of hot pixels, and the mean of their further dark current at `DARK_C`."""
+
+ROOM_R_F_PER_MM2: Final = 1e-3
+"""What the room's light on a head in the air is worth in reflectance at full level."""
+
+LONGEST_S: Final = 30.0
+"""The longest of the usual exposures, s."""
+
+CAP: Final = "cap"
+"""Site at which the head's fibres look into the dark."""
+
+VIGNETTING: Final = 0.1
+PHOTONS: Final = 200_000
+"""Photons for each site and angle."""
+
+
+class Light(LitLight, Protocol):
+    """A stretch of light, see `rigsim.boxes.source_shutter.SourceLight`."""
+
+    @property
+    def fibre(self) -> int | None:
+        """Number of the only detection fibre that is not covered; None: none is covered."""
+
+
+class ProbeScene:
+    """One subject, or a phantom, under the probe.
+
+    Parameters
+    ----------
+    rig
+        The drawing.
+    tissue
+        What the probe sits on.
+    build
+        The probe as built; None: drawn by the camera's serial number and `seed` 0, so that
+        sessions of one probe share it.
+    sensor
+        The camera's sensor at `DARK_C`; None takes what the rig states.
+    seed
+        Seeds the photons and what differs from exposure to exposure.
+    photons
+        Photons for each site and angle.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        tissue: ProbedTissue,
+        *,
+        build: ProbeBuild | None = None,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        photons: int = PHOTONS,
+    ) -> None:
+        if rig.probe is None or len(rig.views) != 1:
+            raise SceneError(f"rig {rig.name!r}: expected a contact probe and one view")
+        self.rig, self.tissue, self.seed = rig, tissue, seed
+        self.build = build_probe(rig, seed=0) if build is None else build
+        if len(self.build.gain) != len(rig.probe.fibres):
+            raise SceneError(
+                f"build: got {len(self.build.gain)} fibres, expected {len(rig.probe.fibres)}"
+            )
+        self._view = rig.views[0]
+        dark = {"dark_e_per_s": DARK_E_PER_S, "vignetting": VIGNETTING}
+        self._sensor = sensor_of(self._view, **dark) if sensor is None else sensor
+        self.profiles = Profiles(rig, tissue, photons=photons, seed=seed)
+        self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
+        images = unit_images(self.build, self._view)
+        self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
+        self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
+        """What hot pixels add to the dark current at `DARK_C`, electrons/s, shape (H, W)."""
+        full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
+        self.needs: SceneNeeds = probe_needs(
+            rig,
+            tissue,
+            self.build,
+            noise=Noise.of(self._sensor),
+            hot=float(self.hot_e_per_s.max()) * LONGEST_S / full_e,
+        )
+        """What is built, what is not, and why."""
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
+
+    def sensor(self, view_name: str | None = None, *, camera_c: float = DARK_C) -> Sensor:
+        """Return the camera's sensor at a temperature in degrees Celsius."""
+        self._check_view(view_name)
+        dark = self._sensor.dark_e_per_s * _warmth(camera_c)
+        return dataclasses.replace(self._sensor, dark_e_per_s=dark)
+
+    # light --------------------------------------------------------------------------------------
+
+    def profile(self, head: HeadState) -> Profile | None:
+        """Return what the fibres would take at full level; None where they touch nothing.
+
+        Raises
+        ------
+        SceneError
+            The tissue has no such site.
+        """
+        if not head.placed or head.site in ("", CAP):
+            return None
+        try:
+            return self.profiles.profile(head.site, head.angle_deg, head.suction_mbar)
+        except TissueError as error:
+            raise SceneError(str(error)) from error
+
+    def fibre_light(self, head: HeadState, *, fibre: int | None = None) -> FloatArray:
+        """Return `through_fibres` of what the head touches; nothing where it is in the air."""
+        profile = self.profile(head)
+        if profile is None:
+            return np.zeros((len(self.build.gain), 3))
+        return self.through_fibres(profile.reflectance_per_mm2, fibre=fibre)
+
+    def through_fibres(
+        self, reflectance_per_mm2: FloatArray, *, fibre: int | None = None
+    ) -> FloatArray:
+        """Return the light that comes out of the fibres, in full scales per second at level 1.
+
+        Parameters
+        ----------
+        reflectance_per_mm2
+            R_f in 1/mm^2, shape (F, 3).
+        fibre
+            The only detection fibre that is not covered; None: none is covered.
+
+        Returns
+        -------
+        ndarray
+            Shape (F, 3), camera RGB in the middle of an even nominal spot, with gains and
+            cross-talk.
+
+        Raises
+        ------
+        SceneError
+            There is no such fibre.
+        """
+        count = len(self.build.gain)
+        open_share = np.ones(count)
+        if fibre is not None:
+            if not 0 <= fibre < count:
+                raise SceneError(f"fibre: got {fibre}, expected 0 to {count - 1}")
+            open_share[:] = self.build.cover_leak
+            open_share[fibre] = 1.0
+        taken = (open_share * self.build.gain)[:, None] * reflectance_per_mm2
+        return np.asarray(METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
+
+    def image(self, fibre_light: FloatArray) -> Float32Array:
+        """Return the light on the sensor, shape (H, W, 3), of what comes out of the fibres."""
+        height, width = self._view.height_px, self._view.width_px
+        light = self._images @ np.asarray(fibre_light, np.float32)
+        return np.asarray(light.reshape(height, width, 3))
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Light],
+        exposure_s: float,
+        seed: int,
+        head: HeadState,
+    ) -> NDArray[np.uint16]:
+        """Expose the camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The source's light, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+        head
+            What the head touched when it began.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+
+        Raises
+        ------
+        SceneError
+            Unknown view, site or fibre; light with a wrong level or end.
+        """
+        self._check_view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        total = np.zeros((len(self.build.gain), 3))
+        for pop in pops:
+            energy = full_power_s(pop, "the source")
+            energy *= 1.0 + self.build.ripple * float(rng.standard_normal())
+            total += max(energy, 0.0) * self.fibre_light(head, fibre=pop.fibre)
+        if (not head.placed and head.site != CAP) or not head.site:
+            room = np.full((len(self.build.gain), 3), ROOM_R_F_PER_MM2)
+            total += exposure_s * self.through_fibres(room)
+        light = self.image(total)
+        sensor = self.sensor(camera_c=head.camera_c)
+        full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
+        hot = self.hot_e_per_s * np.float32(exposure_s * _warmth(head.camera_c) / full_e)
+        light += hot[..., None]
+        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+
+    def truth_appearance(self, probings: Sequence[Probing]) -> SkinAppearance:
+        """Return the truth of some placements of the head.
+
+        See Also
+        --------
+        rigsim.scenes.probe.truth.appearance : the parameters.
+        """
+        from rigsim.scenes.probe.truth import appearance
+
+        return appearance(self, probings)
+
+    # inside -------------------------------------------------------------------------------------
+
+    def _check_view(self, name: str | None) -> None:
+        if name is not None and name != self._view.name:
+            raise SceneError(f"view: got {name!r}, expected {self._view.name!r}")
+
+
+def _warmth(camera_c: float) -> float:
+    """Return the dark current relative to that at `DARK_C`."""
+    return math.pow(2.0, (camera_c - DARK_C) / DARK_DOUBLES_K)
+
+
+def _hot_pixels(sensor: Sensor, shape: tuple[int, ...]) -> Float32Array:
+    """Return the further dark current of hot pixels at `DARK_C`, electrons per second."""
+    rng = np.random.default_rng([0x686F74, *sensor.serial.encode()])
+    hot = rng.random(shape) < HOT_SHARE
+    return np.where(hot, rng.exponential(HOT_E_PER_S, shape), 0.0).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Skin patches: microrelief, stretch and motion."""

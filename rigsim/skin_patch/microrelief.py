@@ -1,0 +1,334 @@
+"""A patch of facial skin at ten micrometres: furrows, pores, plateaus, cells, pigment, layer.
+
+Everything is a function of the position and the seed, so a larger patch of the same seed contains
+the smaller one at its centre. Vellus hair is left out.
+
+Figures. Primary furrows are 20 to 100 um deep, secondary ones 5 to 40 um (Pierard, Uhoda,
+Pierard-Franchimont 2003, doi:10.1111/j.1473-2130.2003.00012.x). The horny layer is 16.8 um thick on
+the cheek (Egawa, Hirao, Takahashi 2007, doi:10.2340/00015555-0183), thinner when counted in layers.
+Indented upright, horny layer and epidermis have 1 to 2 MPa alike (Geerligs et al. 2011,
+doi:10.1016/j.jbiomech.2011.01.015), so a layer is only a few times stiffer than what bears it
+as long as it is moist; dry ones are an order stiffer (Yuan and Verma 2006,
+doi:10.1016/j.colsurfb.2005.12.013). Relief governs how skin folds at such moderate ratios
+(Leyva-Mendivil et al. 2018, doi:10.1039/c7sm01969f). What distinguishes the three sites, and every
+number without a citation, is this project's choice, within those figures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from rigsim.geometry.polygon_net import polygon_net
+from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
+from rigsim.subject.pigment import MELANIN_LIMIT, MELANIN_PRESETS
+from rigsim.tissue.skin_layers import MAX_C_HD
+from rigsim.tissue.skin_table import SkinTable
+
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+SiteName = Literal["forehead", "cheek", "chin"]
+SITES: Final = get_args(SiteName)
+"""Names of the sites."""
+
+TEXEL_RANGE_UM: Final = (2.0, 40.0)
+SIZE_RANGE_MM: Final = (0.1, 40.0)
+MAX_TEXELS: Final = 4096
+BAND_NM: Final = (450.0, 650.0)
+"""What a monochrome camera sees of white LEDs, as one equally weighted band; this project's
+choice."""
+
+
+class MicroSkinError(ValueError):
+    """A patch is asked for that cannot be made, or that contradicts itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    spacing_mm: float
+    depth_um: float
+    width_mm: float
+    elongation: float
+    direction_deg: float
+    jitter: float
+    second_um: float
+    fine_um: float
+    dome_um: float
+    cells_um: float
+    pores: float
+    pore_um: float
+    layer_um: float
+    thin: float
+    stiffness_ratio: float
+    poisson: float
+    alpha: float
+
+
+_SITES: Final[dict[str, _Site]] = {
+    # Long furrows across the brow: elongated polygons, along x.
+    "forehead": _Site(0.42, 44.0, 0.095, 1.7, 4.0, 0.75, 13.0, 3.5, 7.0, 0.8, 0.20, 28.0,
+                      6.5, 0.60, 2.0, 0.20, 0.22),
+    # An even, finer net with many pores.
+    "cheek": _Site(0.34, 30.0, 0.080, 1.15, 65.0, 0.9, 10.0, 3.0, 5.0, 0.7, 0.45, 34.0,
+                   6.0, 0.65, 2.0, 0.20, 0.26),
+    # Coarse, deep and irregular.
+    "chin": _Site(0.55, 56.0, 0.125, 1.3, -35.0, 1.0, 17.0, 4.5, 9.0, 1.0, 0.60, 40.0,
+                  7.0, 0.70, 2.0, 0.20, 0.24),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MicroSkin:
+    """A patch in its neutral state; maps are (N, N), row 0 is +y, N even, centre at the origin."""
+
+    site: str
+    """One of `SITES`."""
+    seed: int
+    preset: str
+    """Melanin, one of `rigsim.subject.pigment.MELANIN_PRESETS`."""
+    texel_um: float
+    """Distance of texels, um."""
+    height_um: Float32Array
+    """Height of the neutral surface, um, mean 0 over large areas, pits are negative."""
+    albedo: Float32Array
+    """Diffuse reflectance in `BAND_NM`, 0 to 1."""
+    alpha: Float32Array
+    """GGX roughness of facets below 10 um, 0.1 to 0.5."""
+    layer_um: Float32Array
+    """Thickness of the stiff layer, um, > 0; thinner in furrows."""
+    stiffness_ratio: float
+    """Modulus of the layer over that of the tissue that bears it, > 0."""
+    poisson: float
+    """Poisson's number of the tissue that bears it, 0 to 0.5. Below 0.5 fluid leaves or enters it
+    while it is held, so that it thickens less than a fixed volume would."""
+    melanin: float | None = None
+    """Volume fraction of melanosomes; None: the preset's."""
+
+    def __post_init__(self) -> None:
+        shape = self.height_um.shape
+        if len(shape) != 2 or shape[0] != shape[1] or shape[0] % 2 or shape[0] < 8:
+            raise MicroSkinError(f"height_um: got shape {shape}, expected (N, N), N even, >= 8")
+        for name in ("height_um", "albedo", "alpha", "layer_um"):
+            values = getattr(self, name)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise MicroSkinError(f"{name}: expected finite values of shape {shape}")
+        if not TEXEL_RANGE_UM[0] <= self.texel_um <= TEXEL_RANGE_UM[1]:
+            raise MicroSkinError(f"texel_um: got {self.texel_um}, expected {TEXEL_RANGE_UM}")
+        if self.layer_um.min() <= 0.0:
+            raise MicroSkinError(f"layer_um: got {self.layer_um.min()}, expected > 0")
+        if not 1e-3 <= self.stiffness_ratio <= 1e4:
+            raise MicroSkinError(
+                f"stiffness_ratio: got {self.stiffness_ratio}, expected 0.001 to 10000"
+            )
+        if not 0.0 <= self.poisson <= 0.5:
+            raise MicroSkinError(f"poisson: got {self.poisson}, expected 0 to 0.5")
+
+    @property
+    def size_mm(self) -> float:
+        """Side of the patch, mm."""
+        return self.height_um.shape[0] * self.texel_um * 1e-3
+
+    @property
+    def melanin_fraction(self) -> float:
+        """Volume fraction of melanosomes around which the patch varies."""
+        return MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
+
+
+def make_micro_skin(
+    site: SiteName | str,
+    *,
+    seed: int = 0,
+    size_mm: float,
+    texel_um: float = 10.0,
+    preset: str = "III",
+    melanin: float | None = None,
+) -> MicroSkin:
+    """Draw a patch of skin.
+
+    Parameters
+    ----------
+    site
+        "forehead", "cheek" or "chin".
+    seed
+        Seed of every pattern, >= 0.
+    size_mm
+        Side of the patch, 0.1 to 40 mm, rounded up to an even number of texels. How much a field
+        of view needs tells `rigsim.skin_patch.stretch.size_for`.
+    texel_um
+        Distance of texels, 2 to 40 um; detail finer than two texels is left out.
+    preset
+        How dark the skin is, one of `rigsim.subject.pigment.MELANIN_PRESETS`.
+    melanin
+        Volume fraction of melanosomes instead of the preset's, 0.005 to 0.45.
+
+    Returns
+    -------
+    MicroSkin
+
+    Raises
+    ------
+    MicroSkinError
+        An argument is outside its range.
+
+    Examples
+    --------
+    >>> skin = make_micro_skin("cheek", seed=3, size_mm=0.5)
+    >>> skin.height_um.shape, bool(skin.height_um.min() < 0.0)
+    ((50, 50), True)
+    """
+    if site not in _SITES:
+        raise MicroSkinError(f"site: got {site!r}, expected one of {', '.join(SITES)}")
+    if preset not in MELANIN_PRESETS:
+        raise MicroSkinError(
+            f"preset: got {preset!r}, expected one of {', '.join(MELANIN_PRESETS)}"
+        )
+    fraction = MELANIN_PRESETS[preset] if melanin is None else melanin
+    if not min(MELANIN_PRESETS.values()) <= fraction <= max(MELANIN_PRESETS.values()):
+        raise MicroSkinError(f"melanin: got {melanin}, expected 0.005 to 0.45")
+    if seed < 0:
+        raise MicroSkinError(f"seed: got {seed}, expected >= 0")
+    if not TEXEL_RANGE_UM[0] <= texel_um <= TEXEL_RANGE_UM[1]:
+        raise MicroSkinError(f"texel_um: got {texel_um}, expected {TEXEL_RANGE_UM}")
+    if not SIZE_RANGE_MM[0] <= size_mm <= SIZE_RANGE_MM[1]:
+        raise MicroSkinError(f"size_mm: got {size_mm}, expected {SIZE_RANGE_MM}")
+    count = max(8, 2 * math.ceil(size_mm * 500.0 / texel_um - 1e-9))
+    if count > MAX_TEXELS:
+        raise MicroSkinError(f"size_mm: got {count} texels a side, expected <= {MAX_TEXELS}")
+    where = _SITES[site]
+    places = (np.arange(count) - 0.5 * (count - 1)) * texel_um * 1e-3
+    points = np.zeros((count, count, 3), np.float32)
+    points[..., 0], points[..., 1] = places[None, :], places[::-1, None]
+    own = len(SITES) * seed + SITES.index(site)
+    height, furrow = _relief(where, points, texel_um * 1e-3, own)
+    return MicroSkin(
+        site=site,
+        seed=seed,
+        preset=preset,
+        texel_um=texel_um,
+        height_um=height,
+        albedo=_albedo(points, furrow, fraction, own),
+        alpha=_alpha(where, points, own),
+        layer_um=np.asarray(where.layer_um * (1.0 - (1.0 - where.thin) * furrow), np.float32),
+        stiffness_ratio=where.stiffness_ratio,
+        poisson=where.poisson,
+        melanin=melanin,
+    )
+
+
+def _relief(
+    where: _Site, points: Float32Array, texel_mm: float, seed: int
+) -> tuple[Float32Array, Float32Array]:
+    """Return height in um and how much each texel lies in a furrow, 0 to 1."""
+    salt = 1000 * seed
+    angle = math.radians(where.direction_deg)
+    cell = where.spacing_mm
+    # Lines wander: positions are moved by smooth noise before the nets are drawn.
+    x = points[..., 0] + 0.06 * cell * smooth_noise(points, (1.3 * cell, 0.45 * cell), seed=salt)
+    y = points[..., 1] + 0.06 * cell * smooth_noise(
+        points, (1.3 * cell, 0.45 * cell), seed=salt + 1
+    )
+    along = math.cos(angle) * x + math.sin(angle) * y
+    across = -math.sin(angle) * x + math.cos(angle) * y
+
+    def net(scale: float, turn: int) -> tuple[Float32Array, Float32Array]:
+        distance, number = polygon_net(
+            along / (where.elongation * scale * cell),
+            across / (scale * cell),
+            jitter=where.jitter,
+            seed=salt + turn,
+        )
+        return np.asarray(distance * scale * cell, np.float32), number
+
+    def furrow_of(distance: Float32Array, width_mm: float) -> Float32Array:
+        # Rounded at the bottom, then like the flank of a fold.
+        round_mm = 0.35 * width_mm
+        return np.asarray(
+            np.exp(-(np.sqrt(distance**2 + round_mm**2) - round_mm) / (0.5 * width_mm)),
+            np.float32,
+        )
+
+    first, _ = net(1.0, 2)
+    second, level = net(0.47, 3)
+    third, _ = net(0.24, 4)
+    vary = 1.0 + 0.25 * smooth_noise(points, (1.7 * cell,), seed=salt + 5)
+    vary_second = np.clip(0.9 + 0.5 * smooth_noise(points, (1.1 * cell,), seed=salt + 6), 0.0, None)
+    deep = furrow_of(first, where.width_mm)
+    shallow = furrow_of(second, 0.6 * where.width_mm)
+    fine = furrow_of(third, 0.4 * where.width_mm)
+    height = -where.depth_um * vary * deep
+    height -= where.second_um * vary_second * shallow * (1.0 - 0.6 * deep)
+    if 0.4 * where.width_mm > 1.5 * texel_mm:
+        height -= where.fine_um * fine * (1.0 - 0.6 * deep)
+    # Plateaus: every small polygon at its own level, bulging towards its middle.
+    height += where.dome_um * (level - 0.5) * (1.0 - shallow)
+    height += 2.0 * where.dome_um * np.minimum(first / cell, 0.5)
+    pores = scattered_spots(
+        points,
+        np.full(points.shape[:-1], where.pores, np.float32),
+        cell_mm=1.0,
+        radius_mm=(0.05, 0.13),
+        seed=salt + 7,
+        softness=3.0,
+        smallest_mm=0.8 * texel_mm,
+    )
+    height -= where.pore_um * pores
+    # Corneocytes, 35 um across, some lifted; then grain down to the texel.
+    if texel_mm <= 0.0175:
+        edge, lifted = polygon_net(
+            points[..., 0].astype(np.float64) / 0.035,
+            points[..., 1].astype(np.float64) / 0.035,
+            jitter=0.9,
+            seed=salt + 8,
+        )
+        height += where.cells_um * (2.0 * lifted - 1.0) * np.minimum(edge / 0.25, 1.0)
+    grain = tuple(size for size in (0.11, 0.055, 0.03) if size >= 2.0 * texel_mm)
+    if grain:
+        height += 1.4 * where.cells_um * smooth_noise(points, grain, seed=salt + 9)
+    thin = np.maximum(np.maximum(deep, 0.5 * shallow), 0.6 * pores)
+    # Mean of what was drawn, for a height about zero that does not depend on the patch's size.
+    return np.asarray(height + 0.45 * where.depth_um, np.float32), np.asarray(
+        np.clip(thin, 0.0, 1.0), np.float32
+    )
+
+
+def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: int) -> Float32Array:
+    """Return diffuse reflectance: melanin in specks of 40 to 150 um, a few vessels and spots."""
+    salt = 1000 * seed + 500
+    speckle = 0.5 * smooth_noise(points, (0.15,), seed=salt)
+    speckle += 0.4 * smooth_noise(points, (0.08,), seed=salt + 1)
+    speckle += 0.3 * smooth_noise(points, (0.05,), seed=salt + 2)
+    slow = smooth_noise(points, (1.5, 0.6), seed=salt + 3)
+    spots = scattered_spots(
+        points,
+        np.full(points.shape[:-1], 0.35, np.float32),
+        cell_mm=0.5,
+        radius_mm=(0.03, 0.12),
+        seed=salt + 4,
+        softness=4.0,
+    )
+    c_m = melanin * np.exp(0.45 * speckle + 0.12 * slow + 0.5 * spots - 0.1 * furrow)
+    vessels = line_network(points, 1.6, 0.04, seed=salt + 5)
+    patchy = np.clip(smooth_noise(points, (1.1,), seed=salt + 6), 0.0, 1.0)
+    c_hd = 0.035 * np.exp(0.10 * slow + 0.8 * vessels * patchy)
+    table = SkinTable.load()
+    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    nodes_m = np.geomspace(melanin / 12.0, min(12.0 * melanin, MELANIN_LIMIT), 48)
+    nodes_h = np.geomspace(0.01, 0.15, 24)
+    tabulated = table.spectra(nodes_m[:, None], nodes_h[None, :])[..., band].mean(axis=-1)
+    at_m = np.log(np.clip(c_m, nodes_m[0], nodes_m[-1]) / nodes_m[0])
+    at_h = np.log(np.clip(c_hd, nodes_h[0], min(nodes_h[-1], MAX_C_HD)) / nodes_h[0])
+    at_m *= (len(nodes_m) - 1) / math.log(nodes_m[-1] / nodes_m[0])
+    at_h *= (len(nodes_h) - 1) / math.log(nodes_h[-1] / nodes_h[0])
+    return np.asarray(map_coordinates(tabulated, [at_m, at_h], order=1, mode="nearest"), np.float32)
+
+
+def _alpha(where: _Site, points: Float32Array, seed: int) -> Float32Array:
+    """Return GGX roughness: films of oil smooth some places."""
+    oil = smooth_noise(points, (2.5, 0.7), seed=1000 * seed + 900)
+    return np.asarray(np.clip(where.alpha * (1.0 + 0.07 * oil), 0.1, 0.5), np.float32)

@@ -1,0 +1,254 @@
+"""Wrinkles that rise where an expression shortens the skin, by buckling along fixed lines.
+
+Skin is a stiff layer on a soft one and rests under tension. Shortening first spends the tension;
+from then on the layer buckles across the shortening, and the length that finds no more room in the
+surface goes into the wrinkle: what is measured along a wrinkled line stays the skin's slack length.
+Where wrinkles can rise is drawn once for a person, so every expression that shortens a zone raises
+the same lines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.geometry.atlas import Atlas
+from rigsim.geometry.mesh import Float32Array
+from rigsim.geometry.surface_noise import smooth_noise
+from rigsim.subject.face_regions import soft_step
+from rigsim.subject.wrinkle_zones import ZONES, Zone
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+TENSION_RANGE: Final = (0.05, 0.10)
+"""Part of its length by which a person's skin at rest is stretched."""
+
+FURROW: Final = 1.2
+"""How much narrower furrows are than ridges; 0 is a cosine."""
+
+FINEST_TEXELS: Final = 3.0
+"""Texels that a wave needs; finer wrinkles are left out."""
+
+SEAM_STEPS: Final = 6.0
+"""Texels that lie farther from each other than so many usual ones have a seam between them."""
+
+_STEPS: Final = 2048
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ZoneLines:
+    """Where a person's skin can buckle in one zone, at n texels of the face's texture."""
+
+    zone: Zone
+    texel: NDArray[np.intp]
+    """Flat indices of the texels, shape (n,)."""
+    phase_rad: FloatArray
+    """2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
+    slope: FloatArray
+    """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
+    share: FloatArray
+    """Part of the excess length that goes into the zone's wrinkles, shape (n,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class WrinkleLines:
+    """Where a person's skin can buckle."""
+
+    zones: tuple[ZoneLines, ...]
+    tension: float
+    """Part of its length by which the skin at rest is stretched."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wrinkles:
+    """What an expression raises; maps of shape (N, N), row 0 is the top."""
+
+    height_um: Float32Array
+    """Height added to the relief, um; zero on average over a wave."""
+    excess: Float32Array
+    """Length that the wrinkles take in, relative to the surface they lie on; 0 where smooth."""
+    left_out: tuple[str, ...]
+    """Zones whose waves are too short for the texture."""
+
+
+def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> WrinkleLines:
+    """Draw where a person's skin can buckle.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head under each texel, shape (N, N, 3).
+    covered
+        Texels with a surface, shape (N, N).
+    seed
+        Seed of the person, >= 0.
+
+    Returns
+    -------
+    WrinkleLines
+        The lines of `ZONES`.
+    """
+    rng = np.random.default_rng([seed, 22])
+    tension = float(rng.uniform(*TENSION_RANGE))
+    size = points_mm.shape[0]
+    y, z = points_mm[..., 1], points_mm[..., 2]
+    front = covered & (z > -60.0) & (y > -75.0) & (y < 90.0)  # no zone reaches farther
+    front[[0, -1]] = front[:, [0, -1]] = False
+    texel = np.flatnonzero(front)
+    flat = points_mm.reshape(-1, 3)
+    middle = flat[texel].astype(np.float64)
+    folded = np.column_stack([np.abs(middle[:, 0]), middle[:, 1:]])
+    step_mm = np.median(np.linalg.norm(flat[texel + 1] - flat[texel], axis=-1))
+    drawn = []
+    for zone in ZONES:
+        wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
+        offset = rng.uniform(0.0, 2.0 * math.pi, 2)
+        lifts = rng.uniform(0.8, 1.0, 2)
+        share = zone.share(folded)
+        near = np.flatnonzero(share > 0.01)
+        share = share[near]
+        # the texel, its neighbours at larger and smaller u, at larger and smaller v
+        around = texel[near] + np.array([0, 1, -1, -size, size])[:, None]
+        points = flat[around].astype(np.float64)
+        away = np.linalg.norm(points[1:] - points[0], axis=-1)
+        # beyond a seam of the texture there is nothing, or skin from elsewhere
+        known = covered.reshape(-1)[around[1:]] & (away < SEAM_STEPS * step_mm)
+        steps = np.maximum(known[0::2].astype(np.float64) + known[1::2], 1.0)
+        points[1:] = np.where(known[..., None], points[1:], points[0])
+        wobble = smooth_noise(points.astype(np.float32), (24.0, 11.0), seed=seed + 95)
+        right = (points[0, :, 0] > 0.0).astype(np.intp)
+        if zone.mirrored:
+            points[..., 0] = np.abs(points[..., 0])
+        across = zone.across_mm(points) / wave + 0.07 * wobble
+        phase = 2.0 * math.pi * across
+        if zone.single:
+            # one wave with its furrow on the line; beside it the skin is smooth
+            lone = np.abs(across[0]) < 0.5
+            share = share * np.where(lone, np.cos(math.pi * across[0]) ** 2, 0.0)
+        elif zone.name == "glabella":
+            phase -= 2.0 * math.pi * 0.55  # furrows on both sides of the middle, a little off it
+        else:
+            phase += offset[right] if zone.mirrored else offset[0]
+        slope = size * np.stack(
+            [(phase[1] - phase[2]) / steps[0], (phase[3] - phase[4]) / steps[1]], axis=-1
+        )
+        share = share * (lifts[right] if zone.mirrored else lifts[0])
+        drawn.append(ZoneLines(zone, texel[near], phase[0], slope, share))
+    # zones that overlap divide the shortening among them
+    together = np.zeros(size * size)
+    for lines in drawn:
+        together[lines.texel] += lines.share
+    crowd = np.maximum(together, 1.0)
+    return WrinkleLines(
+        tuple(dataclasses.replace(one, share=one.share / crowd[one.texel]) for one in drawn),
+        tension,
+    )
+
+
+def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
+    """Raise the wrinkles of a face whose surface has moved.
+
+    Parameters
+    ----------
+    lines
+        Where the skin can buckle.
+    rest, posed
+        The surface before and after, on the same texture.
+
+    Returns
+    -------
+    Wrinkles
+        Smooth where the lines of a zone have not come nearer to each other by more than the
+        tension.
+    """
+    size = rest.size
+    height = np.zeros(size * size)
+    total = np.zeros(size * size)
+    along_u, along_v = posed.texel_mm()
+    texel_mm = np.maximum(along_u, along_v).reshape(-1)
+    left_out = []
+    for one in lines.zones:
+        if not len(one.texel):
+            continue
+        # waves per mm across the lines, before and after
+        before = _density(_metric(rest, one.texel), one.slope)
+        after = _density(_metric(posed, one.texel), one.slope)
+        steady = (before > 1e-6) & (after > 1e-6)
+        stretch = np.where(steady, before / np.maximum(after, 1e-9), 1.0)
+        slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
+        excess = one.share * np.maximum(slack, 0.0)
+        wave_mm = 2.0 * math.pi / np.maximum(after, 1e-9)
+        fine = soft_step((wave_mm / texel_mm[one.texel] - FINEST_TEXELS) / 0.5)
+        if (excess > 0.0).any() and float(np.median(fine)) < 0.5:
+            left_out.append(one.zone.name)
+        excess *= fine
+        height[one.texel] += 1e3 * wave_mm * depth_of(excess) * _profile(one.phase_rad)
+        total[one.texel] += excess
+    return Wrinkles(
+        height.astype(np.float32).reshape(size, size),
+        total.astype(np.float32).reshape(size, size),
+        tuple(left_out),
+    )
+
+
+def depth_of(excess: ArrayLike) -> FloatArray:
+    """Return how deep a wave is that takes in an excess of length.
+
+    Parameters
+    ----------
+    excess
+        Length along the wave over its wavelength, minus one, 0 or more.
+
+    Returns
+    -------
+    ndarray
+        From furrow to ridge, over the wavelength.
+
+    Examples
+    --------
+    >>> bool(depth_of(0.0) == 0.0)
+    True
+    """
+    return np.interp(np.asarray(excess, np.float64), _EXCESS, _DEPTH)
+
+
+def _profile(phase: FloatArray) -> FloatArray:
+    """Return the height of a wave of depth 1, with zero mean and its furrow at phase 0."""
+    low, high = math.exp(-2.0 * FURROW), 1.0
+    return np.asarray((_BELL_MEAN - np.exp(FURROW * (np.cos(phase) - 1.0))) / (high - low))
+
+
+def _waves() -> tuple[float, FloatArray, FloatArray]:
+    """Return the mean of the furrow's bell, and excess of length against depth."""
+    phase = 2.0 * math.pi * (np.arange(_STEPS) + 0.5) / _STEPS
+    bell = np.exp(FURROW * (np.cos(phase) - 1.0))
+    slope = 2.0 * math.pi * FURROW * np.sin(phase) * bell / (1.0 - math.exp(-2.0 * FURROW))
+    depth = np.concatenate([[0.0], np.geomspace(1e-4, 3.0, 400)])
+    length = np.sqrt(1.0 + (depth[:, None] * slope) ** 2).mean(axis=1)
+    return float(bell.mean()), length - 1.0, depth
+
+
+_BELL_MEAN, _EXCESS, _DEPTH = _waves()
+
+
+def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
+    """Return the inverse metric of the texture, (n, 3): of du du, du dv, dv dv."""
+    du = atlas.dp_du_mm.reshape(-1, 3)[texel].astype(np.float64)
+    dv = atlas.dp_dv_mm.reshape(-1, 3)[texel].astype(np.float64)
+    e, f = np.sum(du * du, axis=-1), np.sum(du * dv, axis=-1)
+    g = np.sum(dv * dv, axis=-1)
+    determinant = np.maximum(e * g - f * f, 1e-9 * np.maximum(e, g) ** 2 + 1e-30)
+    return np.stack([g, -f, e], axis=-1) / determinant[:, None]
+
+
+def _density(inverse: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return the length of a phase's gradient on the surface, rad/mm."""
+    u, v = slope[:, 0], slope[:, 1]
+    squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v
+    return np.sqrt(np.maximum(squared, 0.0))

@@ -1,0 +1,189 @@
+"""A subject who cannot sit quite still: a slow drift of the head, and a twitch at the mouth.
+
+Both are functions of the world's time alone, and both are zero at time zero, where the truth maps
+are taken.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
+from rigsim.subject.head import LANDMARKS_MM
+
+FloatArray = NDArray[np.float64]
+
+SPAN_S: Final = 25.0
+"""Time within which the drift reaches its stated size: that of a capture."""
+
+DRIFT_MM: Final = (0.3, 3.0)
+DRIFT_DEG: Final = (0.1, 1.0)
+"""Ranges from which the greatest shift and turn are drawn."""
+
+WAVES: Final = 5
+BAND_HZ: Final = (0.02, 0.4)
+"""Waves of sway that make up the drift, and their frequencies; heads in rests sway below 0.5 Hz."""
+
+PIVOT_MM: Final = (0.0, 0.0, -70.0)
+"""Middle of the head, about which it turns; the shift is that of this point."""
+
+TWITCH_S: Final = 0.5
+TWITCH_MM: Final = (0.8, 2.0)
+TWITCH_RADIUS_MM: Final = 14.0
+"""Length of the twitch, range of its size, and how far it reaches from the corner of the mouth."""
+
+
+class MotionError(ValueError):
+    """A motion is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadMotion:
+    """Drift and twitch of one capture; see `head_motion`."""
+
+    amplitude: FloatArray
+    """Waves of shift x, y, z in mm and of turn about x, y, z in rad, shape (WAVES, 6)."""
+    frequency_hz: FloatArray
+    """Shape (WAVES, 6)."""
+    phase_rad: FloatArray
+    """Shape (WAVES, 6)."""
+    twitch_start_s: float
+    """When the twitch begins; inf for none."""
+    twitch_mm: float
+    """How far the corner of the mouth moves."""
+    twitch_side: str
+    """"left" or "right", as seen in the image."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges."""
+        for name in ("amplitude", "frequency_hz", "phase_rad"):
+            array = getattr(self, name)
+            if array.ndim != 2 or array.shape[1] != 6 or not np.isfinite(array).all():
+                raise MotionError(f"{name}: got shape {array.shape}, expected finite (n, 6)")
+        if not self.twitch_mm >= 0.0:
+            raise MotionError(f"twitch_mm: got {self.twitch_mm}, expected >= 0")
+        if self.twitch_side not in ("left", "right"):
+            raise MotionError(f"twitch_side: got {self.twitch_side!r}, expected left or right")
+
+    def pose(self, t_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return where the head is.
+
+        Parameters
+        ----------
+        t_s
+            World time, s.
+
+        Returns
+        -------
+        rotation, shift_mm : ndarray
+            Shapes (3, 3) and (3,): a point p of the still head is at rotation @ p + shift_mm.
+        """
+        at = 2.0 * math.pi * self.frequency_hz * t_s + self.phase_rad
+        state = np.sum(self.amplitude * (np.sin(at) - np.sin(self.phase_rad)), axis=0)
+        rotation = _turn(state[3:])
+        pivot = np.array(PIVOT_MM)
+        return rotation, pivot - rotation @ pivot + state[:3]
+
+    def twitch(self, t_s: float) -> float:
+        """Return how far the twitch has gone, 0 (rest) to 1."""
+        phase = (t_s - self.twitch_start_s) / TWITCH_S
+        return math.sin(math.pi * phase) ** 2 if 0.0 < phase < 1.0 else 0.0
+
+    def twitched(self, mesh: Mesh, amount: float) -> Mesh:
+        """Return a face whose corner of the mouth is drawn up and outwards.
+
+        Parameters
+        ----------
+        mesh
+            The still face.
+        amount
+            Result of `twitch`.
+
+        Returns
+        -------
+        Mesh
+            The same triangles; normals are turned as the surface is.
+        """
+        from rigsim.subject.face_regions import on_mean_head
+
+        points = on_mean_head(mesh.vertices_mm, mesh)
+        corner = np.array(LANDMARKS_MM[f"mouth corner {self.twitch_side}"])
+        squared = np.sum((points - corner) ** 2, axis=-1) / TWITCH_RADIUS_MM**2
+        outward = -1.0 if self.twitch_side == "left" else 1.0
+        way = np.array([0.75 * outward, 0.6, -0.28])
+        way /= np.linalg.norm(way)
+        moved = np.exp(-squared)[:, None] * (amount * self.twitch_mm * way)
+        vertices = mesh.vertices_mm + moved.astype(np.float32)
+        turned = vertex_normals(vertices, mesh.faces) - vertex_normals(mesh.vertices_mm, mesh.faces)
+        normals = mesh.normals + turned
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
+        return build_mesh(vertices, mesh.faces, mesh.uv, normals)
+
+
+def head_motion(
+    seed: int, *, drift_mm: float | None = None, drift_deg: float | None = None, twitch: bool = True
+) -> HeadMotion:
+    """Draw the motion of a head during one capture.
+
+    Parameters
+    ----------
+    seed
+        Seed, >= 0; the same gives the same motion.
+    drift_mm, drift_deg
+        Greatest shift of `PIVOT_MM` and greatest turn within 25 s, 0 to 10 mm and degrees;
+        None draws 0.3 to 3 mm and 0.1 to 1 degree.
+    twitch
+        Whether the mouth twitches once, between 20 and 80 % of the 25 s.
+
+    Returns
+    -------
+    HeadMotion
+        The motion; at time 0 the head is where its mesh is.
+
+    Examples
+    --------
+    >>> rotation, shift_mm = head_motion(1).pose(0.0)
+    >>> bool(np.allclose(rotation, np.eye(3)) and np.allclose(shift_mm, 0.0))
+    True
+    """
+    rng = np.random.default_rng([seed, 5])
+    sizes = [float(rng.uniform(*DRIFT_MM)), float(rng.uniform(*DRIFT_DEG))]
+    for k, (name, value) in enumerate((("drift_mm", drift_mm), ("drift_deg", drift_deg))):
+        if value is not None:
+            if not 0.0 <= value <= 10.0:
+                raise MotionError(f"{name}: got {value}, expected 0 to 10")
+            sizes[k] = value
+    low, high = np.log(BAND_HZ)
+    frequency = np.exp(rng.uniform(low, high, (WAVES, 6)))
+    amplitude = rng.standard_normal((WAVES, 6)) / np.sqrt(frequency)
+    phase = rng.uniform(0.0, 2.0 * math.pi, (WAVES, 6))
+    t = np.linspace(0.0, SPAN_S, 501)[:, None, None]
+    track = np.sum(
+        amplitude * (np.sin(2.0 * math.pi * frequency * t + phase) - np.sin(phase)), axis=1
+    )
+    amplitude[:, :3] *= sizes[0] / np.linalg.norm(track[:, :3], axis=1).max()
+    amplitude[:, 3:] *= math.radians(sizes[1]) / np.linalg.norm(track[:, 3:], axis=1).max()
+    start = float(rng.uniform(0.2, 0.8)) * SPAN_S if twitch else math.inf
+    return HeadMotion(
+        amplitude=amplitude,
+        frequency_hz=frequency,
+        phase_rad=phase,
+        twitch_start_s=start,
+        twitch_mm=float(rng.uniform(*TWITCH_MM)) if twitch else 0.0,
+        twitch_side=str(rng.choice(["left", "right"])),
+    )
+
+
+def _turn(vector: FloatArray) -> FloatArray:
+    """Return the rotation about a vector by its length in rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)

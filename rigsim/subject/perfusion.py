@@ -1,0 +1,196 @@
+"""Blood in the skin of a face: three compartments of vessels, and states that dilate them.
+
+The blood of a point is that of a capillary bed, of the loops that rise from it, and of the
+vessels of the plexus. A state changes the radius of the vessels, region by region; a vessel's
+volume goes with the square of its radius. Since the compartments have patterns of their own and
+answer unequally, a state is not a scaling and shifting of the neutral map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigsim.geometry.mesh import Float32Array
+from rigsim.geometry.surface_noise import line_network, smooth_noise
+
+HEMOGLOBIN_LIMIT: Final = 0.32
+"""Largest volume fraction of blood, Jimenez et al. 2010, table 1."""
+
+BASE: Final = 0.018
+"""Blood volume fraction of facial skin between the regions; dermal values of 0.2 to 7 % are
+usual, Jacques 1998, "Skin optics summary", Oregon Medical Laser Center."""
+
+# Added to the base, in units of it: cheeks, nose and lips hold more blood.
+_REGION_GAIN: Final[Mapping[str, float]] = {
+    "cheeks": 0.85,
+    "nose": 1.1,
+    "lips": 2.6,
+    "chin": 0.35,
+    "lids": 0.25,
+    "nose sides": 0.3,
+    "temples": -0.12,
+    "neck": -0.15,
+}
+
+_SHARES: Final = (0.56, 0.28, 0.16)
+"""Parts of the blood in bed, loops and plexus."""
+
+_ANSWERS: Final = (0.45, 1.0, 0.8)
+"""How far each compartment's vessels follow a change of radius: loops are muscular and answer
+most, the bed is mostly filled by what reaches it."""
+
+# Relative change of the vessels' radius by region; "all" holds everywhere. Directions follow
+# Jimenez et al. 2010, figures 2 to 5 and section 5: anger flushes and fear pales the whole face
+# (127 % and 81 %), a smile fills the cheeks and empties stretched skin, exercise and alcohol
+# redden different regions.
+_STATES: Final[Mapping[str, Mapping[str, float]]] = {
+    "neutral": {},
+    "anger": {"all": 0.13, "forehead": 0.10, "cheeks": 0.06, "brows": 0.08, "lips": -0.04},
+    "disgust": {"nose sides": 0.14, "nose": 0.08, "lips": -0.08, "lids": 0.05, "cheeks": 0.03},
+    "fear": {"all": -0.11, "lips": -0.05, "cheeks": -0.04},
+    "happiness": {"cheeks": 0.14, "nose sides": -0.06, "mouth corners": -0.08, "lids": 0.03},
+    "sadness": {"all": -0.03, "lids": 0.12, "nose": 0.10, "chin": 0.06, "brows": 0.05},
+    "surprise": {"forehead": 0.07, "brows": -0.06, "cheeks": -0.03, "all": -0.02},
+    "smile": {"cheeks": 0.18, "nose sides": -0.09, "mouth corners": -0.12, "lips": -0.07},
+    "exercise": {"all": 0.16, "cheeks": 0.22, "forehead": 0.12, "temples": 0.08, "chin": 0.05},
+    "alcohol": {"all": 0.08, "nose": 0.22, "cheeks": 0.13, "lids": 0.05, "neck": 0.09},
+}
+
+STATES: Final = tuple(_STATES)
+"""Names of the states."""
+
+
+class StateError(KeyError, ValueError):
+    """There is no state of that name."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Perfusion:
+    """The neutral blood of a face, by compartment."""
+
+    compartments: Float32Array
+    """Volume fraction of blood in bed, loops and plexus, shape (..., 3), >= 0."""
+    points_mm: Float32Array
+    """Points on the mean head, shape (..., 3)."""
+    regions: Mapping[str, Float32Array]
+    """Masks of `rigsim.subject.face_regions.region_masks`."""
+    seed: int
+    """Seed of the person's answers to the states."""
+
+    def dilation(self, state: str) -> Float32Array:
+        """Return the relative change of the vessels' radius in a state, shape (...).
+
+        Raises
+        ------
+        StateError
+            The state is unknown.
+        """
+        if state not in _STATES:
+            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
+        change = np.zeros(self.points_mm.shape[:-1], np.float32)
+        if state == "neutral":
+            return change
+        for name, gain in _STATES[state].items():
+            change += np.float32(gain) * (1.0 if name == "all" else self.regions[name])
+        # Each person has an own pattern of how strongly the vessels answer (observation 3).
+        salt = self.seed + 60 + STATES.index(state)
+        own = 1.0 + 0.25 * smooth_noise(self.points_mm, (35.0, 15.0), seed=salt)
+        return np.asarray(change * np.maximum(own, 0.0), np.float32)
+
+    def blood(self, state: str = "neutral") -> Float32Array:
+        """Return the volume fraction of blood in the dermis.
+
+        Parameters
+        ----------
+        state
+            One of `STATES`.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (...), 0 to 0.32.
+
+        Raises
+        ------
+        StateError
+            The state is unknown.
+        """
+        change = self.dilation(state)
+        total = np.zeros(change.shape, np.float32)
+        for index, answer in enumerate(_ANSWERS):
+            radius = np.maximum(1.0 + answer * change, 0.0)
+            total += self.compartments[..., index] * radius * radius
+        # Vessels fill the dermis at most up to the limit; the fold keeps the order of values.
+        return np.asarray(total / (1.0 + (total / HEMOGLOBIN_LIMIT) ** 4) ** 0.25, np.float32)
+
+    def dilated(self, change: ArrayLike) -> Perfusion:
+        """Return the perfusion after a lasting change of the vessels' radius, such as by heat.
+
+        Parameters
+        ----------
+        change
+            Relative change of the radius of vessels that follow it fully, shape (...) or a number,
+            above -1; the compartments follow unequally.
+        """
+        by = np.asarray(change, np.float32)
+        if not np.all(by > -1.0):
+            raise ValueError(f"change: got {by.min()}, expected above -1")
+        radius = 1.0 + np.asarray(_ANSWERS, np.float32) * by[..., None]
+        grown = self.compartments * radius * radius
+        return replace(self, compartments=np.asarray(grown, np.float32))
+
+
+def perfuse(
+    points_mm: Float32Array,
+    regions: Mapping[str, Float32Array],
+    *,
+    seed: int,
+    amount: float = 1.0,
+) -> Perfusion:
+    """Draw the vessels of a face and what each state does to them.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    regions
+        Masks of `rigsim.subject.face_regions.region_masks`.
+    seed
+        Any integer.
+    amount
+        Factor of all blood, 0.1 to 4.
+
+    Returns
+    -------
+    Perfusion
+        Neutral compartments, and what is needed to dilate them.
+    """
+    if not 0.1 <= amount <= 4.0:
+        raise ValueError(f"amount: got {amount}, expected 0.1 to 4")
+    rng = np.random.default_rng([seed, 2])
+    mean = np.full(points_mm.shape[:-1], 1.0, np.float32)
+    contrast = np.full(points_mm.shape[:-1], 1.0, np.float32)
+    for name, gain in _REGION_GAIN.items():
+        mean += np.float32(gain * rng.uniform(0.75, 1.25)) * regions[name]
+    contrast += 0.5 * regions["cheeks"] + 0.35 * regions["nose"] - 0.3 * regions["lips"]
+    mean *= np.float32(BASE * amount * rng.uniform(0.85, 1.15))
+
+    bed = 1.0 + 0.16 * contrast * smooth_noise(points_mm, (14.0, 6.0, 3.0), seed=seed + 41)
+    loops = 1.0 + 0.24 * contrast * smooth_noise(points_mm, (2.6, 1.5, 0.9), seed=seed + 42)
+    # Means of the networks over space, so that the plexus is 1 on average.
+    fine = line_network(points_mm, 3.4, 0.55, seed=seed + 43) / 0.15
+    coarse = line_network(points_mm, 9.0, 0.8, seed=seed + 44) / 0.083
+    plexus = 0.45 + 0.3 * np.minimum(fine, 4.0) + 0.25 * contrast * np.minimum(coarse, 4.0)
+    layers = (np.maximum(bed, 0.1), np.maximum(loops, 0.05), plexus)
+    compartments = np.stack(
+        [share * mean * layer for share, layer in zip(_SHARES, layers, strict=True)], axis=-1
+    )
+    return Perfusion(compartments.astype(np.float32), points_mm, regions, seed)

@@ -1,0 +1,238 @@
+"""How blood follows what a person does: prompts, exercise, alcohol; known at every time.
+
+A state's vessels are dilated by a part of what `rigsim.subject.perfusion` says, the state's level: 0 at
+rest, 1 in full. Vessels relax towards what is asked of them, rise and fall with time constants of
+their own. A prompt is answered after the person's reaction time, each a little otherwise. Exercise
+is at its height when it ends, and fades; alcohol is absorbed after it was drunk.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from rigsim.geometry.mesh import Float32Array
+from rigsim.subject.perfusion import STATES, Perfusion, StateError
+from rigsim.subject.person import Subject
+
+RELAXATION_S: Final = 0.02
+"""Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, saw no phase
+between two states at samples 0.25 s apart: mostly, the moving face squeezes its skin."""
+
+REACTION_S: Final = 0.16
+"""Time from a sound to the movement, s; simple reactions to sounds take about 0.16 s."""
+
+REACTION_SPREAD_S: Final = 0.02
+"""Standard deviation of the reaction time, s."""
+
+FADING_S: Final = 40.0
+"""Time constant of the flush after exercise, s."""
+
+ABSORPTION_S: Final = 1200.0
+"""Time constant of the flush after a drink, s."""
+
+
+class CourseError(ValueError):
+    """A course of blood that cannot be made."""
+
+
+class Course(Protocol):
+    """What a state's blood does in time."""
+
+    @property
+    def state(self) -> str:
+        """Which state of `rigsim.subject.perfusion.STATES`."""
+
+    def tell(self, now_s: float, asked: str) -> None:
+        """Let the person hear, at a world time in s, what is asked of him."""
+
+    def level(self, t_s: float) -> float:
+        """Return how much of the state's dilation the vessels have at a world time, 0 to 1."""
+
+    def pose(self, t_s: float) -> str:
+        """Return the state that the face shows by its movement at a world time."""
+
+
+@dataclass(slots=True)
+class PromptedCourse:
+    """Blood of an expression that a person makes and drops at prompts.
+
+    Parameters
+    ----------
+    state
+        The expression; any other prompt asks for rest.
+    rise_s, fall_s
+        Time constants of filling and emptying, s, > 0.
+    reaction_s
+        Mean time from prompt to movement, s, >= 0.
+    reaction_spread_s
+        Its standard deviation, s, >= 0; no reaction comes before its prompt.
+    seed
+        Of the reaction times.
+
+    Examples
+    --------
+    >>> course = PromptedCourse("smile", rise_s=2.0, reaction_s=0.5, reaction_spread_s=0.0)
+    >>> course.tell(10.0, "smile")
+    >>> [round(course.level(t), 3) for t in (10.4, 12.5, 100.0)]
+    [0.0, 0.632, 1.0]
+    >>> course.pose(10.4), course.pose(10.6)
+    ('neutral', 'smile')
+    """
+
+    state: str
+    rise_s: float = RELAXATION_S
+    fall_s: float = RELAXATION_S
+    reaction_s: float = REACTION_S
+    reaction_spread_s: float = REACTION_SPREAD_S
+    seed: int = 0
+    _moves: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
+    """World time of each movement, s; the level then; the level that is gone to."""
+
+    def __post_init__(self) -> None:
+        _check_state(self.state)
+        for name in ("rise_s", "fall_s"):
+            _require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "seconds > 0")
+        for name in ("reaction_s", "reaction_spread_s"):
+            _require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "seconds >= 0")
+
+    def tell(self, now_s: float, asked: str) -> None:
+        """Let the person hear a prompt at a world time, s."""
+        number = len(self._moves)
+        rng = np.random.default_rng([self.seed, 90, number])
+        late_s = max(0.0, self.reaction_s + self.reaction_spread_s * rng.standard_normal())
+        moved_s = now_s + late_s
+        if self._moves:
+            moved_s = max(moved_s, self._moves[-1][0])
+        self._moves.append((moved_s, self.level(moved_s), float(asked == self.state)))
+
+    def level(self, t_s: float) -> float:
+        """Return how much of the expression's blood is there at a world time, s: 0 to 1."""
+        number = bisect.bisect_right(self._moves, t_s, key=lambda move: move[0]) - 1
+        if number < 0:
+            return 0.0
+        since_s, from_level, to_level = self._moves[number]
+        constant_s = self.rise_s if to_level > from_level else self.fall_s
+        return to_level + (from_level - to_level) * math.exp(-(t_s - since_s) / constant_s)
+
+    def pose(self, t_s: float) -> str:
+        """Return what the face shows at a world time, s: the movement itself is taken as quick."""
+        number = bisect.bisect_right(self._moves, t_s, key=lambda move: move[0]) - 1
+        return self.state if number >= 0 and self._moves[number][2] > 0 else "neutral"
+
+
+@dataclass(slots=True)
+class EventCourse:
+    """Blood after something that happens once: the event is over when the person is told so.
+
+    Parameters
+    ----------
+    state
+        "exercise", which is at its height then and fades, or "alcohol", which comes up; of the
+        other states those that are held fade.
+    constant_s
+        Time constant, s, > 0; None: of the state.
+
+    Examples
+    --------
+    >>> course = EventCourse("exercise", constant_s=30.0)
+    >>> course.tell(100.0, "exercise")
+    >>> [round(course.level(t), 3) for t in (99.0, 100.0, 130.0)]
+    [0.0, 1.0, 0.368]
+    """
+
+    state: str
+    constant_s: float | None = None
+    _over_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        _check_state(self.state)
+        given = self.constant_s
+        _require(given is None or 0 < given < math.inf, "constant_s", given, "seconds > 0")
+
+    @property
+    def relaxation_s(self) -> float:
+        """The time constant, s."""
+        if self.constant_s is not None:
+            return self.constant_s
+        return ABSORPTION_S if self.state == "alcohol" else FADING_S
+
+    def tell(self, now_s: float, asked: str) -> None:
+        """Let the event end at a world time, s; may lie before 0 where a world began later."""
+        if asked == self.state and math.isinf(self._over_s):
+            self._over_s = now_s
+
+    def level(self, t_s: float) -> float:
+        """Return how much of the state's blood is there at a world time, s: 0 to 1."""
+        if t_s < self._over_s:
+            return 0.0
+        left = math.exp(-(t_s - self._over_s) / self.relaxation_s)
+        return 1.0 - left if self.state == "alcohol" else left
+
+    def pose(self, t_s: float) -> str:
+        """Return "neutral": neither exercise nor alcohol moves the face for a picture."""
+        return "neutral"
+
+
+@dataclass(frozen=True, slots=True)
+class HeldPerfusion(Perfusion):
+    """Vessels that are dilated by a part of what one state asks for, whatever the face shows."""
+
+    held: str = "neutral"
+    """State of the blood."""
+    level: float = 0.0
+    """Part of its dilation, 0 to 1."""
+
+    def dilation(self, state: str) -> Float32Array:
+        """Return the relative change of the vessels' radius, shape (...); ``state`` is not used."""
+        return np.asarray(np.float32(self.level) * Perfusion.dilation(self, self.held))
+
+
+def with_blood(subject: Subject, state: str, level: float) -> Subject:
+    """Return a face whose blood stays at a level of one state in whatever state it is shown.
+
+    Parameters
+    ----------
+    subject
+        The face.
+    state
+        State of the blood, one of `rigsim.subject.perfusion.STATES`.
+    level
+        Part of the state's dilation of the vessels, 0 to 1.
+
+    Raises
+    ------
+    CourseError
+        For another level.
+    rigsim.subject.perfusion.StateError
+        For an unknown state.
+
+    Examples
+    --------
+    >>> from rigsim.subject import make_subject
+    >>> face = make_subject(size=64)
+    >>> half = with_blood(face, "exercise", 0.5).hemoglobin("neutral").mean()
+    >>> bool(face.hemoglobin().mean() < half < face.hemoglobin("exercise").mean())
+    True
+    """
+    _check_state(state)
+    _require(0.0 <= level <= 1.0, "level", level, "0 to 1")
+    own = subject.perfusion
+    held = HeldPerfusion(own.compartments, own.points_mm, own.regions, own.seed, state, level)
+    return dataclasses.replace(subject, perfusion=held)
+
+
+def _check_state(state: str) -> None:
+    if state not in STATES or state == "neutral":
+        expected = ", ".join(name for name in STATES if name != "neutral")
+        raise StateError(f"state: got {state!r}, expected one of {expected}")
+
+
+def _require(good: bool, name: str, got: object, expected: str) -> None:
+    if not good:
+        raise CourseError(f"{name}: got {got!r}, expected {expected}")

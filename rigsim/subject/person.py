@@ -1,0 +1,352 @@
+"""A simulated person's face: geometry with its truth maps of melanin, blood and surface."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import Float32Array, Mesh, centered, load_mesh
+from rigsim.subject import (
+    expression_wrinkles,
+    expressions,
+    face_regions,
+    landmarks,
+    pigment,
+    relief,
+)
+from rigsim.subject.head import LANDMARKS_MM, build_head
+from rigsim.subject.perfusion import STATES, Perfusion, StateError, perfuse
+
+PRESETS: Final = tuple(pigment.MELANIN_PRESETS)
+"""Names of the presets, pale to dark."""
+
+SIZE_RANGE: Final = (64, 8192)
+"""Texels along one side of the truth maps."""
+
+
+class SubjectError(ValueError):
+    """A subject is asked for that cannot be made."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Pose:
+    """The surface of a face in an expression, on the texture of the face at rest."""
+
+    state: str
+    """Name of the expression."""
+    amount: float
+    """How far it goes, 0 to 1.5."""
+    origin: tuple[Mesh, Float32Array]
+    """Mesh and relief of the face at rest."""
+    lines: expression_wrinkles.WrinkleLines
+    """Where this person's skin can buckle."""
+    mesh: Mesh
+    """The face moved; the same triangles and texture coordinates."""
+    atlas: Atlas
+    """Its surface under each texel."""
+    wrinkles: expression_wrinkles.Wrinkles
+    """What rises where the skin is shortened."""
+    height_um: Float32Array
+    """Relief at rest and wrinkles, um, shape (N, N)."""
+    normal: Float32Array
+    """Unit normals of mesh, relief and wrinkles, shape (N, N, 3), rig frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """One face; maps are textures of shape (N, N), row 0 is the top (v = 1)."""
+
+    preset: str
+    """Name of the preset of melanin."""
+    seed: int
+    """Seed of everything that is drawn."""
+    mesh: Mesh
+    """Geometry in mm, rig frame, facing +z."""
+    atlas: Atlas
+    """Surface under each texel."""
+    melanin: Float32Array
+    """Volume fraction of melanosomes in the epidermis, 0 to 0.5."""
+    perfusion: Perfusion
+    """Blood by compartment, and what the states do to it."""
+    roughness: Float32Array
+    """GGX alpha of the surface, 0.15 to 0.5."""
+    height_um: Float32Array
+    """Pores and wrinkles over the mesh, um."""
+    hair: Float32Array
+    """Part of each texel that brows and lashes cover, 0 to 1."""
+    normal: Float32Array
+    """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
+    pose: Pose | None = None
+    """The expression that the geometry is in; ``None`` at rest."""
+    rest: Subject | None = None
+    """The same face at rest; ``None`` for a face that is at rest itself."""
+    beard: Float32Array | None = None
+    """How much stubble lies below the surface, shape (N, N), 0 to 1; ``None``: none."""
+    oiliness: float = 1.0
+    """Factor of the share of the surface that oil covers."""
+    offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How far the whole face was moved from where it was made, rig frame, see `moved_by`."""
+
+    @property
+    def size(self) -> int:
+        """Texels along one side of the maps."""
+        return self.atlas.size
+
+    def hemoglobin(self, state: str = "neutral") -> Float32Array:
+        """Return the volume fraction of blood in the dermis in a state, shape (N, N), 0 to 0.32.
+
+        Raises
+        ------
+        rigsim.subject.perfusion.StateError
+            The state is unknown.
+        """
+        return self.perfusion.blood(state)
+
+    def posed(self, state: str, amount: float = 1.0) -> Subject:
+        """Return this face in an expression: moved, with its wrinkles.
+
+        Parameters
+        ----------
+        state
+            One of `rigsim.subject.perfusion.STATES`; those that are no expression do not move the face.
+        amount
+            0 (rest) to 1 (full) and 1.5 (an extreme).
+
+        Returns
+        -------
+        Subject
+            The same person with another mesh, atlas, relief and normals; triangles, texture
+            coordinates and what the skin is made of stay. A posed face is posed from its rest. The
+            blood stays that of every state, see `hemoglobin`.
+
+        Raises
+        ------
+        rigsim.subject.perfusion.StateError
+            The state is unknown.
+        rigsim.subject.expressions.ExpressionError
+            The amount is out of range.
+        """
+        if state not in STATES:
+            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
+        low, high = expressions.AMOUNT_RANGE
+        if not low <= amount <= high:
+            raise expressions.ExpressionError(f"amount: got {amount}, expected {low:g} to {high}")
+        rest = self if self.rest is None else self.rest
+        if amount == 0.0 or not expressions.moves(state):
+            return rest
+        pose = _pose(rest, state, float(amount))
+        return dataclasses.replace(
+            rest,
+            mesh=pose.mesh,
+            atlas=pose.atlas,
+            height_um=pose.height_um,
+            normal=pose.normal,
+            pose=pose,
+            rest=rest,
+        )
+
+    def moved_by(self, offset_mm: tuple[float, float, float]) -> Subject:
+        """Return this face standing elsewhere, as a whole.
+
+        Parameters
+        ----------
+        offset_mm
+            How far it moves, mm, rig frame; without any the same object is returned.
+
+        Returns
+        -------
+        Subject
+            The same person, in the same pose, with another mesh and atlas; all else stays.
+
+        Raises
+        ------
+        SubjectError
+            The offset is not three finite numbers.
+        """
+        x, y, z = _three(offset_mm)
+        if (x, y, z) == (0.0, 0.0, 0.0):
+            return self
+        rest = self if self.rest is None else self.rest
+        way = np.array([x, y, z], np.float32)
+        there = dataclasses.replace(
+            rest,
+            mesh=dataclasses.replace(rest.mesh, vertices_mm=rest.mesh.vertices_mm + way),
+            atlas=rest.atlas.moved_by(way),
+            offset_mm=(rest.offset_mm[0] + x, rest.offset_mm[1] + y, rest.offset_mm[2] + z),
+        )
+        return there if self.pose is None else there.posed(self.pose.state, self.pose.amount)
+
+    def blend_shapes(self) -> dict[str, Float32Array]:
+        """Return how each expression moves the vertices, {state: (V, 3) in mm}, rig frame."""
+        rest = self if self.rest is None else self.rest
+        return expressions.blend_shapes(rest.mesh, seed=self.seed)
+
+    def tangent_normal(self) -> Float32Array:
+        """Return the normals in the frame of the texture, see `rigsim.subject.relief.tangent_normals`.
+
+        Returns
+        -------
+        ndarray of float32
+            Unit vectors, shape (N, N, 3): relief and wrinkles without the mesh's own bends.
+        """
+        return relief.tangent_normals(self.atlas, self.normal)
+
+    def landmarks_mm(self) -> dict[str, tuple[float, float, float]]:
+        """Return named points of the mean head, moved to this face, mm in the rig frame.
+
+        They move with the expression as the skin nearest to them does.
+        """
+        rest = self.mesh if self.rest is None else self.rest.mesh
+        points = face_regions.from_mean_head(np.array(list(LANDMARKS_MM.values())), rest)
+        if self.rest is not None:
+            away = np.linalg.norm(points[:, None] - rest.vertices_mm[None], axis=-1)
+            nearest = np.argmin(away, axis=1)
+            points = points + self.mesh.vertices_mm[nearest] - rest.vertices_mm[nearest]
+        return {
+            name: (float(x), float(y), float(z))
+            for name, (x, y, z) in zip(LANDMARKS_MM, points, strict=True)
+        }
+
+    def surface_landmarks(self) -> landmarks.SurfacePoints:
+        """Return named points of the skin itself; ``.on(mesh)`` says where they are."""
+        return landmarks.find(self.mesh if self.rest is None else self.rest.mesh)
+
+
+def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
+    given = np.asarray(offset_mm, np.float64)
+    if given.shape != (3,) or not np.isfinite(given).all():
+        raise SubjectError(f"offset_mm: got {offset_mm!r}, expected three finite numbers")
+    return float(given[0]), float(given[1]), float(given[2])
+
+
+_poses: WeakValueDictionary[tuple[int, int, int, str, float], Pose] = WeakValueDictionary()
+"""Poses that somebody holds, by what they are made of; a pose holds its origin, so that an id
+stays that of the same object."""
+_lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLines] = (
+    WeakValueDictionary()
+)
+"""Their lines, by the first three of the same."""
+
+
+def _pose(rest: Subject, state: str, amount: float) -> Pose:
+    """Return a pose of a face at rest; the same object as long as anybody holds it."""
+    key = (id(rest.mesh), id(rest.height_um), rest.seed, state, amount)
+    pose = _poses.get(key)
+    if pose is None:
+        deltas = expressions.displacement_mm(rest.mesh, state, amount=amount, seed=rest.seed)
+        mesh = expressions.moved(rest.mesh, deltas)
+        atlas = unwrap(mesh, rest.size)
+        lines = _lines.get(key[:3])
+        if lines is None:
+            points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
+            lines = expression_wrinkles.wrinkle_lines(points, rest.atlas.covered, seed=rest.seed)
+            _lines[key[:3]] = lines
+        wrinkles = expression_wrinkles.raise_wrinkles(lines, rest.atlas, atlas)
+        height = rest.height_um + wrinkles.height_um
+        pose = Pose(
+            state=state,
+            amount=amount,
+            origin=(rest.mesh, rest.height_um),
+            lines=lines,
+            mesh=mesh,
+            atlas=atlas,
+            wrinkles=wrinkles,
+            height_um=height,
+            normal=relief.relief_normals(atlas, height),
+        )
+        _poses[key] = pose
+    return pose
+
+
+def make_subject(
+    preset: str = "III",
+    *,
+    seed: int = 0,
+    size: int = 512,
+    mesh: Mesh | str | Path | None = None,
+    blood: float = 1.0,
+) -> Subject:
+    """Make a face.
+
+    Parameters
+    ----------
+    preset
+        One of `PRESETS`: skin types I to VI, or "palest" or "darkest".
+    seed
+        Seed of shape and patterns, >= 0; the same arguments give the same face.
+    size
+        Texels along one side of the maps, 64 to 8192; a face of 512 has texels of about 0.5 mm.
+    mesh
+        Geometry in mm, or its file (.npz, .obj), instead of the procedural head; the tip of its
+        nose must be its foremost point. A file's mesh is moved to the rig's centre.
+    blood
+        Factor of all blood, 0.1 to 4.
+
+    Returns
+    -------
+    Subject
+        The face with its truth maps.
+
+    Raises
+    ------
+    SubjectError
+        An argument is outside its range.
+    rigsim.geometry.mesh.MeshError
+        The mesh cannot be used.
+
+    Examples
+    --------
+    >>> face = make_subject("II", seed=1, size=64)
+    >>> face.melanin.shape, sorted(face.landmarks_mm())[:2]
+    ((64, 64), ['brow left', 'brow right'])
+    """
+    if preset not in pigment.MELANIN_PRESETS:
+        raise SubjectError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS)}")
+    if seed < 0:
+        raise SubjectError(f"seed: got {seed}, expected >= 0")
+    if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
+        raise SubjectError(f"size: got {size}, expected {SIZE_RANGE[0]} to {SIZE_RANGE[1]} texels")
+    if not 0.1 <= blood <= 4.0:
+        raise SubjectError(f"blood: got {blood}, expected 0.1 to 4")
+    if mesh is None:
+        surface = _head(seed)
+    elif isinstance(mesh, Mesh):
+        surface = mesh
+    else:
+        surface = centered(load_mesh(mesh))
+    atlas = unwrap(surface, size)
+    points = face_regions.on_mean_head(atlas.position_mm, surface)
+    regions = face_regions.region_masks(points)
+    height = relief.height_um(points, regions, texel_mm=_typical_texel_mm(atlas), seed=seed)
+    return Subject(
+        preset=preset,
+        seed=seed,
+        mesh=surface,
+        atlas=atlas,
+        melanin=pigment.melanin_map(points, regions, pigment.MELANIN_PRESETS[preset], seed=seed),
+        perfusion=perfuse(points, regions, seed=seed, amount=blood),
+        roughness=relief.roughness_map(points, regions, seed=seed),
+        height_um=height,
+        hair=relief.hair_map(points, seed=seed),
+        normal=relief.relief_normals(atlas, height),
+    )
+
+
+@lru_cache(maxsize=4)
+def _head(seed: int) -> Mesh:
+    return build_head(np.random.default_rng([seed, 0]))
+
+
+def _typical_texel_mm(atlas: Atlas) -> float:
+    along_u, along_v = atlas.texel_mm()
+    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
+
+
+__all__ = ["PRESETS", "STATES", "Subject", "SubjectError", "make_subject"]

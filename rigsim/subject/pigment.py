@@ -1,0 +1,126 @@
+"""Melanin of a face: base, slow variation, sun, freckles, moles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.geometry.mesh import Float32Array
+from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
+from rigsim.subject.face_regions import soft_step
+
+MELANIN_LIMIT: Final = 0.5
+"""Largest volume fraction, Jimenez et al. 2010, table 1."""
+
+MELANIN_PRESETS: Final[Mapping[str, float]] = {
+    "palest": 0.005,
+    "I": 0.007,
+    "II": 0.014,
+    "III": 0.028,
+    "IV": 0.047,
+    "V": 0.085,
+    "VI": 0.17,
+    "darkest": 0.45,
+}
+"""Volume fraction of melanosomes of each preset, for an epidermis of 0.25 mm. The ranges that
+Jacques 1998 ("Skin optics summary", Oregon Medical Laser Center) gives for lightly (1.3-6.3 %),
+moderately (11-16 %) and darkly (18-43 %) pigmented adults belong to a real epidermis of about
+0.07 mm, so they are divided by 3.5 here; the two ends are those of the range to be covered, and
+the darkest reflects less than real skin does."""
+
+
+def melanin_map(
+    points_mm: Float32Array,
+    regions: Mapping[str, Float32Array],
+    base: float,
+    *,
+    seed: int,
+    freckles: float | None = None,
+) -> Float32Array:
+    """Draw the melanin of a face.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    regions
+        Masks of `rigsim.subject.face_regions.region_masks`.
+    base
+        Volume fraction of melanosomes around which the map varies, 0.001 to 0.45.
+    seed
+        Any integer; it also decides where the sun did not reach.
+    freckles
+        How many freckles there are, 0 to 1, fewer on dark skin; ``None`` draws it, 0.2 to 0.8.
+
+    Returns
+    -------
+    ndarray of float32
+        Volume fraction of melanosomes in the epidermis, shape (...), 0.0005 to 0.5.
+    """
+    if not 0.001 <= base <= 0.45:
+        raise ValueError(f"base: got {base}, expected a melanin fraction from 0.001 to 0.45")
+    if freckles is not None and not 0.0 <= freckles <= 1.0:
+        raise ValueError(f"freckles: got {freckles}, expected 0 to 1")
+    rng = np.random.default_rng([seed, 1])
+    # Variations are steps of log-odds against the limit: factors for pale skin, bounded for dark.
+    step = 0.10 * smooth_noise(points_mm, (40.0, 18.0), seed=seed + 11)
+    step += 0.05 * smooth_noise(points_mm, (7.0, 3.0, 1.4), seed=seed + 12)
+    step += 0.12 * regions["forehead"] + 0.14 * regions["lids"] + 0.06 * regions["temples"]
+    step -= 0.55 * regions["lips"] + 0.10 * regions["neck"]
+    step += _tan(points_mm, base, rng)
+    step += _freckles(points_mm, regions, base, seed=seed, rng=rng, amount=freckles)
+    step += _moles(points_mm, base, seed=seed, rng=rng)
+    odds = base / (MELANIN_LIMIT - base) * np.exp(step)
+    return np.asarray(MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
+
+
+def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> NDArray[np.floating]:
+    """Sun everywhere but under a cap or behind glasses; half a tan is in the base already."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
+    if rng.random() < 0.5:
+        edge = float(rng.uniform(56.0, 70.0))  # a cap down to this height
+        hidden = soft_step((y - edge - 0.0025 * x * x) / 1.5)
+    else:
+        half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
+        q = ((np.abs(x) - 34.0) / half_width) ** 4 + ((y - 21.0) / half_height) ** 4
+        hidden = soft_step((1.0 - q) * 4.0) * soft_step((z + 40.0) / 5.0)
+    return gain * (0.45 - hidden)
+
+
+def _freckles(
+    points: Float32Array,
+    regions: Mapping[str, Float32Array],
+    base: float,
+    *,
+    seed: int,
+    rng: np.random.Generator,
+    amount: float | None,
+) -> NDArray[np.floating]:
+    where = 0.9 * regions["cheeks"] + 0.9 * regions["nose"] + 0.25 * regions["forehead"] + 0.03
+    where = where * (1.0 - regions["lips"])
+    # Freckles belong to pale skin.
+    drawn = float(rng.uniform(0.2, 0.8))  # drawn anyway, so that moles stay where they are
+    density = (drawn if amount is None else amount) * float(np.exp(-base / 0.05))
+    spots = scattered_spots(
+        points, density * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
+    )
+    return 0.9 * spots
+
+
+def _moles(
+    points: Float32Array, base: float, *, seed: int, rng: np.random.Generator
+) -> NDArray[np.floating]:
+    spots = scattered_spots(
+        points,
+        np.full(points.shape[:-1], 0.16),
+        cell_mm=26.0,
+        radius_mm=(0.7, 2.2),
+        seed=seed + 31,
+        softness=8.0,
+    )
+    # Nevi hold several times the melanin of the skin around them.
+    return float(rng.uniform(1.4, 2.0)) * (1.0 + 0.6 * float(np.exp(-base / 0.05))) * spots

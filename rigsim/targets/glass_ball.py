@@ -1,0 +1,224 @@
+"""A small ball of black glass in a sphere of LEDs: every LED's spot, as the camera sees it.
+
+The ball is smooth, so that each LED's disc is mirrored in one place, which depends on where in the
+lens's pupil the ray goes: spots far from the axis lie out of the plane in focus and are blurred.
+Rays are traced from points of the pupil; diffraction is left to `rigsim.render.lens_blur`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from capture.rig import View
+from rigsim import shading
+from rigsim.as_built.sphere import BuiltSphere
+from rigsim.geometry.mesh import Float32Array
+from rigsim.targets.mirror_ball import reflection_point
+
+FloatArray = NDArray[np.float64]
+
+RADIUS_MM: Final = 6.0
+ETA: Final = 1.52
+"""Of crown glass."""
+
+CENTER_MM: Final = (0.0, 0.0, -3.0)
+"""Where the ball's middle is on average: the spots near the axis, half a radius before the middle,
+are then in focus."""
+
+HAND_MM: Final = 0.3
+"""Standard deviation of where an operator puts it, per axis."""
+
+PUPIL_POINTS: Final = 37
+SUBPIXELS: Final = 4
+
+
+def ball_center_mm(seed: int) -> FloatArray:
+    """Return where the ball's middle is, mm, rig frame, shape (3,)."""
+    rng = np.random.default_rng([seed, 12])
+    return np.array(CENTER_MM) + HAND_MM * rng.standard_normal(3)
+
+
+def ball_stokes(
+    view: View,
+    sphere: BuiltSphere,
+    *,
+    extinction: float,
+    center_mm: FloatArray,
+    radius_mm: float = RADIUS_MM,
+) -> Float32Array:
+    """Return the picture of the ball for each moment of the light, each pixel averaged.
+
+    Parameters
+    ----------
+    view
+        The camera, which looks along -z and is focused on its target.
+    sphere
+        The LEDs.
+    extinction
+        Of the LEDs' films, > 1.
+    center_mm, radius_mm
+        The ball.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (12, H, W): Stokes vectors of the moments in the order of
+        `rigsim.as_built.sphere.MOMENTS`, radiance in the unit of `rigsim.light.lobe_moments`.
+    """
+    eye = np.array(view.position_mm, np.float64)
+    pupil = eye + _pupil(view)
+    pitch = view.distance_mm / view.focal_px
+    shape = (view.height_px, view.width_px)
+    out = np.zeros((12, *shape), np.float32)
+    weights = sphere.weights
+    for led, place in enumerate(sphere.position_mm):
+        if sphere.intensity[led] == 0.0:
+            continue
+        radius = float(sphere.radius_mm[led])
+        distance = float(np.linalg.norm(place))
+        beam = -place / distance
+        box = _box(pupil, place, beam, radius, center_mm, radius_mm, pitch, shape)
+        if box is None:
+            continue
+        part = np.zeros((box[1] - box[0], box[3] - box[2]))
+        _add_spot(part, box, pitch, shape, pupil, center_mm, radius_mm, place, beam, radius)
+        stokes = _mirrored(eye, place, center_mm, radius_mm, sphere.absorbs[led], view, extinction)
+        # unit of rigsim.light.lobe_moments: intensity 1 gives irradiance 1 at 600 mm
+        brightness = sphere.intensity[led] * 600.0**2 / (math.pi * radius**2)
+        for m in range(4):
+            for c in range(3):
+                out[3 * m + c, box[0] : box[1], box[2] : box[3]] += (
+                    weights[led, m] * brightness * stokes[c] * part
+                ).astype(np.float32)
+    return out
+
+
+def _pupil(view: View) -> FloatArray:
+    """Return points of the entrance pupil relative to its middle, even per area, (n, 3)."""
+    magnification = view.focal_mm / view.distance_mm
+    radius = 0.5 * view.focal_mm / (view.f_number * (1.0 + magnification))
+    k = np.arange(PUPIL_POINTS) + 0.5
+    r = radius * np.sqrt(k / PUPIL_POINTS)
+    phi = math.pi * (1.0 + math.sqrt(5.0)) * k
+    right, up, _ = (np.array(axis) for axis in view.axes)
+    points = (r * np.cos(phi))[:, None] * right + (r * np.sin(phi))[:, None] * up
+    # a few points are not even about the middle, which would shift all that is out of focus
+    return np.asarray(points - points.mean(axis=0))
+
+
+def _mirrored(
+    eye: FloatArray,
+    place: FloatArray,
+    center: FloatArray,
+    radius: float,
+    absorbs: FloatArray,
+    view: View,
+    extinction: float,
+) -> FloatArray:
+    """Return the Stokes vector of an LED's reflection over the radiance before its film."""
+    point = reflection_point(eye, place, center, radius)
+    to_light, to_camera = place - point, eye - point
+    to_light /= np.linalg.norm(to_light)
+    to_camera /= np.linalg.norm(to_camera)
+    facet = to_light + to_camera
+    facet /= np.linalg.norm(facet)
+    # a rough facet's reflection over its lobe is Fresnel's alone
+    alpha = 0.5
+    cosine = float(facet @ to_light)
+    shadowed = 2.0 / (1.0 + math.sqrt(1.0 + alpha**2 * (1.0 - cosine**2) / cosine**2))
+    lobe = shadowed**2 / (math.pi * alpha**2) / (4.0 * cosine)
+    rough = shading.specular_stokes(
+        facet[None],
+        to_light[None],
+        to_camera[None],
+        alpha,
+        eta=ETA,
+        light_absorbs=absorbs,
+        image_right=view.axes[0],
+        extinction=extinction,
+    )
+    return np.asarray(rough[0] / lobe, np.float64)
+
+
+def _box(
+    pupil: FloatArray,
+    place: FloatArray,
+    beam: FloatArray,
+    lamp_radius: float,
+    center: FloatArray,
+    radius: float,
+    pitch: float,
+    shape: tuple[int, int],
+) -> tuple[int, int, int, int] | None:
+    """Return first and past-the-last row and column of a spot, or None outside the image."""
+    side = np.cross(beam, [0.0, 1.0, 0.0] if abs(beam[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    across = np.cross(beam, side)
+    rim = [place + 1.5 * lamp_radius * v for v in (side, -side, across, -across)]
+    seen = []
+    for eye in (pupil[0], *pupil[-8:]):
+        for spot in rim:
+            point = reflection_point(eye, spot, center, radius)
+            t = eye[2] / (eye[2] - point[2])
+            seen.append((eye + t * (point - eye))[:2])
+    low, high = np.min(seen, axis=0) / pitch, np.max(seen, axis=0) / pitch
+    rows, columns = shape
+    first = math.floor(0.5 * (rows - 1) - high[1]) - 1, math.floor(low[0] + 0.5 * (columns - 1)) - 1
+    last = math.ceil(0.5 * (rows - 1) - low[1]) + 2, math.ceil(high[0] + 0.5 * (columns - 1)) + 2
+    box = max(first[0], 0), min(last[0], rows), max(first[1], 0), min(last[1], columns)
+    return box if box[0] < box[1] and box[2] < box[3] else None
+
+
+@njit(cache=True, nogil=True)
+def _add_spot(  # type: ignore[no-untyped-def]
+    part, box, pitch, shape, pupil, center, radius, lamp, beam, lamp_radius
+):
+    """Add which part of each pixel's rays, over pixel and pupil, ends on a lamp's disc."""
+    share = 1.0 / (SUBPIXELS * SUBPIXELS * pupil.shape[0])
+    ray, place = np.empty(3), np.empty(3)
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            hits = 0
+            for a in range(SUBPIXELS):
+                for b in range(SUBPIXELS):
+                    y = (0.5 * shape[0] - i - (a + 0.5) / SUBPIXELS) * pitch
+                    x = (j + (b + 0.5) / SUBPIXELS - 0.5 * shape[1]) * pitch
+                    for p in range(pupil.shape[0]):
+                        ray[0], ray[1], ray[2] = x - pupil[p, 0], y - pupil[p, 1], -pupil[p, 2]
+                        length, along, square = 0.0, 0.0, 0.0
+                        for k in range(3):
+                            length += ray[k] * ray[k]
+                        length = math.sqrt(length)
+                        for k in range(3):
+                            ray[k] /= length
+                            off = pupil[p, k] - center[k]
+                            along += off * ray[k]
+                            square += off * off
+                        rest = along * along - square + radius * radius
+                        if rest <= 0.0:
+                            continue
+                        t = -along - math.sqrt(rest)
+                        facing = 0.0
+                        for k in range(3):
+                            place[k] = pupil[p, k] + t * ray[k]
+                            facing += ray[k] * (place[k] - center[k])
+                        gap, towards = 0.0, 0.0
+                        for k in range(3):
+                            ray[k] -= 2.0 * facing * (place[k] - center[k]) / (radius * radius)
+                            towards += ray[k] * beam[k]
+                            gap += (lamp[k] - place[k]) * beam[k]
+                        if towards >= 0.0 or gap >= 0.0:
+                            continue
+                        t = gap / towards
+                        miss = 0.0
+                        for k in range(3):
+                            off = place[k] + t * ray[k] - lamp[k]
+                            miss += off * off
+                        if miss < lamp_radius * lamp_radius:
+                            hits += 1
+            part[i - box[0], j - box[2]] += hits * share

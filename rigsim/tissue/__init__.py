@@ -1,0 +1,1 @@
+"""Monte Carlo transport in layered tissue, and tables made with it."""

@@ -1,0 +1,250 @@
+"""Where the bytes of a served box go in and out: a pseudo-terminal, or a TCP port."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pty
+import selectors
+import socket
+import tty
+from collections.abc import Callable
+from typing import Protocol
+
+from rigsim.world.link import Link, LinkStalled, Unplugged
+from rigsim.world.world import World
+
+__all__ = ["BoxEnd", "PtyEnd", "TcpEnd"]
+
+log = logging.getLogger(__name__)
+
+CHUNK_BYTES = 4096
+
+
+class BoxEnd(Protocol):
+    """Where the bytes of one box go in and out."""
+
+    address: str
+
+    @property
+    def stalled(self) -> bool:
+        """Whether bytes wait that could not be passed on."""
+
+    def start(self, selector: selectors.BaseSelector) -> None:
+        """Begin to serve; `selector` calls back when bytes come."""
+
+    def pump(self) -> None:
+        """Pass on what the box has said."""
+
+    def stop(self) -> None:
+        """Stop serving; doing so twice is allowed."""
+
+
+class _Line:
+    """One end of a link: bytes that the box would not take yet wait here."""
+
+    def __init__(self, world: World, link: Link) -> None:
+        self._world = world
+        self._link = link
+        self._unsent = b""
+
+    @property
+    def stalled(self) -> bool:
+        """Whether bytes wait that could not be passed on."""
+        return bool(self._unsent)
+
+    def forget(self) -> None:
+        self._unsent = b""
+        with self._world.lock:
+            self._link.detach()
+
+    def attach(self) -> None:
+        with self._world.lock:
+            self._world.advance(self._world.now)
+            self._link.attach(self._world.now)
+
+    def send(self, data: bytes) -> None:
+        """Pass bytes on; raise `Unplugged`."""
+        self._unsent += data
+        with self._world.lock:
+            now = self._world.now
+            self._world.advance(now)
+            with contextlib.suppress(LinkStalled):
+                if self._unsent:
+                    self._link.send(self._unsent, now)
+                    self._unsent = b""
+                    self._world.advance(now)
+
+    def take(self) -> bytes:
+        """Return what the box said; raise `Unplugged`."""
+        if self._unsent:
+            self.send(b"")
+        with self._world.lock:
+            self._link.check(self._world.now)
+            return self._link.take(self._link.waiting)
+
+
+class PtyEnd:
+    """A box behind a pseudo-terminal."""
+
+    def __init__(self, world: World, link: Link) -> None:
+        self._line = _Line(world, link)
+        # the slave stays open here: else the master fails when a client closes
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.address = os.ttyname(self._slave)
+        self._open = True
+
+    @property
+    def stalled(self) -> bool:
+        """Whether bytes wait that could not be passed on."""
+        return self._line.stalled
+
+    def start(self, selector: selectors.BaseSelector) -> None:
+        """Begin to serve; `selector` calls back when bytes come."""
+        self._selector = selector
+        selector.register(self._master, selectors.EVENT_READ, self._readable)
+        self._line.attach()
+
+    def _readable(self) -> None:
+        if not self._line.stalled:
+            with contextlib.suppress(BlockingIOError):
+                self._guarded(lambda: self._line.send(os.read(self._master, CHUNK_BYTES)))
+
+    def pump(self) -> None:
+        """Pass on what the box has said."""
+
+        def write() -> None:
+            data = self._line.take()
+            # nobody reads and the terminal is full: what the box says is lost, as on a real line
+            with contextlib.suppress(BlockingIOError):
+                while data:
+                    data = data[os.write(self._master, data) :]
+
+        if self._open:
+            self._guarded(write)
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except Unplugged:
+            self.stop()
+
+    def stop(self) -> None:
+        """Stop serving; doing so twice is allowed."""
+        if self._open:
+            self._open = False
+            self._selector.unregister(self._master)
+            os.close(self._master)
+            os.close(self._slave)
+            self._line.forget()
+
+
+class TcpEnd:
+    """A box behind a TCP port, for one client at a time."""
+
+    def __init__(self, world: World, link: Link, host: str, port: int) -> None:
+        self._line = _Line(world, link)
+        self._listener = socket.create_server((host, port), backlog=4)
+        self._listener.setblocking(False)
+        self._client: socket.socket | None = None
+        self._leaving: set[socket.socket] = set()
+        self._unwritten = b""
+        self.address = f"socket://{host}:{self._listener.getsockname()[1]}"
+
+    @property
+    def stalled(self) -> bool:
+        """Whether bytes wait that could not be passed on."""
+        return self._line.stalled or bool(self._unwritten)
+
+    def start(self, selector: selectors.BaseSelector) -> None:
+        """Begin to serve; `selector` calls back when bytes come."""
+        self._selector = selector
+        selector.register(self._listener, selectors.EVENT_READ, self._acceptable)
+
+    def _acceptable(self) -> None:
+        try:
+            client, peer = self._listener.accept()
+        except OSError:
+            return  # gone again
+        self._readable()  # a client that was killed may not have been noticed yet
+        if self._client is not None:
+            log.warning("%s: refused %s, another host has the box", self.address, peer)
+            self._see_out(client)
+            return
+        try:
+            self._line.attach()
+        except Unplugged:
+            self._see_out(client)
+            return
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+        self._selector.register(client, selectors.EVENT_READ, self._readable)
+
+    def _readable(self) -> None:
+        if self._client is None or self._line.stalled:
+            return
+        try:
+            data = self._client.recv(CHUNK_BYTES)
+            if not data:
+                raise ConnectionResetError
+            self._line.send(data)
+        except BlockingIOError:
+            return
+        except (OSError, Unplugged):
+            self._hang_up()
+
+    def pump(self) -> None:
+        """Pass on what the box has said."""
+        if self._client is None:
+            return
+        try:
+            # a client that never reads loses what does not fit, as on a real line
+            self._unwritten = (self._unwritten + self._line.take())[-(2**20) :]
+            if self._unwritten:
+                self._unwritten = self._unwritten[self._client.send(self._unwritten) :]
+        except BlockingIOError:
+            return
+        except (OSError, Unplugged):
+            self._hang_up()
+
+    def _hang_up(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            self._selector.unregister(client)
+            self._see_out(client)
+            self._unwritten = b""
+            self._line.forget()
+
+    def _see_out(self, client: socket.socket) -> None:
+        """Tell a client that it is over, and wait for its own end: closing at once is a reset."""
+
+        def drain() -> None:
+            with contextlib.suppress(BlockingIOError):
+                try:
+                    over = not client.recv(CHUNK_BYTES)
+                except ConnectionError:
+                    over = True
+                if over:
+                    self._leaving.discard(client)
+                    self._selector.unregister(client)
+                    client.close()
+
+        try:
+            client.setblocking(False)
+            client.shutdown(socket.SHUT_WR)
+        except OSError:
+            client.close()
+            return
+        self._leaving.add(client)
+        self._selector.register(client, selectors.EVENT_READ, drain)
+
+    def stop(self) -> None:
+        """Stop serving; doing so twice is allowed."""
+        self._hang_up()
+        for client in self._leaving:
+            client.close()
+        self._listener.close()

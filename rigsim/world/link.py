@@ -1,0 +1,187 @@
+"""The line between a host and a box: delay, order, and everything that can happen to bytes on it.
+
+A `Link` is sans-I/O like the box behind it: what either side sends is queued with the time at which
+it arrives, and `advance` delivers what is due. The line keeps its order; late means late for all
+that follows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from rigsim.boxes.controller import Controller
+from rigsim.world.faults import Faults
+
+__all__ = ["Link", "LinkStalled", "Unplugged"]
+
+STALL_BUFFER_BYTES = 256
+"""What the line holds while a stalled box takes nothing."""
+BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"
+
+Record = Callable[[float, str, bytes], None]
+
+
+class Unplugged(Exception):
+    """The cable is out."""
+
+
+class LinkStalled(Exception):
+    """The box takes no bytes and the buffer of the line is full."""
+
+
+class Link:
+    """One box and the line to it.
+
+    Parameters
+    ----------
+    box
+        At the far end.
+    faults
+        Switches, see `rigsim.world.faults.Faults`.
+    rng
+        Decides when they strike.
+    record
+        Called with (time in s, direction, bytes) for the transcript: ``>`` arrives at the box,
+        ``<`` arrives at the host.
+    """
+
+    def __init__(
+        self, box: Controller, *, faults: Faults, rng: np.random.Generator, record: Record
+    ) -> None:
+        self.box = box
+        self.attached = False
+        self._faults = faults
+        self._rng = rng
+        self._record = record
+        self._to_box: deque[tuple[float, bytes]] = deque()
+        self._to_host: deque[tuple[float, bytes]] = deque()
+        self._received = bytearray()
+        self._first_open = math.inf
+        self._opened_at = math.inf
+        self._byte_s = 10.0 / faults.baud if faults.baud else 0.0
+        self._reset_at = faults.reset_after
+        # when the last byte under way each way arrives: the line is first in, first out
+        self._box_free = 0.0
+        self._host_free = 0.0
+
+    # the host's end ---------------------------------------------------------------------------
+
+    def attach(self, now: float) -> None:
+        """Open the port; raise `Unplugged` when nothing is there."""
+        self._first_open = min(self._first_open, now)
+        self._opened_at = now
+        self.check(now)
+        self.attached = True
+        if self._faults.reset_on_open:
+            self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=True)
+
+    def detach(self) -> None:
+        """Close the port; what the box says from now on is lost."""
+        self.attached = False
+        self._to_host.clear()
+        self._received.clear()
+
+    def check(self, now: float) -> None:
+        """Raise `Unplugged` while the cable is out; a port opened before stays dead after."""
+        out = self._first_open + self._faults.unplug_after
+        if now >= out and (now < out + self._faults.replug_after or self._opened_at < out):
+            raise Unplugged
+
+    def send(self, data: bytes, now: float) -> None:
+        """Send bytes to the box; raise `LinkStalled` when they do not fit."""
+        self.check(now)
+        waiting = sum(len(chunk) for _, chunk in self._to_box)
+        if self._stall_end(now) > now and waiting + len(data) > STALL_BUFFER_BYTES:
+            raise LinkStalled
+        for line in data.splitlines(keepends=True):
+            for copy in self._mangled(line):
+                self._box_free = max(now, self._box_free) + len(copy) * self._byte_s
+                self._to_box.append((self._box_free + self._faults.latency, copy))
+
+    def take(self, size: int) -> bytes:
+        """Return at most `size` bytes that have arrived."""
+        data = bytes(self._received[:size])
+        del self._received[:size]
+        return data
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that have arrived and were not taken."""
+        return len(self._received)
+
+    def flush(self) -> None:
+        """Drop what has arrived."""
+        self._received.clear()
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self, now: float) -> float:
+        """Return when something will next happen on the line, in s; inf for never."""
+        due = self._to_host[0][0] if self._to_host else math.inf
+        if self._to_box:
+            due = min(due, max(self._to_box[0][0], self._stall_end(now)))
+        return min(due, self._reset_at, self.box.deadline())
+
+    def advance(self, now: float) -> None:
+        """Deliver what is due at `now`, in s."""
+        if self._reset_at <= now:
+            self._reset_at = math.inf
+            self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
+        self._answer(self.box.advance(now), now)
+        while self._to_box and self._to_box[0][0] <= now and self._stall_end(now) <= now:
+            _, data = self._to_box.popleft()
+            self._record(now, ">", data)
+            if self._strikes(self._faults.brownout):
+                self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
+            self._answer(self.box.feed(data, now), now)
+        while self._to_host and self._to_host[0][0] <= now:
+            _, data = self._to_host.popleft()
+            self._record(now, "<", data)
+            self._received += data
+
+    def _answer(self, data: bytes, now: float) -> None:
+        for line in data.splitlines(keepends=True):
+            if not self.attached or self._strikes(self._faults.lose_answer):
+                continue
+            said = [BANNER] if self._strikes(self._faults.babble) else []
+            delay_s = self._faults.latency
+            if self._strikes(self._faults.late):
+                delay_s += self._faults.late_s
+            for copy in [*said, *self._mangled(line)]:
+                start = max(now + delay_s, self._host_free)
+                self._host_free = start + len(copy) * self._byte_s
+                self._to_host.append((self._host_free, copy))
+
+    def _stall_end(self, now: float) -> float:
+        start = self._first_open + self._faults.stall_after
+        return start + self._faults.stall_s if start <= now < start + self._faults.stall_s else now
+
+    # what happens to bytes --------------------------------------------------------------------
+
+    def _strikes(self, probability: float) -> bool:
+        return probability > 0.0 and bool(self._rng.random() < probability)
+
+    def _mangled(self, line: bytes) -> list[bytes]:
+        faults = self._faults
+        copies = 1 + self._strikes(faults.duplicate)
+        return [damaged for _ in range(copies) if (damaged := self._damaged(line))]
+
+    def _damaged(self, line: bytes) -> bytes:
+        faults = self._faults
+        if self._strikes(faults.glue):
+            line = line.removesuffix(b"\n")
+        if self._strikes(faults.cut):
+            line = line[: int(self._rng.integers(0, len(line) + 1))]
+        if not (faults.drop or faults.flip):
+            return line
+        data = np.frombuffer(line, np.uint8).copy()
+        if faults.flip:
+            bits = np.left_shift(1, self._rng.integers(0, 8, data.size)).astype(np.uint8)
+            data ^= np.where(self._rng.random(data.size) < faults.flip, bits, 0).astype(np.uint8)
+        if faults.drop:
+            data = data[self._rng.random(data.size) >= faults.drop]
+        return data.tobytes()

@@ -1,0 +1,57 @@
+"""What is in front of a rig's cameras, as the world asks it for frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.world.suction import HeadState
+from rigsim.world.taped_skin import GripState
+
+__all__ = ["CaliperScene", "ProbeScene", "Scene"]
+
+
+class Scene(Protocol):
+    """What is in front of the cameras."""
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of one exposure lit by `pops`.
+
+        They are what the rig's box gives: `FlashPop` of the flash, `LedPulse` of the dome, or
+        `PatternLight` of the gradient sphere, clipped to the time in which the shutter was open.
+        """
+
+
+class CaliperScene(Protocol):
+    """What is in front of the cameras of a rig with a caliper."""
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Any],
+        exposure_s: float,
+        seed: int,
+        grip: GripState,
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of one exposure, see `Scene`; of skin held by `grip`."""
+
+
+class ProbeScene(Protocol):
+    """What is in front of the fibres of a rig with a contact probe."""
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Any],
+        exposure_s: float,
+        seed: int,
+        head: HeadState,
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of one exposure, see `Scene`; `head` is of its start."""

@@ -1,0 +1,198 @@
+"""A world's boxes on a pty or a TCP port, and its cameras on a TCP port, in real time.
+
+One thread moves the bytes of the boxes and lets the world's time pass; each camera connection has
+a thread of its own, because making pixels takes time and no lamp may wait for it. The same boxes,
+lines and faults as behind ``sim://`` are used, so any client in any language sees what a driver
+sees. Whoever reaches a port can fire the lights: ports listen on this machine only, unless asked
+otherwise.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import selectors
+import threading
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
+
+from capture.rig import Rig, load_rig
+from rigsim.world.box_ends import BoxEnd, PtyEnd, TcpEnd
+from rigsim.world.camera_service import CameraService
+from rigsim.world.faults import Faults
+from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
+from rigsim.world.world import World
+
+__all__ = ["ServeError", "Served", "serve"]
+
+log = logging.getLogger(__name__)
+
+IDLE_S = 0.5
+"""Longest sleep of the thread that serves the boxes."""
+STALL_POLL_S = 0.02
+
+
+class ServeError(ValueError):
+    """An address that cannot be served on."""
+
+
+def serve(
+    rig_name: str | Rig,
+    *,
+    pty: bool = False,
+    tcp: str = "127.0.0.1:0",
+    allow_remote: bool = False,
+    seed: int = 0,
+    scene: Scene | CaliperScene | ProbeScene | None = None,
+    faults: Faults | None = None,
+    shots_made: Mapping[str, int] | None = None,
+    world: World | None = None,
+) -> Served:
+    """Serve the boxes and cameras of a rig until the result is closed.
+
+    Parameters
+    ----------
+    rig_name
+        Name, path, or the rig itself.
+    pty
+        Boxes on pseudo-terminals instead of TCP; cameras are on TCP in either case.
+    tcp
+        ``HOST:PORT``; port 0 takes free ones. Otherwise the boxes get ports upwards from it, in the
+        order of the rig, then all cameras one.
+    allow_remote
+        Permit an address that other machines can reach.
+    seed, scene, faults, shots_made
+        Of the world that is made, see `World`; without `faults`, bytes take no time beyond that
+        of the pty or the network.
+    world
+        Serve this one instead; its clock must be the real one.
+
+    Returns
+    -------
+    Served
+        Already being served; ``served.addresses`` are the URLs, boxes first.
+
+    Raises
+    ------
+    ServeError
+        When the address is taken, is no address, or is reachable from elsewhere without
+        `allow_remote`.
+
+    Examples
+    --------
+    >>> with serve("flash") as served:
+    ...     sorted(served.addresses)
+    ['cam', 'flash']
+    """
+    if world is None:
+        rig = rig_name if isinstance(rig_name, Rig) else load_rig(rig_name)
+        faults = Faults(baud=0.0) if faults is None else faults
+        world = World(
+            rig, seed=seed, clock="real", scene=scene, faults=faults, shots_made=shots_made
+        )
+    if world.virtual:
+        raise ServeError("clock: got a virtual one, expected 'real': other programs share our time")
+    return Served(world, pty=pty, host_port=_host_port(tcp, allow_remote))
+
+
+def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not (colon and host and port.isdecimal() and int(port) < 65_536):
+        raise ServeError(f"tcp: got {text!r}, expected HOST:PORT, e.g. 127.0.0.1:0")
+    try:
+        local = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = False
+    if not local and not allow_remote:
+        raise ServeError(
+            f"tcp: got {host!r}, expected an address of this machine only, such as 127.0.0.1: "
+            "whoever reaches the port can fire the lights; permit it with allow_remote "
+            "(--allow-remote) if that is wanted"
+        )
+    if not local:
+        log.warning("%s: other machines can reach the boxes and fire the lights", text)
+    return host, int(port)
+
+
+class Served:
+    """Boxes and cameras being served; close it to stop.
+
+    Attributes
+    ----------
+    world : World
+        What is served.
+    addresses : dict of str to str
+        URL of each box, then of each camera, by name.
+    """
+
+    def __init__(self, world: World, *, pty: bool, host_port: tuple[str, int]) -> None:
+        self.world = world
+        self.addresses: dict[str, str] = {}
+        self._closing = threading.Event()
+        self._selector = selectors.DefaultSelector()
+        self._wake_read, self._wake_write = os.pipe()
+        self._selector.register(self._wake_read, selectors.EVENT_READ, lambda: None)
+        self._ends: list[BoxEnd] = []
+        host, port = host_port
+        try:
+            for name in world.rig.boxes:
+                end: BoxEnd = (
+                    PtyEnd(world, world.link(name))
+                    if pty
+                    else TcpEnd(world, world.link(name), host, port)
+                )
+                self._ends.append(end)
+                end.start(self._selector)
+                self.addresses[name] = end.address
+                port += port > 0
+            self._cameras = CameraService(world, host, port)
+        except OSError as exc:
+            for started in self._ends:
+                started.stop()
+            raise ServeError(f"tcp: cannot listen on {host}:{port}: {exc}") from exc
+        self.addresses.update(self._cameras.addresses)
+        self._thread = threading.Thread(target=self._run, name="rigsim-boxes", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Serve until closed from elsewhere, or for `timeout_s`."""
+        self._closing.wait(timeout_s)
+
+    def close(self) -> None:
+        """Stop serving; doing so twice is allowed."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        os.write(self._wake_write, b"x")
+        self._thread.join()
+        self._cameras.close()
+        for end in self._ends:
+            end.stop()
+        self._selector.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _run(self) -> None:
+        world = self.world
+        while not self._closing.is_set():
+            pause = min(IDLE_S, world.deadline() - world.now)
+            if any(end.stalled for end in self._ends):
+                pause = min(pause, STALL_POLL_S)
+            for key, _ in self._selector.select(max(0.0, pause)):
+                key.data()
+            world.advance(world.now)
+            for end in self._ends:
+                end.pump()

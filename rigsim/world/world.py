@@ -1,0 +1,417 @@
+"""One simulated world: its clock, its boxes and cameras, its light.
+
+`World.advance` is the only door through which time passes, for ports, cameras and servers alike,
+so that everyone who looks sees the same lamps. A world has a virtual clock, which jumps to whatever
+comes next, or the real one. Boxes live as long as their world, not as long as the port to them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+import time
+import zlib
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.devices.camera import Exposure
+from capture.rig import Rig, View, load_rig
+from rigsim.boxes.controller import Controller
+from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.flash import FlashPop
+from rigsim.boxes.gradient_sphere import PatternLight
+from rigsim.boxes.probe import SourceLight
+from rigsim.world.faults import NO_FAULTS, Faults
+from rigsim.world.light_record import Light, LightRecord
+from rigsim.world.link import Link
+from rigsim.world.rig_boxes import Wiring, make_box
+from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
+from rigsim.world.suction import CameraCooler, HeadState, SuckedHead
+from rigsim.world.taped_skin import GripState, TapedSkin
+
+if TYPE_CHECKING:
+    from rigsim.world.camera import CameraBody
+
+__all__ = [
+    "CaliperScene",
+    "FlashPop",
+    "GripState",
+    "HeadState",
+    "LedPulse",
+    "Light",
+    "PatternLight",
+    "ProbeScene",
+    "Scene",
+    "SourceLight",
+    "World",
+    "WorldClock",
+    "get",
+    "get_by_name_or_box",
+]
+
+TRANSCRIPT_LINES = 4096
+
+
+class WorldClock:
+    """A world's time as a clock for ports and drivers."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def monotonic(self) -> float:
+        """Return the world's time, in s."""
+        return self._world.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let `seconds` of the world's time pass."""
+        self._world.wait(self._world.now + seconds)
+
+
+class World:
+    """A rig made of physics.
+
+    Parameters
+    ----------
+    rig
+        What stands there; by default the flash rig that ships.
+    seed
+        Seeds boxes, faults and sensors: same seed, same bytes.
+    clock
+        ``"virtual"``: time passes when somebody waits; ``"real"``: by itself.
+    scene
+        What the cameras see; without one, frames hold black level and read noise.
+    faults
+        What goes wrong; by default nothing.
+    shots_made
+        How many shots cameras have made before, by view, in another world of the same seed: their
+        noise must not come again.
+
+    Attributes
+    ----------
+    scene : Scene or None
+        May be exchanged between exposures.
+    pops : list of FlashPop
+        All pops so far.
+    pulses : list of LedPulse
+        All light of LEDs that has ended, in the order in which it did.
+    patterns : list of PatternLight
+        The same of the patterns of a gradient sphere.
+    sources : list of SourceLight
+        The same of the source fibre of a contact probe.
+    grips : list of (float, GripState)
+        What the caliper has held, from each world time in s on; empty where the rig has none.
+    skin : TapedSkin or None
+        What the caliper acts upon; None where the rig has none.
+    head : SuckedHead or None
+        The contact probe's head and what is under it; None where the rig has none.
+    """
+
+    def __init__(
+        self,
+        rig: Rig | None = None,
+        *,
+        seed: int = 0,
+        clock: Literal["virtual", "real"] = "virtual",
+        scene: Scene | CaliperScene | ProbeScene | None = None,
+        faults: Faults | None = None,
+        shots_made: Mapping[str, int] | None = None,
+    ) -> None:
+        if clock not in ("virtual", "real"):
+            raise ValueError(f"clock: got {clock!r}, expected 'virtual' or 'real'")
+        self.rig = load_rig("flash") if rig is None else rig
+        self.seed = seed
+        self.virtual = clock == "virtual"
+        self.scene = scene
+        self.faults = NO_FAULTS if faults is None else faults
+        self._light = light = LightRecord()
+        self.pops, self.pulses = light.pops, light.pulses
+        self.patterns, self.sources = light.patterns, light.sources
+        self.grips: list[tuple[float, GripState]] = []
+        self.skin: TapedSkin | None = None
+        if self.rig.caliper is not None:
+            stiffness = self.faults.skin_stiff
+            self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
+            self._note_grip(0.0)
+        self.head: SuckedHead | None = None
+        if self.rig.probe is not None:
+            kept_c, fails_after_s = self.rig.probe.camera_c, self.faults.camera_warms_after
+            self.head = SuckedHead(
+                CameraCooler(kept_c, fails_after_s=fails_after_s),
+                seed=seed,
+                leak=self.faults.pump_leak,
+                pump_dead=self.faults.pump_dead,
+                lifts_after_s=self.faults.head_lifts_after,
+            )
+        self.clock = WorldClock(self)
+        self.transcript: deque[str] = deque(maxlen=TRANSCRIPT_LINES)
+        self.lock = threading.RLock()
+        self._digest = hashlib.sha256()
+        self._started = time.monotonic()
+        self._now = 0.0
+        self._name = ""
+        self._shots_made = dict(shots_made or {})
+        self._cameras: dict[str, CameraBody] = {}
+        wiring = Wiring(
+            self.rig, self.faults, light, self._trigger, self._note_grip, self.skin, self.head
+        )
+        self._links = {name: self._make_link(name, wiring) for name in self.rig.boxes}
+
+    def _make_link(self, name: str, wiring: Wiring) -> Link:
+        box = make_box(name, wiring, rng=self.rng_for("box", name))
+        return Link(
+            box, faults=self.faults, rng=self.rng_for("link", name), record=self._record_bytes
+        )
+
+    def rng_for(self, *names: str) -> np.random.Generator:
+        """Return a generator that depends on the world's seed and on `names` only."""
+        words = [zlib.crc32(name.encode()) for name in names]
+        return np.random.default_rng(np.random.SeedSequence([self.seed, *words]))
+
+    # time -------------------------------------------------------------------------------------
+
+    @property
+    def now(self) -> float:
+        """The world's time, in s since it was made."""
+        return self._now if self.virtual else time.monotonic() - self._started
+
+    def deadline(self) -> float:
+        """Return when something will next happen, in s; inf for never."""
+        with self.lock:
+            due = math.inf
+            for link in self._links.values():
+                due = min(due, link.deadline(self._now))
+            return due
+
+    def advance(self, now: float) -> float:
+        """Let time pass up to `now`, in s; everything due before happens at its own time.
+
+        Return when something will next happen, in s, as far as is known now; inf for never.
+        """
+        with self.lock:
+            while (due := self.deadline()) <= now:
+                self._now = max(self._now, due)
+                for link in self._links.values():
+                    link.advance(self._now)
+            self._now = max(self._now, now)
+            return due
+
+    def wait(self, until: float) -> None:
+        """Let the world's time come to `until`, in s: at once, or by waiting."""
+        if self.virtual:
+            self.advance(until)
+            return
+        while (remaining := until - self.now) > 0.0:
+            self.advance(self.now)
+            time.sleep(min(remaining, max(0.0, self.deadline() - self.now)))
+        self.advance(self.now)
+
+    # boxes ------------------------------------------------------------------------------------
+
+    def link(self, name: str) -> Link:
+        """Return the line to the box called `name`."""
+        if name not in self._links:
+            raise KeyError(f"box: got {name!r}, expected one of {', '.join(self._links)}")
+        return self._links[name]
+
+    def box(self, name: str) -> Controller:
+        """Return the box called `name`."""
+        return self.link(name).box
+
+    def _record_bytes(self, now: float, direction: str, data: bytes) -> None:
+        line = f"{now:.6f} {direction} {data!r}"
+        self.transcript.append(line)
+        self._digest.update(line.encode() + b"\n")
+
+    @property
+    def transcript_sha256(self) -> str:
+        """Hash of everything that went over the lines, with its times."""
+        return self._digest.hexdigest()
+
+    # cameras ----------------------------------------------------------------------------------
+
+    def camera(self, view_name: str) -> CameraBody:
+        """Return the camera of a view; it lives as long as the world."""
+        from rigsim.world.camera import CameraBody
+
+        with self.lock:
+            if view_name not in self._cameras:
+                first = self._shots_made.get(view_name, 0)
+                self._cameras[view_name] = CameraBody(
+                    self, self.rig.view(view_name), first_shot=first
+                )
+            return self._cameras[view_name]
+
+    def _trigger(self, now: float, mask: int = -1) -> None:
+        """Pulse the camera line; a dome pulses the lines of the mask's bits, in the rig's order."""
+        for number, view in enumerate(self.rig.views):
+            if mask >> number & 1 and view.name in self._cameras:
+                self._cameras[view.name].edge(now)
+
+    def light_between(self, start: float, end: float) -> tuple[Light, ...]:
+        """Return pops from `start` to `end`, both included, and LEDs' light clipped to them."""
+        with self.lock:
+            return self._light.between(start, end, now=self.now)
+
+    def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
+        """Return the pops from `start` to `end`, both included, in s."""
+        with self.lock:
+            return self._light.pops_between(start, end)
+
+    def grip_at(self, t_s: float) -> GripState:
+        """Return what the caliper held at a world time, s.
+
+        Raises
+        ------
+        ValueError
+            Where the rig has no caliper.
+        """
+        with self.lock:
+            if not self.grips:
+                raise ValueError(f"caliper: rig {self.rig.name!r} has none")
+            first = bisect_right(self.grips, t_s, key=lambda entry: entry[0])
+            return self.grips[max(first - 1, 0)][1]
+
+    def head_at(self, t_s: float) -> HeadState:
+        """Return what the contact probe's head touched at a world time, s.
+
+        Raises
+        ------
+        ValueError
+            Where the rig has no contact probe.
+        """
+        with self.lock:
+            if self.head is None:
+                raise ValueError(f"probe: rig {self.rig.name!r} has none")
+            self.head.advance(self.now)
+            return self.head.state_at(t_s)
+
+    @property
+    def heads(self) -> list[tuple[float, HeadState]]:
+        """World times, s, at which something changed under the probe's head, and its states then.
+
+        Between them the suction relaxes; `head_at` tells it for any time.
+        """
+        with self.lock:
+            times = () if self.head is None else self.head.changes_s
+            return [(t_s, self.head_at(t_s)) for t_s in times]
+
+    def _note_grip(self, now: float) -> None:
+        if self.skin is not None and (state := self.skin.state) != self._last_grip():
+            self.grips.append((now, state))
+
+    def _last_grip(self) -> GripState | None:
+        return self.grips[-1][1] if self.grips else None
+
+    def expose(
+        self,
+        view_name: str,
+        exposure: Exposure,
+        t_start: float,
+        *,
+        seed: int,
+        pops: Iterable[Light] | None = None,
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of an exposure that began at `t_start`.
+
+        Parameters
+        ----------
+        view_name
+            Camera.
+        exposure
+            Its settings.
+        t_start
+            World time of the shutter's opening, s.
+        seed
+            Of the sensor's noise.
+        pops
+            Light that was seen; by default what came while the shutter was open.
+        """
+        end = t_start + exposure.exposure_s
+        seen = self.light_between(t_start, end) if pops is None else tuple(pops)
+        if self.scene is None:
+            return _dark_frame(self.rig.view(view_name), np.random.default_rng(seed))
+        exposure_s = exposure.exposure_s
+        if self.rig.caliper is not None:
+            held = cast(CaliperScene, self.scene)
+            grip = self.grip_at(t_start)
+            return held.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed, grip=grip)
+        if self.rig.probe is not None:
+            touching = cast(ProbeScene, self.scene)
+            head = self.head_at(t_start)
+            return touching.exposure(
+                view_name, pops=seen, exposure_s=exposure_s, seed=seed, head=head
+            )
+        scene = cast(Scene, self.scene)
+        return scene.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed)
+
+    # names ------------------------------------------------------------------------------------
+
+    def register(self, name: str) -> str:
+        """Make the world reachable as ``sim://flash?world=NAME`` and return `name`."""
+        other = _BENCH.setdefault(name, self)
+        if other is not self:
+            raise ValueError(f"name: got {name!r}, which another world has; unregister it first")
+        self._name = name
+        return name
+
+    def unregister(self) -> None:
+        """Take the world's name away; doing so twice is allowed."""
+        if _BENCH.get(self._name) is self:
+            del _BENCH[self._name]
+        self._name = ""
+
+
+_BENCH: dict[str, World] = {}
+
+
+def get(name: str) -> World:
+    """Return the registered world called `name`.
+
+    Raises
+    ------
+    KeyError
+        When there is none.
+    """
+    if name not in _BENCH:
+        known = ", ".join(_BENCH) or "none"
+        raise KeyError(f"world: got {name!r}, expected a registered one: {known}")
+    return _BENCH[name]
+
+
+def get_by_name_or_box(name: str) -> World:
+    """Return the registered world called `name`, or the only one without a name of that box.
+
+    Parameters
+    ----------
+    name
+        As it was registered; or the box ``BOX`` of a world that ``sim://BOX`` or ``sim://BOX?...``
+        made without a name of its own.
+
+    Raises
+    ------
+    KeyError
+        When there is none, or several worlds without a name have that box.
+    """
+    unnamed = [url for url in _BENCH if url.partition("?")[0] == f"sim://{name}"]
+    if name in _BENCH or not unnamed:
+        return get(name)
+    if len(unnamed) > 1:
+        raise KeyError(
+            f"world: got {name!r}, of which there are {len(unnamed)}, expected one with a name"
+        )
+    return _BENCH[unnamed[0]]
+
+
+def _dark_frame(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:
+    noise = rng.normal(view.black_level, view.read_noise_e / view.gain_e_per_dn, _shape(view))
+    return np.rint(np.clip(noise, 0, 2**view.bit_depth - 1)).astype(np.uint16)
+
+
+def _shape(view: View) -> tuple[int, int]:
+    return view.height_px, view.width_px
