@@ -17,8 +17,8 @@ from typing import Any
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import suggest
-from skinrig.surroundings import look
 from skinrig.waiting_threads import WAITING_ASLEEP
+from skinrig.workspace import look
 from skinrig.written_units import unit_sign
 
 MOST_AT_ONCE = 2

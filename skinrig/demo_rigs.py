@@ -17,7 +17,7 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.light_safety import light_rows
+from skinrig.capturing.light_safety import light_rows
 from skinrig.simulating.simulation import Simulated, simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
@@ -139,7 +139,8 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         )  # fmt: skip
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):
-        from skinrig.rendering.evaluation import FULL, evaluate_folders
+        from skinrig.rendering.photographs.comparison import FULL
+        from skinrig.rendering.photographs.evaluation import evaluate_folders
 
         compared = evaluate_folders(
             appearance, capture.session, out / f"pictures-dome-{DOME_SUBJECT}",
@@ -258,8 +259,8 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
+    from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
     from skinrig.applying.expression import hemoglobin_rig
-    from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
     from skinrig.evaluating import facial_color
 
     found = store.read(appearance)

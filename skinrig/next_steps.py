@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from skinrig.surroundings import Surroundings, look
+from skinrig.workspace import Surroundings, look
 
 CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "flash": {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",

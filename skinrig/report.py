@@ -9,31 +9,28 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.dynamic_appearance import parts_of
-from skinrig.reporting import (
+from skinrig.appearances.dynamic import parts_of
+from skinrig.reporting import consents, page, provenance, unjudged
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import verdict as verdict_section
+from skinrig.reporting.comparison import page as comparison
+from skinrig.reporting.comparison import runs as run_comparison
+from skinrig.reporting.folders import Findings, ReportError, discover, read_json
+from skinrig.reporting.sections import (
     bench,
     calibration,
     chromophore,
-    comparison,
-    consents,
     dynamic,
     extremes,
-    map_pictures,
     microrelief,
     omissions,
-    page,
     population,
-    provenance,
-    run_comparison,
     sequence,
     session,
     subsurface,
-    unjudged,
 )
-from skinrig.reporting import pictures as pictures_section
-from skinrig.reporting import surface as surface_section
-from skinrig.reporting import verdict as verdict_section
-from skinrig.reporting.folders import Findings, ReportError, discover, read_json
+from skinrig.reporting.sections import images as pictures_section
+from skinrig.reporting.sections import surface as surface_section
 
 __all__ = ["Report", "ReportError", "build", "make"]
 

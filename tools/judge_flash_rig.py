@@ -21,8 +21,8 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
-from skinrig.bounds import cramer_rao
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.bounds import cramer_rao
 from skinrig.evaluating.flash import BANDS, BOUND_FACTOR, BOUND_LIMIT, MEDIAN_LIMIT
 from skinrig.simulating.simulation import simulate_session
 

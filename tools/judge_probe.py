@@ -15,7 +15,7 @@ from pathlib import Path
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from skinrig.benchmarks.probe import medium
+from skinrig.benchmarks.probe.session import medium
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.simulating.simulation import simulate_session, truth_folder

@@ -19,7 +19,8 @@ from typing import Any
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
-from skinrig.rendering.evaluation import FULL, evaluate_folders
+from skinrig.rendering.photographs.comparison import FULL
+from skinrig.rendering.photographs.evaluation import evaluate_folders
 from skinrig.simulating.simulation import simulate_session
 
 SUBJECTS = ("palest", "II", "III", "V", "darkest")

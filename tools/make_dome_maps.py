@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.front_view import FrontView
-from skinrig.reporting import png
+from skinrig.appearances.front_view import FrontView
+from skinrig.drawing import png
 
 TARGET = Path(__file__).resolve().parents[1] / "docs/images/dome-maps.png"
 GRAY = 0.5

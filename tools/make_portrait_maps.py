@@ -18,7 +18,7 @@ import skimage.data
 from capture.importers import import_photos
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from skinrig.reporting import png
+from skinrig.drawing import png
 
 TARGET = Path(__file__).resolve().parents[1] / "docs/images/portrait-maps.png"
 FACE = (slice(60, 196), slice(160, 288))

@@ -21,7 +21,8 @@ from model.texture_statistics import histograms as texture_histograms
 from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
-from skinrig import consent, face_textures
+from skinrig import consent
+from skinrig.appearances import face_textures
 from skinrig.fitting import traits
 from skinrig.fitting.traits import AlbedoSample, TraitFitError
 from skinrig.traits import albedo_vectors

@@ -20,8 +20,9 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
-from skinrig import consent, dynamic_appearance
-from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
+from skinrig import consent
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.dynamic import FACIAL_COLOR, PARTS, WRINKLES
 from skinrig.errors import UsageError
 
 KIND = "expression"

@@ -20,7 +20,7 @@ from model.microstructure.convolution import LineKernels, Sampling, convolve_til
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import KernelRegions, rasterize, regional_kernels
-from skinrig.blend_shapes import BlendShapeMesh
+from skinrig.blend_shapes.meshes import BlendShapeMesh
 
 Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -168,7 +168,7 @@ def apply_microstructure(
     ------
     ApplyMicrostructureError
         For heights that are no map, or an `out` that belongs to another job.
-    skinrig.blend_shapes.BlendShapeError
+    skinrig.blend_shapes.errors.BlendShapeError
         For shapes that the mesh lacks.
     """
     shape = tuple(int(side) for side in np.shape(neutral_height))

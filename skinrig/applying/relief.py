@@ -18,11 +18,11 @@ from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
 from model.microstructure.strain_fields import KernelRegions
 from model.skin import SkinAppearance, SkinMap
-from skinrig import blend_shapes
+from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
-from skinrig.blend_shapes import BlendShapeMesh
-from skinrig.dynamic_appearance import MICROSTRUCTURE
+from skinrig.blend_shapes import meshes as blend_shapes
+from skinrig.blend_shapes.meshes import BlendShapeMesh
 
 REGION_PX: Final = 256
 """Texels a side of the maps that say whose relief is where, and how large pixels are."""

@@ -11,8 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinrig import skin_bands
-from skinrig.benchmark import BandError, Limit, Point, StageBenchmark
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark
+from skinrig.evaluating import skin_bands
 
 SCHEMA: Final = "skinrig.bench/2"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skinrig.reporting import figures, point_names
+from skinrig.drawing import figures, point_names
 
 
 def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:

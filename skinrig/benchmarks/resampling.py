@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import metrics
-from skinrig.benchmark import BandError
+from skinrig.benchmarks.measurement import BandError
 
 DRAWS = 200
 TILE_PX = 16

@@ -10,10 +10,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from skinrig.benchmark import StageBenchmark
 from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import to_document
+from skinrig.benchmarks.measurement import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 

@@ -19,7 +19,7 @@ from capture.calibration.fiber.phantom import PhantomCertificate
 from capture.calibration.fiber.readings import FibreReadings, sum_spots
 from capture.calibration.fiber.spots import find_fibre_spots
 from capture.session import FrameRecord, Session
-from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
+from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
 KIND: Final = "fibre"
 WORN_GAIN: Final = 0.5

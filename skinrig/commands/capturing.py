@@ -82,7 +82,7 @@ def capture(
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.acquisition import (
+    from skinrig.capturing.acquisition import (
         capture_session,
         eyes_of,
         names_of,
@@ -137,7 +137,7 @@ def serve(
 
     Example: skinrig serve flash --pty
     """
-    from skinrig.serving import serve_rig
+    from skinrig.simulating.serving import serve_rig
 
     serve_rig(
         rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed,

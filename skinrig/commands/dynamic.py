@@ -183,9 +183,9 @@ def apply_expression(
 
     Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
     """
+    from skinrig.appearances.dynamic import PARTS
     from skinrig.applying import expression as applying
     from skinrig.applying.relief import EXTRAPOLATIONS, SOURCES, Relief, one_of
-    from skinrig.dynamic_appearance import PARTS
 
     console = Console(json)
     given = applying.parse_weights(weights)
@@ -226,9 +226,9 @@ def apply_microstructure(
 
     Example: skinrig apply microstructure moving --mesh head.npz --weights smile=1 --out relief
     """
+    from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
     from skinrig.applying.relief import Relief
-    from skinrig.dynamic_appearance import MICROSTRUCTURE
 
     console = Console(json)
     given = applying.parse_weights(weights)

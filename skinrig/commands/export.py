@@ -92,8 +92,10 @@ def export(
 
     Example: skinrig export appearance --to gltf --out delivery
     """
-    from skinrig.exporting import appearances, brdfs, light_lists, sessions, stokes
+    from skinrig.exporting import appearances, brdfs
     from skinrig.exporting.options import Delivery
+    from skinrig.exporting.sessions import handing as sessions
+    from skinrig.exporting.sessions import light_lists, stokes
 
     console = Console(json)
     known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME, stokes.NAME)

@@ -74,7 +74,7 @@ def bench(
         )
     wait_asleep(os.environ)  # before numerical libraries are loaded: one stage runs at a time
     if extremes:
-        from skinrig.reporting.extremes import run_extremes
+        from skinrig.reporting.sections.extremes import run_extremes
 
         document = run_extremes(stages or (), out=out, console=console)
     else:

@@ -134,7 +134,7 @@ def reconstruct(
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
     from reconstruction.pipeline import recipes as pipeline
-    from skinrig.state_truth import truth_beside
+    from skinrig.appearances.state_truth import truth_beside
 
     console = Console(json)
     check_rank(rank, basis)

@@ -137,7 +137,7 @@ def render(
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
     if against is not None and not components:
-        from skinrig.rendering import evaluation
+        from skinrig.rendering.photographs import evaluation
 
         found = evaluation.evaluate_folders(
             appearance[0], against, out, calibration=calibration, translucency=translucency,

@@ -164,7 +164,7 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.acquisition import (
+    from skinrig.capturing.acquisition import (
         amounts_of,
         names_of,
         numbers_of,

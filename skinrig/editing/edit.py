@@ -17,7 +17,9 @@ from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import TraitLibrary
 from model.traits.vectors import DOUBTFUL_P, TraitVector
 from reconstruction.correspondence import common_regions
-from skinrig import consent, face_textures
+from skinrig import consent
+from skinrig.appearances import face_textures
+from skinrig.appearances.face_textures import Face
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
@@ -26,7 +28,6 @@ from skinrig.editing.albedo import AlbedoEdit
 from skinrig.editing.spots import SpotOrder
 from skinrig.editing.surface_mixtures import SurfaceMixtures
 from skinrig.errors import UsageError
-from skinrig.face_textures import Face
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 

@@ -14,9 +14,9 @@ from model.skin import SkinMap
 from reconstruction.correspondence import common_parameterization
 from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
 from reconstruction.surface import texture_fill
-from skinrig import face_textures
+from skinrig.appearances import face_textures
+from skinrig.appearances.face_textures import Face
 from skinrig.editing import pigment_spots, spot_removal
-from skinrig.face_textures import Face
 from skinrig.traits import albedo_vectors
 
 Image = NDArray[np.float32]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
-from skinrig.bounds import cramer_rao
+from skinrig.evaluating.bounds import cramer_rao
 
 BANDS: tuple[tuple[float, float], ...] = (
     (0.0, 0.02), (0.02, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.51),

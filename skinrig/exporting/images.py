@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
-from skinrig.reporting import png
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.exporting import materialx
 from skinrig.exporting.images import CAMERA, DATA, SRGB, Image, ImageFolder, png_range
+from skinrig.exporting.materials import materialx
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
@@ -170,8 +170,8 @@ def _tangent_normals(
     appearance: SkinAppearance, names: list[str], out: ImageFolder, delivery: Delivery
 ) -> tuple[str | None, str]:
     """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
-    from skinrig.exporting import tangents
-    from skinrig.exporting.tangents import FramedMesh
+    from skinrig.exporting.materials import tangents
+    from skinrig.exporting.materials.tangents import FramedMesh
     from skinrig.rendering.geometry import GeometryError, own_mesh
 
     found = next((n for n in ("normals_refined", "normals") if n in names), None)

@@ -77,11 +77,11 @@ def all_cases() -> tuple[Case, ...]:
         interior,
         motion,
         photons,
-        pictures,
         reflectance,
         rendering,
         transport,
     )
+    from skinrig.extremes import images as pictures
     from skinrig.extremes import surface as extremes_surface
 
     groups = (

@@ -19,9 +19,9 @@ from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from reconstruction.pipeline.flash import state_images
 from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBloodError
 from reconstruction.pipeline.flash.state_images import Landmarks, Subject
-from skinrig import dynamic_appearance
-from skinrig.dynamic_appearance import FACIAL_COLOR, Part
-from skinrig.state_truth import truth_of_state
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.dynamic import FACIAL_COLOR, Part
+from skinrig.appearances.state_truth import truth_of_state
 
 
 class FacialColorInputError(ValueError):

@@ -17,8 +17,9 @@ from model.microstructure import FOREHEAD, KernelTable, KernelTableError
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
-from skinrig import consent, dynamic_appearance
-from skinrig.dynamic_appearance import MICROSTRUCTURE, Part
+from skinrig import consent
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.dynamic import MICROSTRUCTURE, Part
 
 SITE = re.compile(r"[a-z][a-z0-9_]{0,31}")
 

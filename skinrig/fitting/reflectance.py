@@ -14,9 +14,10 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY, SkinReflectance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
-from skinrig import consent, probe_sites
+from skinrig import consent
 from skinrig.errors import UsageError
-from skinrig.probe_sites import PlacedTranslucency
+from skinrig.fitting import probe_sites
+from skinrig.fitting.probe_sites import PlacedTranslucency
 
 KEY = "reflectance_model"
 """Of `parameters`: how the translucency of a model came about."""

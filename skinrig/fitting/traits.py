@@ -20,11 +20,12 @@ from model.traits.vectors import Contrast
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from skinrig import consent, face_textures
+from skinrig import consent
+from skinrig.appearances import face_textures
+from skinrig.appearances.face_textures import Face
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.errors import UsageError
-from skinrig.face_textures import Face
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import VectorKind

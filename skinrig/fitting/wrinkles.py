@@ -20,8 +20,9 @@ from reconstruction.pipeline.dome.stages import MESH_FILE
 from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkles.fit import WrinkleFit, fit
 from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
-from skinrig import consent, dynamic_appearance
-from skinrig.dynamic_appearance import WRINKLES, Part
+from skinrig import consent
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.dynamic import WRINKLES, Part
 
 STATE = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMALS = ("normals_refined", "normals")

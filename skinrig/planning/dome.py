@@ -23,7 +23,7 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Prediction
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
-from skinrig.planning.dome_sight import LIGHT_ERROR, Sight, sight
+from skinrig.planning.dome_observation import LIGHT_ERROR, Sight, sight
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
 
 Floats = NDArray[np.float64]

@@ -20,7 +20,7 @@ from capture.rig import Rig
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.detectability import detectable
 from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
-from skinrig.bounds import relative_bounds
+from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
 
 Floats = NDArray[np.float64]

@@ -103,7 +103,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
     from rigsim.as_built.sphere import as_drawn
     from rigsim.population import files as subject_file
     from rigsim.scenes.gradient.scene import GradientScene
-    from skinrig.benchmarks.gradient_normals import NEUTRAL, lights_of, pixel_geometry
+    from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
 
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
     size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
+from skinrig.capturing.light_safety import light_figures
 from skinrig.errors import UsageError
-from skinrig.light_safety import light_figures
 from skinrig.written_units import written
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -89,7 +89,7 @@ class Choice:
     reasons: tuple[str, ...] = ()
     """Why what is wanted is not reached, or what the forecast rests on."""
     light: Mapping[str, Any] = field(default_factory=dict)
-    """Flicker and dose, see `skinrig.light_safety.light_figures`."""
+    """Flicker and dose, see `skinrig.capturing.light_safety.light_figures`."""
 
     @property
     def reached(self) -> bool:
@@ -233,7 +233,7 @@ def choose(
     if most_lights is not None and rig_name != "dome":
         raise OptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
-        from skinrig.acquisition import read_plan
+        from skinrig.capturing.acquisition import read_plan
 
         plan = read_plan(forecast)
         if plan.rig != rig.name:

@@ -60,7 +60,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     from rigsim.population import files as subject_file
     from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
-    from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
+    from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
     from skinrig.simulating.probe import PHOTONS
 
     if rig.probe is None:

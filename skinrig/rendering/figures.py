@@ -20,9 +20,9 @@ from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, reduced
 from skinrig.rendering.camera import Camera
 from skinrig.rendering.geometry import FittedSurface, own_mesh, read_mesh
+from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
-from skinrig.rendering.pictures import Panel, exposure_of, sheet, tone
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
 from skinrig.rendering.shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
@@ -163,7 +163,7 @@ def draw_photograph(
     UnusableError
         The session holds no such photograph that the model has not seen.
     """
-    from skinrig.rendering.photographs import Photographs
+    from skinrig.rendering.photographs.held_out import Photographs
 
     folder.check(out)
     photographs = Photographs.of(session, subject.appearance, calibration=calibration)
@@ -352,7 +352,7 @@ def _words(sigma: Sequence[float]) -> str:
 
 
 def _png(image: NDArray[np.floating], exposure: float) -> bytes:
-    from skinrig.reporting import png
+    from skinrig.drawing import png
 
     return png.encode(tone(image, exposure))
 

@@ -10,8 +10,8 @@ from typing import Any
 from model import store
 from skinrig import consent
 from skinrig.reporting import page
-from skinrig.reporting import pictures as pictures_section
 from skinrig.reporting.folders import Findings
+from skinrig.reporting.sections import images as pictures_section
 
 
 def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:

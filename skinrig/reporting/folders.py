@@ -13,7 +13,7 @@ from typing import Any
 from capture.calibration.store import SCHEMA as CALIBRATION_SCHEMA
 from model import store
 from model.skin import SkinAppearance
-from skinrig.reporting import pictures as pictures_section
+from skinrig.reporting.sections import images as pictures_section
 
 
 class ReportError(ValueError):

@@ -268,7 +268,7 @@ def _anchor(heading: str, taken: set[str]) -> str:
 
 def _bars() -> str:
     """Return the style of the color scales' bars, of the same colors as the pictures."""
-    from skinrig.reporting import png
+    from skinrig.drawing import png
 
     rules = []
     for scale, name in png.SCALES.items():

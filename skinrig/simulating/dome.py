@@ -15,8 +15,8 @@ from capture.plan.rows import lights_of
 from capture.rig import Rig, load_rig
 from model import store
 from model.skin import SkinAppearance
+from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
-from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     OptionsError,

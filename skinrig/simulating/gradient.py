@@ -19,7 +19,7 @@ from capture.plan.gradient import (
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
-from skinrig.light_safety import light_figures, light_lines
+from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     Order,

@@ -21,8 +21,8 @@ from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
-from skinrig.acquisition import directions_of
-from skinrig.light_safety import light_figures, light_lines
+from skinrig.capturing.acquisition import directions_of
+from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     Order,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
-from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
+from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
 from skinrig.simulating.flash import (
     WIDTHS_PX,

@@ -23,8 +23,8 @@ from capture.devices.probe import ProbeBox
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
+from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError
-from skinrig.sequences import SequenceOrder
 from skinrig.simulating.leaving_out import left_out_of
 from skinrig.simulating.resumption import refusals
 from skinrig.simulating.shot_numbers import shots_made
@@ -63,7 +63,7 @@ class Simulated:
     blur_mm: tuple[float, ...] = ()
     """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
     light: Mapping[str, float | str] = field(default_factory=dict)
-    """Figures of the LEDs' light, see `skinrig.light_safety`; empty for the flash rig."""
+    """Figures of the LEDs' light, see `skinrig.capturing.light_safety`; empty for the flash rig."""
     effects: tuple[Mapping[str, Any], ...] = ()
     """What the scene built and what not, with reasons, see `rigsim.needs.effects.Effect`."""
 

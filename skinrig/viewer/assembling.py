@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from skinrig.viewer import (
-    facial_color_assets,
-    fitted_assets,
-    microstructure_assets,
-    presets,
-    scattering_assets,
-    surface_assets,
-    wrinkle_assets,
-)
+from skinrig.viewer import presets
+from skinrig.viewer.assets import facial_color as facial_color_assets
+from skinrig.viewer.assets import fitted as fitted_assets
+from skinrig.viewer.assets import scattering as scattering_assets
+from skinrig.viewer.assets import surface as surface_assets
+from skinrig.viewer.assets import wrinkles as wrinkle_assets
+from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
 
 BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (

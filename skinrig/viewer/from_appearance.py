@@ -12,11 +12,12 @@ from typing import Any, Final
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
-from skinrig import dynamic_appearance
-from skinrig.viewer import patch_charts, procedural
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.viewer import procedural
 from skinrig.viewer.assembling import assemble
 from skinrig.viewer.fine_skin import FineSkin
-from skinrig.viewer.patch_charts import ClosedMesh
+from skinrig.viewer.holes import patch_charts
+from skinrig.viewer.holes.patch_charts import ClosedMesh
 from skinrig.viewer.scene import Kind, SceneError, SceneSource, ViewerScene
 
 MESH: Final = "mesh.obj"

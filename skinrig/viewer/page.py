@@ -10,8 +10,8 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Final
 
-from skinrig.viewer.packing import Packed, pack
-from skinrig.viewer.page_text import as_text
+from skinrig.viewer.packing.arrays import Packed, pack
+from skinrig.viewer.packing.page_text import as_text
 from skinrig.viewer.scene import ViewerScene
 
 SCRIPTS: Final = (

@@ -42,7 +42,7 @@ def scene(
     ------
     SceneError
         For a size out of range.
-    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.BlendShapeError
+    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.errors.BlendShapeError
         For a preset, seed or mesh that cannot be used.
     """
     check_size(size)
@@ -81,11 +81,11 @@ def load_mesh(path: Path) -> Mesh:
     Parameters
     ----------
     path
-        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.load`. The face
+        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The face
         looks towards +z, and its foremost vertex is the tip of the nose.
     """
     from rigsim.geometry.mesh import build_mesh, centered
-    from skinrig import blend_shapes
+    from skinrig.blend_shapes import meshes as blend_shapes
 
     loaded = blend_shapes.load(path)
     if loaded.uv.min() < 0.0 or loaded.uv.max() > 1.0:

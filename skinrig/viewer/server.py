@@ -17,7 +17,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
-from skinrig.viewer.tiles import Pyramid, TileError
+from skinrig.viewer.microstructure.tiles import Pyramid, TileError
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from model import store
 from skinrig import consent
-from skinrig.viewer import packing, page
+from skinrig.viewer import page
+from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import SceneError, ViewerScene
 
 if TYPE_CHECKING:
@@ -136,12 +137,14 @@ def serve(
 
     Raises
     ------
-    skinrig.viewer.server.ServerError, skinrig.viewer.tiles.TileError
+    skinrig.viewer.server.ServerError, skinrig.viewer.microstructure.tiles.TileError
         A port that is taken; a file that is no displacement.
     """
     import tempfile
 
-    from skinrig.viewer import microstructure_assets, server, tiles
+    from skinrig.viewer import server
+    from skinrig.viewer.microstructure import assets as microstructure_assets
+    from skinrig.viewer.microstructure import tiles
 
     with tempfile.TemporaryDirectory(prefix="skinrig-view-") as name:
         pyramid = None

@@ -10,7 +10,7 @@ import pytest
 from skinrig.benchmarks.document import SCHEMA
 from skinrig.benchmarks.stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, plain
-from skinrig.skin_bands import MELANIN_BANDS
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
 HEAVY = {

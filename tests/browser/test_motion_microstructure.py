@@ -19,8 +19,8 @@ from model.microstructure.convolution import LineKernels, convolve
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import TextureStrain, line_kernels, rasterize
-from skinrig.viewer.packing import as_packed
-from skinrig.viewer.relief_growth import GrownRelief
+from skinrig.viewer.microstructure.relief_growth import GrownRelief
+from skinrig.viewer.packing.arrays import as_packed
 
 Float32 = NDArray[np.float32]
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skinrig.viewer import microstructure_assets, page, server, tiles
+from skinrig.viewer import page, server
+from skinrig.viewer.microstructure import assets as microstructure_assets
+from skinrig.viewer.microstructure import tiles
 
 SIZE, WINDOW = 2048, 256
 

@@ -13,8 +13,9 @@ from model import wrinkles
 from model.wrinkles import Layer
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
-from skinrig.viewer import page, wrinkle_assets
-from skinrig.viewer.packing import as_packed
+from skinrig.viewer import page
+from skinrig.viewer.assets import wrinkles as wrinkle_assets
+from skinrig.viewer.packing.arrays import as_packed
 
 ZONES = tuple("abcdefgh")
 TABLES = (
@@ -198,7 +199,7 @@ def test_hybrid_normals_are_softest_in_red_and_sharp_in_the_highlight(viewer, pr
     covered = source[..., 3] > 0.5
     assert covered.mean() > 0.5
     side = source.shape[0]
-    from skinrig.viewer.microstructure_assets import px_per_mm
+    from skinrig.viewer.microstructure.assets import px_per_mm
 
     per_mm = side * float(np.median(px_per_mm(as_packed(procedural_scene).mesh)))
     sigma = np.array(viewer.page.evaluate("() => window.viewer.params.hybrid_sigma_mm")) * per_mm

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from model import skin_reflectance
 from model.brdf import tables as brdf_tables
-from skinrig.viewer import reflectance_assets, trait_assets
-from skinrig.viewer.albedo_trait_assets import AlbedoTraits
-from skinrig.viewer.packing import as_packed
-from skinrig.viewer.reflectance_assets import PageLobes
+from skinrig.viewer.assets import reflectance as reflectance_assets
+from skinrig.viewer.assets import traits as trait_assets
+from skinrig.viewer.assets.albedo_traits import AlbedoTraits
+from skinrig.viewer.assets.reflectance import PageLobes
+from skinrig.viewer.assets.traits import LobeTraits
+from skinrig.viewer.packing.arrays import as_packed
 from skinrig.viewer.scene import SceneSource, Texture
-from skinrig.viewer.trait_assets import LobeTraits
 
 pytestmark = pytest.mark.long
 

@@ -12,7 +12,8 @@ from model.facial_color import HemoglobinRig, StateMaps
 from model.facial_color.rig import GLOBAL_GAINS
 from model.real_time import facial_specular, screen_scattering, tone_mapping
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from skinrig.viewer import packing, page
+from skinrig.viewer import page
+from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import Texture
 
 pytestmark = pytest.mark.long

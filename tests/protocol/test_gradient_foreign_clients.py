@@ -11,7 +11,7 @@ from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port, PortBusy, WrongDevice
 from capture.rig import load_rig
 from rigsim.world.serve import ServeError, serve
-from skinrig.addresses import addresses, require_addresses
+from skinrig.capturing.addresses import addresses, require_addresses
 from skinrig.errors import UsageError
 
 RIG = load_rig("gradient").cropped(16)

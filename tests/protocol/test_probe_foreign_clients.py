@@ -9,7 +9,7 @@ from capture.devices.port import Port, PortBusy
 from capture.devices.probe import ProbeBox
 from capture.rig import load_rig
 from rigsim.world.serve import serve
-from skinrig.addresses import require_addresses
+from skinrig.capturing.addresses import require_addresses
 from skinrig.errors import UsageError
 
 RIG = load_rig("probe")

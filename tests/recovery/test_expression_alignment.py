@@ -12,7 +12,7 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.correspondence import expression_alignment
 from reconstruction.facial_color import shared_melanin
-from skinrig.benchmarks.alignment import (
+from skinrig.benchmarks.flash_rig.alignment import (
     displaced,
     face_of,
     moved_face,

@@ -12,7 +12,7 @@ from reconstruction.chromophores import shading_prior
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
-from skinrig.benchmarks import interval_trials_flash
+from skinrig.benchmarks.intervals import flash as interval_trials_flash
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.facial_color import WAYS, compare, true_blood
 from skinrig.fitting.facial_color import fit_facial_color

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruction.registration import head_motion
-from skinrig.benchmarks.motion import simulate
+from skinrig.benchmarks.dome.motion import simulate
 
 
 @pytest.mark.long

@@ -20,9 +20,9 @@ from reconstruction.pipeline import recipes as pipeline
 from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
-from skinrig.rendering import evaluation
-from skinrig.rendering.photograph_errors import LIMIT
-from skinrig.rendering.photographs import Photographs, PhotographsError
+from skinrig.rendering.photographs import evaluation
+from skinrig.rendering.photographs.errors import LIMIT
+from skinrig.rendering.photographs.held_out import Photographs, PhotographsError
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.simulation import simulate_session
 

@@ -12,7 +12,7 @@ import pytest
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import deform
-from skinrig.benchmarks.microstructure import (
+from skinrig.benchmarks.gradient_rig.microstructure import (
     TEXEL_UM,
     fitted_table,
     slopes_under,

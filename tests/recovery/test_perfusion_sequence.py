@@ -10,7 +10,7 @@ import pytest
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.evidence import EvidenceError
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.sequences import SequenceOrder
+from skinrig.capturing.sequences import SequenceOrder
 from skinrig.simulating.simulation import SimulationError, simulate_session
 
 WIDTH_PX = 192

@@ -14,7 +14,7 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import zones as wrinkle_zones
 from rigsim.subject import make_subject
-from skinrig.benchmarks import wrinkles as bench_wrinkles
+from skinrig.benchmarks.gradient_rig import wrinkles as bench_wrinkles
 
 EXPRESSIONS = ("anger", "disgust", "fear", "happiness", "sadness", "surprise")
 

@@ -186,7 +186,7 @@ def test_an_interrupted_benchmark_is_told_where_its_measurements_are(
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", interrupted)
-    monkeypatch.setattr("skinrig.reporting.extremes.run_extremes", interrupted)
+    monkeypatch.setattr("skinrig.reporting.sections.extremes.run_extremes", interrupted)
     assert main(["bench", *argv]) == 130
     assert ("bench.json in --out keeps" in capsys.readouterr().err) == kept
 

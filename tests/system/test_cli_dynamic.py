@@ -9,7 +9,7 @@ from model import store
 from model.facial_color import HemoglobinRig
 from model.facial_color import document as facial_color_document
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig import dynamic_appearance as dynamic
+from skinrig.appearances import dynamic
 from skinrig.cli import main
 
 SIDE = 40

@@ -15,8 +15,8 @@ from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.cli import app, main
-from skinrig.exporting import obj
-from skinrig.exporting.tangents import FramedMesh
+from skinrig.exporting.materials import obj
+from skinrig.exporting.materials.tangents import FramedMesh
 
 SIDE = 32
 
@@ -132,7 +132,9 @@ def test_simulated_maps_need_no_use(tmp_path, capsys):
 
 
 def test_the_help_names_every_format():
-    from skinrig.exporting import appearances, brdfs, light_lists, sessions, stokes
+    from skinrig.exporting import appearances, brdfs
+    from skinrig.exporting.sessions import handing as sessions
+    from skinrig.exporting.sessions import light_lists, stokes
 
     text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
     text = re.sub(r"-\s+", "-", text)  # lines end at hyphens, too

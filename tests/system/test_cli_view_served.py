@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from skinrig.console import Console
 from skinrig.viewer import writing
+from skinrig.viewer.microstructure.tiles import TileError
 from skinrig.viewer.scene import ViewerMesh, ViewerScene
-from skinrig.viewer.tiles import TileError
 
 
 @pytest.fixture

@@ -152,7 +152,7 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
     monkeypatch.setattr(
         "rigsim.world.serve.serve", lambda *args, **settings: Served(addresses=addresses)
     )
-    monkeypatch.setattr("skinrig.serving._flash_scene", lambda *args: None)
+    monkeypatch.setattr("skinrig.simulating.serving._flash_scene", lambda *args: None)
     assert main(["serve", "flash", "--json"]) == errors.INTERRUPTED
     told = json.loads(capsys.readouterr().out)
     assert told["schema"] == "skinrig.serve/1"

@@ -296,7 +296,7 @@ def test_the_maps_page_lists_the_files_that_go_along():
 def test_the_figures_of_the_domes_light_are_those_of_its_plan():
     from capture.plan.dome import dome_plan
     from capture.rig import load_rig
-    from skinrig.light_safety import light_figures
+    from skinrig.capturing.light_safety import light_figures
 
     rig = load_rig("dome")
     plan = dome_plan(rig)

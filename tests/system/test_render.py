@@ -11,10 +11,10 @@ from model.brdf import tables as brdf_tables
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig.cli import main
 from skinrig.rendering import camera as rendering_camera
-from skinrig.rendering import photographs
 from skinrig.rendering.lights import Light
-from skinrig.rendering.photograph_errors import Photograph
-from skinrig.rendering.photographs import Shot
+from skinrig.rendering.photographs import held_out as photographs
+from skinrig.rendering.photographs.errors import Photograph
+from skinrig.rendering.photographs.held_out import Shot
 
 SIZE = 32
 STEPS = 24

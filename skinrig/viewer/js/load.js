@@ -30,7 +30,7 @@ V.inflate = async (text, count) => {
 };
 
 // Words of half as many texels a side, doubled linearly in whole numbers, and the steps of the
-// finest octave; as skinrig.viewer.packing.joined.
+// finest octave; as skinrig.viewer.packing.arrays.joined.
 V.joinOctaves = (buffer, entry) => {
   const coarse = V.unpackArray(buffer, entry.coarse);
   const steps = new Int8Array(V.unpackArray(buffer, entry.steps).buffer);

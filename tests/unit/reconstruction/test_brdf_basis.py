@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
-from skinrig import brdf_truth
+from skinrig.benchmarks.dome import brdf_truth
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from model import dipole
 from reconstruction.diffuse_albedo.estimation import estimate, reduced_albedo
-from skinrig import brdf_truth
+from skinrig.benchmarks.dome import brdf_truth
 
 SKINS = {"light": brdf_truth.LIGHT_SKIN, "dark": brdf_truth.DARK_SKIN}
 

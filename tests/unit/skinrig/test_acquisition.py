@@ -11,7 +11,7 @@ from capture.rig import load_rig
 from capture.session import Session
 from rigsim.world.faults import Faults
 from rigsim.world.world import World
-from skinrig import acquisition, addresses
+from skinrig.capturing import acquisition, addresses
 from skinrig.cli import main
 from skinrig.errors import UsageError
 

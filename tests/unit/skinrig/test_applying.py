@@ -10,7 +10,7 @@ from model.skin import UNITS, SkinAppearance, SkinMap
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.partial_derivatives import Layer
-from skinrig import dynamic_appearance as dynamic
+from skinrig.appearances import dynamic
 from skinrig.applying import expression
 from skinrig.applying.expression import (
     ApplyError,

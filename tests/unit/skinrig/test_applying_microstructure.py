@@ -8,7 +8,7 @@ from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_para
 from model.microstructure.mesh_strain import StrainError
 from model.microstructure.strain_fields import KernelRegions
 from skinrig.applying.microstructure import ApplyMicrostructureError, apply_microstructure
-from skinrig.blend_shapes import BlendShapeMesh
+from skinrig.blend_shapes.meshes import BlendShapeMesh
 
 
 def square_mm(side=1.0, n=5):

@@ -6,7 +6,7 @@ import pytest
 from model import store
 from model.microstructure.kernel_table import FOREHEAD
 from model.skin import SkinMap
-from skinrig import dynamic_appearance as dynamic
+from skinrig.appearances import dynamic
 from skinrig.applying.expression import ApplyError, Expression, apply_expression
 from skinrig.applying.relief import Relief
 

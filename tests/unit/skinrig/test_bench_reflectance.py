@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skinrig.benchmarks import reflectance
+from skinrig.benchmarks.dome import reflectance
 
 
 def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from skinrig.benchmarks import synthesis
+from skinrig.benchmarks.gradient_rig import synthesis
 
 
 @pytest.fixture

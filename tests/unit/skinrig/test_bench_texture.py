@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.texture_statistics.steerable_pyramid import analyze
-from skinrig.benchmarks import texture
+from skinrig.benchmarks.dome import texture
 
 
 def test_a_missing_peer_is_said_and_no_limit_is_claimed(monkeypatch):

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import knee, pareto_front, to_document
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
 
 
 def point(seconds, error):
@@ -97,7 +97,7 @@ def test_a_reference_of_its_own_error_is_told_from_the_truth():
 
 
 def test_memory_of_slow_calls_is_what_the_process_grew_by(monkeypatch):
-    monkeypatch.setattr("skinrig.benchmark.TRACED_S", 0.0)
+    monkeypatch.setattr("skinrig.benchmarks.measurement.TRACED_S", 0.0)
     with resident_memory.watched() as seen:
         pass
     if seen.mb is None:

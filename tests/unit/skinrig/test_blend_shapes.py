@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from model.microstructure.mesh_strain import strain
-from skinrig.blend_shapes import BlendShapeError, BlendShapeFileError, load
+from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
+from skinrig.blend_shapes.meshes import load
 
 ICT = Path(__file__).parents[4] / "shared/data/ict_face.npz"
 

@@ -6,7 +6,7 @@ from model.skin import UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.inversion import identifiability
-from skinrig.bounds import cramer_rao, relative_bounds
+from skinrig.evaluating.bounds import cramer_rao, relative_bounds
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 

@@ -7,8 +7,8 @@ import pytest
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from skinrig import dynamic_appearance as dynamic
-from skinrig.dynamic_appearance import FACIAL_COLOR, MICROSTRUCTURE, DynamicAppearanceError, Part
+from skinrig.appearances import dynamic
+from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, DynamicAppearanceError, Part
 
 
 def part(value: float, name: str = "a", source: str = "measured") -> Part:

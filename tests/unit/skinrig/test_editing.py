@@ -10,12 +10,12 @@ from model import store
 from model.skin import SkinMap
 from model.skin_reflectance import lobes_of
 from model.traits.storage import load
-from skinrig import face_textures
+from skinrig.appearances import face_textures
 from skinrig.cli import main
+from skinrig.drawing import png
 from skinrig.editing import edit as editing
 from skinrig.editing.edit import EditError, Order
 from skinrig.editing.spots import SpotOrder
-from skinrig.reporting import png
 
 
 @pytest.fixture(scope="module")

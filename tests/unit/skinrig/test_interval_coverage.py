@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skinrig.benchmarks.interval_coverage import (
+from skinrig.benchmarks.intervals.coverage import (
     GAUSSIAN_95,
     LEVELS,
     RAYLEIGH_95,

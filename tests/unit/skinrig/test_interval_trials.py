@@ -7,9 +7,9 @@ import pytest
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, SUBSURFACE_FILE
-from skinrig.benchmarks import interval_trials_probe as probe
-from skinrig.benchmarks.interval_coverage import pooled
-from skinrig.benchmarks.interval_trials import of_map
+from skinrig.benchmarks.intervals import probe
+from skinrig.benchmarks.intervals.coverage import pooled
+from skinrig.benchmarks.intervals.trials import of_map
 
 PLACE = {"site": "cheek", "repeat": 0, "angle_deg": 0.0}
 CHANNELS = ("red", "green", "blue")

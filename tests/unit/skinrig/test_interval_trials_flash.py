@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from reconstruction.chromophores import shading_prior
-from skinrig.benchmarks import interval_trials_flash as trials
+from skinrig.benchmarks.intervals import flash as trials
 
 
 def test_subjects_stand_off_the_tiles_place_by_what_the_stated_error_of_light_is_of():

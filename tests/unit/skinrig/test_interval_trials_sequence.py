@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reconstruction.facial_color.perfusion_fit import fit_course
-from skinrig.benchmarks.interval_coverage import pooled
-from skinrig.benchmarks.interval_trials_sequence import REACTIONS_S, of_fits, order_of
+from skinrig.benchmarks.intervals.coverage import pooled
+from skinrig.benchmarks.intervals.sequence import REACTIONS_S, of_fits, order_of
 
 CONSTANT_S = 20.0
 

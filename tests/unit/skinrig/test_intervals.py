@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from reconstruction.anisotropy import estimation as anisotropy
-from skinrig.benchmark import Timing
-from skinrig.benchmarks import interval_trials_probe, intervals
-from skinrig.benchmarks.interval_coverage import Covered
+from skinrig.benchmarks.intervals import coverage_stage as intervals
+from skinrig.benchmarks.intervals import probe as interval_trials_probe
+from skinrig.benchmarks.intervals.coverage import Covered
+from skinrig.benchmarks.measurement import Timing
 
 ONCE = Timing(1.0, (1.0, 1.0), 1.0, None)
 

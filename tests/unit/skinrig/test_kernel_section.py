@@ -7,7 +7,7 @@ import pytest
 
 from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
-from skinrig.reporting import kernel
+from skinrig.reporting.sections import kernel
 
 FIT = {
     "name": "a000_m1", "angle_deg": 0.0, "stretch_s": 0.9, "alpha": -0.17, "alpha_stderr": 0.12,

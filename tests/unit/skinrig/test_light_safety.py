@@ -8,7 +8,7 @@ from capture.plan.dome import dome_plan
 from capture.plan.gradient import gradient_plan
 from capture.plan.probe import probe_plan
 from capture.rig import load_rig
-from skinrig.light_safety import light_figures, light_rows
+from skinrig.capturing.light_safety import light_figures, light_rows
 
 
 @pytest.mark.parametrize(

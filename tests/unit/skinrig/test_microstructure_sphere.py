@@ -5,8 +5,8 @@ import pytest
 
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from rigsim.skin_patch.microrelief import make_micro_skin
-from skinrig import microstructure_sphere as spheres
-from skinrig.microstructure_sphere import DEFORMATIONS, PLACES, Sphere, SphereError
+from skinrig.applying import microstructure_sphere as spheres
+from skinrig.applying.microstructure_sphere import DEFORMATIONS, PLACES, Sphere, SphereError
 
 SPHERE = Sphere(texels=400, radius_mm=1.95)
 

@@ -9,7 +9,7 @@ import pytest
 from skinrig.cli import main
 from skinrig.next_steps import CALIBRATIONS, OPENER, after_session, suggest, welcome
 from skinrig.reporting.page import document
-from skinrig.surroundings import look
+from skinrig.workspace import look
 
 
 def session(path, rig="flash", kinds=("dark", "subject"), target=""):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from skinrig.reporting import omissions
+from skinrig.reporting.sections import omissions
 
 EFFECTS = [
     {"name": "shadows", "verdict": "built", "reason": "a face", "over_noise": 55.0, "switch": ""},

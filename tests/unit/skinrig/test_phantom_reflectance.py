@@ -12,7 +12,7 @@ from capture.calibration.fiber.phantom import (
 )
 from capture.rig import load_rig
 from model import photon_table
-from skinrig.phantom_reflectance import expected_reflectance
+from skinrig.calibrating.phantom_reflectance import expected_reflectance
 
 GRAY = PhantomCertificate(
     eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,), sigma_s_prime_per_mm=(1.0,),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skinrig.rendering import photograph_errors as errors
-from skinrig.rendering.photograph_errors import Photograph, PhotographError
+from skinrig.rendering.photographs import errors
+from skinrig.rendering.photographs.errors import Photograph, PhotographError
 
 SIDE = 24
 

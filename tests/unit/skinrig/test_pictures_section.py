@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from skinrig.drawing import png
 from skinrig.report import ReportError, build
-from skinrig.reporting import page, pictures, png
+from skinrig.reporting import page
+from skinrig.reporting.sections import images as pictures
 
 
 def a_row(median):

@@ -11,7 +11,8 @@ from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from reconstruction.photometric_stereo import light_selection
 from skinrig.cli import main
-from skinrig.planning import dome, dome_sight, plans
+from skinrig.planning import dome, plans
+from skinrig.planning import dome_observation as dome_sight
 
 
 @pytest.mark.parametrize(

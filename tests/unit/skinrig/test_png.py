@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from skinrig.reporting import png
+from skinrig.drawing import png
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (4, 2, 3)])

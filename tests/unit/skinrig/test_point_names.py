@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from skinrig.reporting import figures, point_names
+from skinrig.drawing import figures, point_names
 
 
 def boxes(axes):

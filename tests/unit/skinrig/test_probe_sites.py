@@ -8,8 +8,8 @@ import pytest
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.subsurface.translucency import SITE_UV, TranslucencyError
 from rigsim.subject.head import build_head
-from skinrig import probe_sites
-from skinrig.probe_sites import ProbeSiteError
+from skinrig.fitting import probe_sites
+from skinrig.fitting.probe_sites import ProbeSiteError
 
 CHANNELS = ("red", "green", "blue")
 MEASURED = {

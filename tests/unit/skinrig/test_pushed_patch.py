@@ -7,8 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
-from skinrig import errors, pushed_patch
-from skinrig.pushed_patch import Push, PushDiverged, PushError, SkinBlock
+from skinrig import errors
+from skinrig.applying import pushed_patch
+from skinrig.applying.pushed_patch import Push, PushDiverged, PushError, SkinBlock
 
 pytest.importorskip("skfem")
 

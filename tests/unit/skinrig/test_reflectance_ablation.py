@@ -6,9 +6,9 @@ import pytest
 from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, lobe_brdf
 from rigsim.geometry.mesh import build_mesh
-from skinrig import skin_bands
-from skinrig.rendering.ablation import one_lobe, without_parts
-from skinrig.rendering.photographs import PhotographsError, Shot, _evenly
+from skinrig.evaluating import skin_bands
+from skinrig.rendering.photographs.ablation import one_lobe, without_parts
+from skinrig.rendering.photographs.held_out import PhotographsError, Shot, _evenly
 
 SIDE = 8
 

@@ -10,8 +10,8 @@ from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, nearest_shares, reduced
 from skinrig.rendering.geometry import FittedSurface
+from skinrig.rendering.images import KNEE, Panel, sheet, tone
 from skinrig.rendering.lookup_kernels import NEAR_TEXELS, look_up
-from skinrig.rendering.pictures import KNEE, Panel, sheet, tone
 from skinrig.rendering.shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
 
 SIZE = 48

@@ -7,11 +7,11 @@ from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig import report
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.document import to_document
-from skinrig.reporting import population
-from skinrig.reporting.chromophore import panels
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.reporting.folders import discover
+from skinrig.reporting.sections import population
+from skinrig.reporting.sections.chromophore import panels
 
 
 @pytest.fixture

@@ -9,9 +9,12 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig.appearances.front_view import WIDTH_PX
 from skinrig.cli import main
-from skinrig.front_view import WIDTH_PX
-from skinrig.reporting import folders, map_comparison, map_pictures, run_comparison, verdict
+from skinrig.reporting import folders, verdict
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting.comparison import maps as map_comparison
+from skinrig.reporting.comparison import runs as run_comparison
 
 PAGE = Path(__file__).parents[3] / "docs" / "report.md"
 

@@ -9,11 +9,13 @@ import pytest
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import report
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.document import to_document
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.report import ReportError
-from skinrig.reporting import map_comparison, run_comparison, truth_errors
-from skinrig.reporting.map_comparison import BY_CHANCE, compare
+from skinrig.reporting.comparison import maps as map_comparison
+from skinrig.reporting.comparison import runs as run_comparison
+from skinrig.reporting.comparison import truth_errors
+from skinrig.reporting.comparison.maps import BY_CHANCE, compare
 
 SIDE = 200
 PIXELS = SIDE * SIDE

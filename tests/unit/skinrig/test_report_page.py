@@ -16,7 +16,9 @@ from PIL import Image
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import report
-from skinrig.reporting import figures, map_pictures, page, png, svg, verdict
+from skinrig.drawing import figures, png, svg
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import page, verdict
 
 
 class Outline(HTMLParser):

@@ -7,7 +7,9 @@ import pytest
 
 from model import store
 from skinrig import report
-from skinrig.reporting import picture_comparison, png, run_comparison
+from skinrig.drawing import png
+from skinrig.reporting.comparison import images as picture_comparison
+from skinrig.reporting.comparison import runs as run_comparison
 
 
 def folder(path, radiance, *, shown=None, **told):

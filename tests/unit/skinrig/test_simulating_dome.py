@@ -9,8 +9,8 @@ import pytest
 
 from capture.rig import load_rig
 from capture.session import Session, verify
+from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.cli import main
-from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulating.dome import small_dome, spread
 from skinrig.simulating.simulation import SimulationError, simulate_session
 

@@ -40,7 +40,7 @@ def test_a_place_that_no_face_can_stand_at_is_refused_before_a_folder_is_made(
 
 
 def test_a_sequence_has_no_place_of_its_own(tmp_path):
-    from skinrig.sequences import SequenceOrder
+    from skinrig.capturing.sequences import SequenceOrder
 
     order = SequenceOrder(state="smile")
     with pytest.raises(SimulationError, match=r"nearer: .* not of a sequence"):

@@ -5,9 +5,9 @@ import pytest
 from capture.plan.gradient import gradient_calibration_plan, gradient_plan
 from capture.rig import load_rig
 from capture.session import verify
-from skinrig.acquisition import choose_plan, needed_boxes, numbers_of, range_of
+from skinrig.capturing.acquisition import choose_plan, needed_boxes, numbers_of, range_of
+from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.errors import UsageError
-from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulating.gradient import make_scene
 from skinrig.simulating.simulation import SimulationError, simulate_session
 

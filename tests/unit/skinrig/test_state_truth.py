@@ -5,7 +5,7 @@ import pytest
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from skinrig.state_truth import truth_beside, truth_of_state
+from skinrig.appearances.state_truth import truth_beside, truth_of_state
 
 
 def write(folder, state):

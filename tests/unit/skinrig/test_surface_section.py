@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.front_view import FrontView
+from skinrig.appearances.front_view import FrontView
 from skinrig.reporting import page
-from skinrig.reporting.surface import section
+from skinrig.reporting.sections.surface import section
 
 BOX = np.array([0.0, 0.0, 0.0]), np.array([10.0, 20.0, 5.0])
 

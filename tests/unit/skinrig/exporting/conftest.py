@@ -12,8 +12,8 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from skinrig.exporting import obj
-from skinrig.exporting.tangents import FramedMesh
+from skinrig.exporting.materials import obj
+from skinrig.exporting.materials.tangents import FramedMesh
 
 collect_ignore = ["read_in_blender.py"]  # of Blender's Python
 

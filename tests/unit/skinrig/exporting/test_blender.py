@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinrig.exporting import blender, gltf, usd
 from skinrig.exporting.images import srgb_curve
-from skinrig.exporting.material import Material
+from skinrig.exporting.materials import blender, gltf, usd
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery
 
 READER = Path(__file__).with_name("read_in_blender.py")

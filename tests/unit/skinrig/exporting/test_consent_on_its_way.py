@@ -12,8 +12,8 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import load
 from skinrig import consent, report
+from skinrig.appearances.dynamic import parts_of
 from skinrig.cli import main
-from skinrig.dynamic_appearance import parts_of
 from skinrig.editing import edit as editing
 from skinrig.editing.spots import SpotOrder
 from skinrig.exporting.appearances import export_appearance
@@ -180,7 +180,8 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
 
 @pytest.mark.long
 def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_path):
-    from skinrig.viewer import packing, writing
+    from skinrig.viewer import writing
+    from skinrig.viewer.packing import arrays as packing
 
     scene = writing.compose([dome("dome")], size=64)
     assert scene.provenance[consent.KEY] == ["P042: research, until 2030-01-01"]

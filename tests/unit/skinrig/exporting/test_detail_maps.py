@@ -10,11 +10,11 @@ import pytest
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from skinrig.exporting import color_deltas, delta_maps, detail_maps
-from skinrig.exporting.detail_maps import visible_share
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.options import Delivery
-from skinrig.exporting.seamless import periodic, periodic_normals
+from skinrig.exporting.packs import color_deltas, delta_maps, detail_maps
+from skinrig.exporting.packs.detail_maps import visible_share
+from skinrig.exporting.packs.seamless import periodic, periodic_normals
 
 SIDE = 48
 

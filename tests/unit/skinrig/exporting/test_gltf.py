@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from skinrig import blend_shapes
+from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.errors import UsageError
-from skinrig.exporting import gltf
 from skinrig.exporting.images import srgb_curve
-from skinrig.exporting.material import Material
+from skinrig.exporting.materials import gltf
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery
 
 MM = 0.001

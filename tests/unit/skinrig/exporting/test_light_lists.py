@@ -11,8 +11,8 @@ from capture import raw
 from capture.importers import import_light_list
 from capture.importers.light_lists import find
 from capture.session import ConsentError, Subject
-from skinrig.exporting.light_lists import export_light_list, in_camera_frame
 from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.sessions.light_lists import export_light_list, in_camera_frame
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 SHAPE = (12, 16)

@@ -9,9 +9,9 @@ import pytest
 
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig.exporting import maps
+from skinrig.exporting.materials.tangents import FramedMesh, from_tangent
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.tangents import FramedMesh, from_tangent
 
 
 def read(path):

@@ -8,10 +8,10 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from skinrig.exporting import materialx
-from skinrig.exporting.material import Material
+from skinrig.exporting.materials import materialx
+from skinrig.exporting.materials.material import Material
+from skinrig.exporting.materials.subsurface_radius import translucency_mm
 from skinrig.exporting.options import Delivery
-from skinrig.exporting.subsurface_radius import translucency_mm
 
 MM = {"m": 1e-3, "cm": 0.1, "mm": 1.0}
 

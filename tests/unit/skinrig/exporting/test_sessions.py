@@ -15,8 +15,8 @@ from capture.session import ConsentError, Session, SessionDamage, Subject, verif
 from capture.session.mhl import c4_id
 from skinrig.cli import main
 from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.sessions import FORMATS
-from skinrig.exporting.sessions import export_session as export
+from skinrig.exporting.sessions.handing import FORMATS
+from skinrig.exporting.sessions.handing import export_session as export
 
 RIG = load_rig("flash").resized(16)
 DAY = date(2030, 1, 1)

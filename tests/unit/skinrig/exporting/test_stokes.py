@@ -14,7 +14,7 @@ from capture.rig import load_rig
 from capture.session import ConsentError, Session, Subject
 from skinrig.cli import main
 from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.stokes import export_stokes, file_stem
+from skinrig.exporting.sessions.stokes import export_stokes, file_stem
 
 RIG = load_rig("gradient").resized(16)
 DAY = date(2030, 1, 1)

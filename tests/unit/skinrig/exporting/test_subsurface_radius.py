@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import brentq
 
 from model.tissue_optics.layers import layer_stack_reflectance
-from skinrig.exporting.material import deficit_of
-from skinrig.exporting.subsurface_radius import (
+from skinrig.exporting.materials.material import deficit_of
+from skinrig.exporting.materials.subsurface_radius import (
     decay,
     deficit_root,
     radius_mm,

@@ -5,7 +5,7 @@ import pytest
 
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
-from skinrig.exporting.surface_fit import fit
+from skinrig.exporting.materials.surface_fit import fit
 
 
 def lobes_named(*names):

@@ -5,7 +5,7 @@ import pytest
 
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from skinrig.exporting.tangents import FramedMesh, filled, from_tangent, to_tangent
+from skinrig.exporting.materials.tangents import FramedMesh, filled, from_tangent, to_tangent
 
 SIZE = 48
 

@@ -8,8 +8,8 @@ import pytest
 
 from rigsim.geometry.mesh import Mesh, MeshError
 from skinrig.errors import UnusableError, UsageError
-from skinrig.exporting import gltf, materialx, udim, usd
-from skinrig.exporting.material import Material
+from skinrig.exporting.materials import gltf, materialx, udim, usd
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skinrig.errors import EXTRA_MISSING, MissingExtra, exit_code
-from skinrig.exporting import usd
-from skinrig.exporting.material import Material
+from skinrig.exporting.materials import usd
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery
 
 

@@ -13,7 +13,7 @@ from capture.calibration.record import Quantity
 from model import color_table, spectra
 from model.skin import SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from skinrig.viewer import camera_color
+from skinrig.viewer.assets import camera_color
 from skinrig.viewer.scene import SceneSource, ViewerMesh
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "LED-B3"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rigsim.subject.person import make_subject
-from skinrig.viewer import deflating
 from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.packing import deflating
 
 
 def test_fine_maps_are_those_of_the_person_at_that_size():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rigsim.geometry.mesh import build_mesh
-from skinrig.viewer import hole_closing, patch_charts
+from skinrig.viewer.holes import closing as hole_closing
+from skinrig.viewer.holes import patch_charts
 from skinrig.viewer.scene import Texture
 
 RADIUS_MM = 60.0

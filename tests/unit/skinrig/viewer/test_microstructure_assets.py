@@ -9,9 +9,8 @@ import pytest
 
 from model.microstructure.convolution import convolve
 from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_parameters
-from skinrig.viewer import micro_relief, slope_variances
-from skinrig.viewer import microstructure_assets as assets
-from skinrig.viewer.micro_relief import MicroRelief, MicrostructureAssetError
+from skinrig.viewer.microstructure import assets, micro_relief, slope_variances
+from skinrig.viewer.microstructure.micro_relief import MicroRelief, MicrostructureAssetError
 from skinrig.viewer.scene import ViewerMesh
 
 

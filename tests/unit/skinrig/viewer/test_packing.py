@@ -7,7 +7,8 @@ import gzip
 import numpy as np
 import pytest
 
-from skinrig.viewer import packing, page_text
+from skinrig.viewer.packing import arrays as packing
+from skinrig.viewer.packing import page_text
 from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
 
 

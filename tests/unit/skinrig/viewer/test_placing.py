@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinrig.viewer.placing import PlacingError, place
+from skinrig.viewer.assets.placing import PlacingError, place
 
 SIZE = 48
 FOCAL_PX, EYE_MM = 900.0, np.array([30.0, 10.0, 500.0])

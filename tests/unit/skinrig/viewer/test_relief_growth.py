@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skinrig.viewer import relief_growth
-from skinrig.viewer.relief_growth import LEVELS, GrownRelief, ReliefGrowthError
+from skinrig.viewer.microstructure import relief_growth
+from skinrig.viewer.microstructure.relief_growth import LEVELS, GrownRelief, ReliefGrowthError
 
 
 def gaussian_patch(side: int = 192, sigma: float = 3.0) -> np.ndarray:

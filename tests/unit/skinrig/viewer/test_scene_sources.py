@@ -11,8 +11,10 @@ from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinMap
 from rigsim.subject.landmarks import find
 from rigsim.subject.person import make_subject
-from skinrig import dynamic_appearance
-from skinrig.viewer import facial_color_assets, from_appearance, placed_color, procedural
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.viewer import from_appearance, procedural
+from skinrig.viewer.assets import facial_color as facial_color_assets
+from skinrig.viewer.assets import placed_color
 from skinrig.viewer.scene import SceneError, SceneSource
 
 STATES = ("smile", "exercise")

@@ -8,9 +8,10 @@ import socket
 import numpy as np
 import pytest
 
-from skinrig.viewer import server, tiles
+from skinrig.viewer import server
+from skinrig.viewer.microstructure import tiles
+from skinrig.viewer.microstructure.tiles import TILE_PX, TileError
 from skinrig.viewer.server import ServerError
-from skinrig.viewer.tiles import TILE_PX, TileError
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,11 @@ from model import dipole, fresnel
 from model.brdf import tables as brdf_tables
 from model.traits import lobe_edits
 from model.traits import storage as trait_storage
-from skinrig.viewer import (
-    compact_brdf,
-    gaussian_profiles,
-    presets,
-    reflectance_assets,
-    trait_assets,
-)
-from skinrig.viewer.reflectance_assets import PageLobes
+from skinrig.viewer import presets
+from skinrig.viewer.assets import compact_brdf, gaussian_profiles
+from skinrig.viewer.assets import reflectance as reflectance_assets
+from skinrig.viewer.assets import traits as trait_assets
+from skinrig.viewer.assets.reflectance import PageLobes
 from skinrig.viewer.scene import SceneSource
 
 

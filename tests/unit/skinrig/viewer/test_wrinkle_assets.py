@@ -10,8 +10,8 @@ import pytest
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from model.wrinkles.partial_derivatives import Layer
-from skinrig.viewer import wrinkle_assets
-from skinrig.viewer.wrinkle_assets import WrinkleAssetError
+from skinrig.viewer.assets import wrinkles as wrinkle_assets
+from skinrig.viewer.assets.wrinkles import WrinkleAssetError
 
 ROWS = {"anger": (1.0, -0.5), "joy": (0.0, 1.0)}
 

@@ -1,0 +1,1 @@
+"""Views of appearances: dynamic maps, face textures and ground truth of expressions."""

@@ -1,0 +1,120 @@
+"""Benchmark of merging exposure brackets, beside OpenCV's Debevec merge in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import hdr
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+
+GAIN, READ_NOISE, BLACK, WHITE = 2.0, 8.0, 512.0, 16383.0
+TIMES_FASTER = 5.0
+ABOVE_BOUND = 1.05
+FRAMES, SIDE = 23, 1024
+SPAN_S = (1e-3, 1.0)
+
+Frames = list[NDArray[np.uint16]]
+
+
+def merging(*, toy: bool) -> StageBenchmark:
+    """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
+    side = 64 if toy else SIDE
+    rng = np.random.default_rng(0)
+    scene = np.geomspace(20.0, 2e5, side * side * 3)
+    scene = rng.permutation(scene).reshape(side, side, 3)  # DN per second
+    points = []
+    worst = 0.0
+    frames: Frames = []
+    times = np.ones(1)
+    for count in (2, 3, 5, 9, FRAMES):
+        times = np.geomspace(*SPAN_S, count)
+        frames = [_expose(scene, t, rng) for t in times]
+        timing = measure(lambda f=frames, t=times: _merge(f, t), repeats=1 if toy else 3)  # type: ignore[misc]
+        radiance, _, valid = _merge(frames, times)
+        bound = _bound(scene, times)
+        # near a frame's saturation noise decides whether the frame counts
+        settled = valid & ~np.any(
+            [np.abs(scene * t / (WHITE - BLACK) - 1) < 0.05 for t in times], axis=0
+        )
+        squares = ((radiance - scene) / scene)[settled] ** 2
+        error = 100 * float(np.sqrt(squares.mean()))
+        spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
+        least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
+        worst = max(worst, error / least)
+        points.append(
+            Point({"frames": count}, timing, error, (error - spread, error + spread), least)
+        )
+    ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
+    ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
+    interval = (error - spread, error + spread)
+    points.append(Point({"frames": FRAMES, "way": "beside"}, ours, error, interval, least))
+    size = f"{FRAMES} x {side}^2 x 3"
+    name = f"times faster than OpenCV's Debevec on {size} (its fastest {theirs:.3f} s)"
+    return StageBenchmark(
+        "hdr",
+        "RMS relative error of radiance, %",
+        "the radiance the frames were drawn from: shot, read and rounding noise",
+        0.0,
+        tuple(points),
+        (
+            Limit(name, ratio, TIMES_FASTER, ">="),
+            Limit("largest error over the Cramér-Rao bound", worst, ABOVE_BOUND, "<="),
+        ),
+        interval_of="pixels",
+        no_bands="radiances over four decades, whoever sends them",
+    )
+
+
+def _merge(
+    frames: Frames, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    return hdr.merge(frames, times, gain=GAIN, read_noise=READ_NOISE, black=BLACK, white=WHITE)
+
+
+def _expose(
+    scene: NDArray[np.float64], time_s: float, rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    electrons = rng.poisson(np.minimum(scene * time_s * GAIN, 1e6)).astype(np.float32)
+    electrons += READ_NOISE * rng.standard_normal(scene.shape, np.float32)
+    return np.clip(np.rint(electrons / GAIN + BLACK), 0, WHITE).astype(np.uint16)
+
+
+def _bound(
+    scene: NDArray[np.float64], times: Sequence[float] | NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
+    information = np.zeros_like(scene)
+    for t in times:
+        variance = scene * t / GAIN + (READ_NOISE / GAIN) ** 2 + 1 / 12
+        information += np.where(scene * t < WHITE - BLACK, t**2 / variance, 0.0)
+    return 1.0 / np.where(information > 0, information, np.nan)
+
+
+def _beside_opencv(
+    frames: Frames, times: NDArray[np.float64], *, rounds: int
+) -> tuple[Timing, float, float]:
+    """Time both in turn, so that both meet the same machine; return the ratio of the fastest."""
+    import cv2
+
+    eight_bits = [(frame >> 6).astype(np.uint8) for frame in frames]
+    peer = cv2.createMergeDebevec()
+    seconds = times.astype(np.float32)
+    _merge(frames, times)
+    peer.process(eight_bits, seconds)
+    ours, theirs = [], []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        _merge(frames, times)
+        middle = time.perf_counter()
+        peer.process(eight_bits, seconds)
+        ours.append(middle - start)
+        theirs.append(time.perf_counter() - middle)
+    # the fastest of each: what neither the other nor the machine's other work slowed down
+    ratio = min(theirs) / min(ours)
+    timing = Timing(float(np.median(ours)), (min(ours), max(ours)), ours[0], None)
+    return timing, min(theirs), ratio

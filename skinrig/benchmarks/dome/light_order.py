@@ -1,0 +1,65 @@
+"""Benchmark of the order in which the dome shows its lights: flicker against planning time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from capture.plan.eye_light import eye_light
+from capture.plan.flicker import FlickerReport, flicker_of_rows
+from capture.plan.light_order import ORDERS, best_order
+from capture.plan.rows import LedRow
+from capture.rig import LedLimits, Rig, load_rig
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+DWELL_S = 1.0 / 12.0
+LESS_FLICKER = 5.0
+DARK_SHARE = 0.3
+"""Share of each light's time that is dark where lights do not overlap."""
+
+
+def light_order(*, toy: bool) -> StageBenchmark:
+    """Time each order of the lights and take the flicker of one pass at open eyes."""
+    rig = load_rig("dome")
+    rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if toy else rig
+    limits = rig.leds or LedLimits()
+    points, found = [], {}
+    orders: dict[str, Callable[[Rig], list[int]]] = dict(ORDERS)
+    orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
+    for name, order in orders.items():
+        timing, shown = measure(partial(order, rig), repeats=1), order(rig)
+        for gaps in (False, True) if name == "spiral" else (False,):
+            found[name, gaps] = _flicker(rig, shown, gaps=gaps)
+            error = 100.0 * found[name, gaps].rms
+            knobs = {"order": name, "gaps": "dark" if gaps else "none"}
+            also = {"flashes a second": found[name, gaps].flashes_per_s}
+            points.append(Point(knobs, timing, error, (error, error), also=also))
+    chosen, worst = found["chosen", False], found["spiral", True]
+    return StageBenchmark(
+        "light-order",
+        "light of 3 to 65 Hz at open eyes, rms over mean, %",
+        "steady light: 0",
+        0.0,
+        tuple(points),
+        (
+            Limit("flashes in the worst second", chosen.flashes_per_s,
+                  limits.max_flashes_per_s - 0.5, "<="),
+            Limit("rms of the chosen order", chosen.rms, limits.max_flicker_rms, "<="),
+            Limit("times less flicker than a spiral with dark gaps", worst.rms / chosen.rms,
+                  LESS_FLICKER, ">="),
+        ),
+        condition=("gaps",),
+        interval_of="nothing: an order's flicker is computed exactly",
+        no_bands="light at the eyes: no skin enters",
+    )  # fmt: skip
+
+
+def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:
+    rows = []
+    for light in shown:
+        lit_s = DWELL_S * (1.0 - DARK_SHARE * gaps)
+        rows.append(LedRow((light,), 1.0, lit_s))
+        if gaps:
+            rows.append(LedRow((), 0.0, DWELL_S - lit_s))
+    overlap_s = rig.leds.overlap_s if rig.leds is not None and not gaps else 0.0
+    return flicker_of_rows(rows, eye_light(rig), overlap_s=overlap_s)

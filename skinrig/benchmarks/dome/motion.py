@@ -1,0 +1,186 @@
+"""Benchmark of the head's motion: frames of the simulated dome, and what is found of its drift."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.registration import head_motion
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+EXPOSURE_S = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class _Superpixels:
+    """A camera whose image has one pixel for each 2 x 2 cell of its sensor."""
+
+    sensor: head_motion.Camera
+
+    @property
+    def center_mm(self) -> Floats:
+        """Centre of projection, (3,)."""
+        return self.sensor.center_mm
+
+    def project(self, points_mm: Floats) -> Floats:
+        """Return column and row (N, 2)."""
+        return (self.sensor.project(points_mm) - 0.5) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Tracking frames of one capture, with where the head was."""
+
+    frames: Sequence[Sequence[Floats]]
+    cameras: Sequence[_Superpixels]
+    points_mm: Floats
+    normals: Floats
+    times_s: Floats
+    poses: Sequence[tuple[Floats, Floats]]
+    twitch: Floats
+    """How far the twitch of the mouth has gone, 0 to 1."""
+
+    def errors_mm(self, found: head_motion.HeadMotion) -> Floats:
+        """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
+        turns = head_motion.rotation_matrix(found.rotation_rad)
+        out = []
+        for (rotation, shift), turn, move in list(
+            zip(self.poses, turns, found.translation_mm, strict=True)
+        )[1:]:
+            gap = self.points_mm @ (turn - rotation).T + (move - shift)
+            out.append(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+        return np.array(out)
+
+    def moved_mm(self) -> Floats:
+        """Return how far the points moved in truth, RMS, (T - 1,)."""
+        out = []
+        for rotation, shift in self.poses[1:]:
+            gap = self.points_mm @ (rotation - np.eye(3)).T + shift
+            out.append(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+        return np.array(out)
+
+
+def simulate(
+    *,
+    width_px: int,
+    views: int,
+    drift_mm: float,
+    times_s: Sequence[float],
+    twitch: bool = False,
+    preset: str = "III",
+    texels: int = 512,
+) -> Drift:
+    """Render tracking frames of a drifting head.
+
+    Parameters
+    ----------
+    width_px
+        Of the sensors; the frames have half of it.
+    views
+        How many of the dome's frontal cameras.
+    drift_mm
+        Greatest shift within 25 s; it turns by a third as many degrees.
+    times_s
+        Of the frames; the first should be 0.
+    twitch
+        Whether the mouth twitches; one more frame then shows it in the middle of that.
+    preset
+        Of the person's melanin.
+    texels
+        Side of the person's maps.
+    """
+    from capture.calibration.geometry import CameraPose
+    from capture.rig import load_rig
+    from rigsim.boxes.dome import LedPulse
+    from rigsim.scenes.dome.scene import DomeScene
+    from rigsim.subject import make_subject
+    from rigsim.subject.head_motion import head_motion as drawn
+
+    rig = load_rig("dome")
+    leds = [light.name for light in rig.lights if light.position_mm[2] > 350.0][::6]
+    front = sorted(rig.views, key=lambda view: -view.position_mm[2])[:views]
+    rig = rig.subset(lights=leds, views=[view.name for view in front]).resized(width_px)
+    motion = drawn(3, drift_mm=drift_mm, drift_deg=drift_mm / 3, twitch=twitch)
+    times_s = sorted([*times_s, motion.twitch_start_s + 0.25] if twitch else times_s)
+    subject = make_subject(preset, seed=0, size=texels)
+    scene = DomeScene(rig, subject, motion=motion, interreflections=False, subsurface=False)
+    frames = []
+    for t in times_s:
+        pops = [LedPulse(k, 1.0, t, t + EXPOSURE_S) for k in range(len(rig.lights))]
+        row = []
+        for view in rig.views:
+            cfa = scene.exposure(view.name, pops=pops, exposure_s=EXPOSURE_S, seed=round(100 * t))
+            x = np.asarray(cfa, np.float64) - view.black_level
+            row.append((x[::2, ::2] + x[::2, 1::2] + x[1::2, ::2] + x[1::2, 1::2]) / 4)
+        frames.append(row)
+    mesh = subject.mesh
+    chosen = np.random.default_rng(0).choice(
+        len(mesh.vertices_mm), min(6000, len(mesh.vertices_mm)), replace=False
+    )
+    return Drift(
+        frames,
+        [_Superpixels(CameraPose.nominal(view)) for view in rig.views],
+        np.asarray(mesh.vertices_mm[chosen], np.float64),
+        np.asarray(mesh.normals[chosen], np.float64),
+        np.asarray(times_s, np.float64),
+        [motion.pose(float(t)) for t in times_s],
+        np.array([motion.twitch(float(t)) for t in times_s]),
+    )
+
+
+def motion(*, toy: bool) -> StageBenchmark:
+    """Follow heads that drift little and much, with few and many tracks."""
+    width, views, times = (160, 2, (0.0, 8.0, 16.0)) if toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
+    texels = 128 if toy else 512
+    points = []
+    for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
+        seen = simulate(
+            width_px=width, views=views, drift_mm=drift_mm, times_s=times, texels=texels
+        )
+        for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
+            points.append(_point(seen, drift_mm, tracks, toy=toy))
+    bands = {}
+    for name, band in MELANIN_BANDS.items():
+        seen = simulate(
+            width_px=width,
+            views=views,
+            drift_mm=1.0,
+            times_s=times[:3],
+            preset=band.preset,
+            texels=texels,
+        )
+        one = _point(seen, 1.0, 100, toy=True)
+        bands[name] = BandError(one.error, one.error_interval)
+    return StageBenchmark(
+        "head-motion",
+        "error of the head's place, mm",
+        f"where the simulated head was; {width // 2} pixels across 300 mm, {views} cameras",
+        0.0,
+        tuple(points),
+        left_out=(("Cramér-Rao bound", "shading that stays in space limits tracks, not noise"),),
+        by_band=bands,
+        condition=("drift mm",),
+        interval_of="frames",
+    )
+
+
+def _point(seen: Drift, drift_mm: float, tracks: int, *, toy: bool) -> Point:
+    def run() -> head_motion.HeadMotion:
+        return head_motion.estimate(
+            seen.frames, seen.cameras, seen.points_mm, seen.normals, seen.times_s,
+            tracks_per_camera=tracks,
+        )  # fmt: skip
+
+    timing = measure(run, repeats=1 if toy else 3)
+    errors = seen.errors_mm(run())
+    error = float(errors.mean())
+    spread = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
+    knobs: Mapping[str, str | int | float | bool] = {"drift mm": drift_mm, "tracks": tracks}
+    also = {"moved_mm": round(float(seen.moved_mm().mean()), 3)}
+    return Point(knobs, timing, error, (error - spread, error + spread), also=also)

@@ -1,0 +1,228 @@
+"""Benchmark of the reflectance model: how many lobes skin needs, and the statistics of albedo."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from model import skin_reflectance
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
+from reconstruction import brdf_basis, diffuse_albedo
+from reconstruction.brdf_basis import SurfaceSamples
+from skinrig.benchmarks.dome import texture as bench_texture
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.rendering.photographs.errors import LIMIT, luminance
+
+FloatArray = NDArray[np.float64]
+
+RANKS: Final = (1, 2, 4, 8, 24)
+USUAL_RANK: Final = 4
+NOISE: Final = 0.02
+LEFT_OUT: Final = 0.2
+"""Share of the lights that no fit sees."""
+LEAST_COSINE: Final = 0.15
+ETA: Final = 1.4
+SUBJECTS: Final = tuple(band.preset for band in MELANIN_BANDS.values())
+EXTREMES: Final = ("palest", "darkest")
+"""Beyond the typical people of the bands; of the full size alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FacePoints:
+    """Points of a simulated face under the dome's lights, and what is true of them.
+
+    Attributes
+    ----------
+    f
+        (P, M, 3) samples with noise, 1/sr; `variance` is theirs.
+    light, view
+        (P, M, 3), unit.
+    normals
+        (P, 3).
+    seen
+        (P, M) bool: light and view stand above the horizon.
+    left_out
+        (P, M) bool: samples of lights that no fit may see.
+    surface
+        (P, M) true surface term, 1/sr.
+    total
+        (P, M, 3) true reflection, 1/sr.
+    """
+
+    f: FloatArray
+    variance: FloatArray
+    light: FloatArray
+    view: FloatArray
+    normals: FloatArray
+    seen: NDArray[np.bool_]
+    left_out: NDArray[np.bool_]
+    surface: FloatArray
+    total: FloatArray
+
+
+def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
+    """Draw points of a simulated face, and samples of them by the dome's lights and cameras.
+
+    Parameters
+    ----------
+    subject
+        Preset.
+    points, samples
+        P and M.
+    rng
+        Of points, pairs of light and camera, and noise.
+    """
+    from rigsim.light import surface_brdf
+    from rigsim.subject import make_subject
+
+    rig = load_rig("dome")
+    face = make_subject(subject, seed=0, size=128)
+    surface = surface_brdf.skin_surface(
+        face, rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
+    )
+    bare = face.atlas.covered & (face.hair < 0.02) & (surface.normal[..., 2] > 0.3)
+    chosen = rng.permutation(np.flatnonzero(bare))[:points]
+    packed = surface.packed().reshape(-1, 7)[chosen]
+    normals = surface.normal.reshape(-1, 3)[chosen].astype(np.float64)
+    place = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
+    ends = [np.array([one.position_mm for one in rows]) for rows in (rig.lights, rig.views)]
+    every = rng.permuted(np.tile(np.arange(len(ends[0]) * len(ends[1])), (len(chosen), 1)), axis=1)
+    pair = _above(every, ends, place, normals)[:, :samples]
+    which = np.divmod(pair, len(ends[1]))
+    to = [_unit(end[k] - place[:, None]) for end, k in zip(ends, which, strict=True)]
+    cosines = [np.einsum("pmk,pk->pm", way, normals) for way in to]
+    seen = (cosines[0] > LEAST_COSINE) & (cosines[1] > LEAST_COSINE)
+    count = pair.shape[1]
+    total, specular = surface_brdf.evaluate(
+        np.repeat(packed, count, axis=0), np.repeat(normals, count, axis=0).astype(np.float32),
+        to[0].reshape(-1, 3), to[1].reshape(-1, 3),
+    )  # fmt: skip
+    clean = np.asarray(total, np.float64).reshape(len(chosen), count, 3)
+    sigma = NOISE * (clean + 0.02 / np.pi / np.maximum(cosines[0], LEAST_COSINE)[..., None])
+    held = rng.random(len(ends[0])) < LEFT_OUT
+    return FacePoints(
+        clean + sigma * rng.standard_normal(clean.shape), sigma**2, to[0], to[1], normals, seen,
+        held[which[0]], np.asarray(specular, np.float64).reshape(len(chosen), count), clean,
+    )  # fmt: skip
+
+
+def model(*, toy: bool) -> StageBenchmark:
+    """Fit the surface term with few and many lobes, and predict lights that were left out."""
+    rng = np.random.default_rng(0)
+    materials = brdf_tables.default()
+    count, samples = (10, 120) if toy else (150, 400)
+    points: list[Point] = []
+    bands: dict[str, BandError] = {}
+    usual: list[float] = []
+    for subject in SUBJECTS if toy else (*SUBJECTS, *EXTREMES):
+        p = face_points(subject, points=count, samples=samples, rng=rng)
+        use = p.seen & ~p.left_out
+        albedo = diffuse_albedo.estimate(
+            p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=use
+        )
+        given = brdf_basis.surface_samples(
+            p.f, p.light, p.view, p.normals, albedo.r_d, eta=ETA, variance=p.variance, valid=use
+        )
+        full = brdf_basis.fit_weights(given, materials)
+        for rank in RANKS:
+            if rank > min(count, materials.size):
+                continue
+
+            def run(
+                rank: int = rank,
+                given: SurfaceSamples = given,
+                full: brdf_basis.BasisWeights = full,
+            ) -> tuple[BrdfBasis, FloatArray]:
+                mix = brdf_basis.reduce(full, rank, basis=materials)[1]
+                lobes = materials.mixed(mix)
+                return lobes, brdf_basis.fit_weights(given, lobes).weights
+
+            timing = measure(run, repeats=1, memory=not toy)
+            lobes, weights = run()
+            surface, everything = _errors(p, lobes, weights, albedo.r_d)
+            again = np.median(rng.choice(surface, (200, len(surface))), axis=1)
+            low, high = (float(q) for q in np.quantile(again, [0.16, 0.84]))
+            error = float(np.median(surface))
+            total = float(np.median(everything))
+            knobs: dict[str, str | int | float | bool] = {
+                "part": "lobes", "rank": rank, "subject": subject, "points": len(surface),
+                "samples": samples,
+            }  # fmt: skip
+            also = {"all_light_error_percent": round(total, 3)}
+            points.append(Point(knobs, timing, error, (low, high), also=also))
+            if rank == USUAL_RANK:
+                for band in (b for b, one in MELANIN_BANDS.items() if one.preset == subject):
+                    bands[band] = BandError(error, (low, high))
+                usual.append(total)
+    texture = [
+        dataclasses.replace(point, knobs={"part": "texture", **point.knobs})
+        for point in bench_texture.points(toy=toy)
+    ]
+    return StageBenchmark(
+        "reflectance",
+        "error of the surface term under lights left out, % of its sum; of matched textures' "
+        "histograms, spreads of the population",
+        "simulated faces: facets, oil and vellus hair, of which no lobe is made",
+        0.0,
+        (*points, *texture),
+        (
+            Limit(
+                f"median error of all light under lights left out, rank {USUAL_RANK}, worst skin",
+                max(usual),
+                100.0 * LIMIT,
+                "<=",
+                "%",
+            ),
+        ),
+        by_band=bands,
+        condition=("part", "subject"),
+        interval_of="points",
+    )
+
+
+def _errors(
+    p: FacePoints, lobes: BrdfBasis, weights: FloatArray, r_d: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return of each point the surface term's error over its sum, and that of all light, %."""
+    known = np.asarray(np.isfinite(r_d).all(axis=1))
+    at = p.seen & p.left_out & known[:, None]
+    some = np.flatnonzero(at.any(axis=1))
+    surface, everything = [], []
+    for point in some:
+        rows = at[point]
+        to, view, n = p.light[point, rows], p.view[point, rows], p.normals[point]
+        share = np.broadcast_to(weights[point], (len(to), lobes.size))
+        lobe = skin_reflectance.lobe_brdf(lobes, share, to, view, n)
+        passed = np.prod([skin_reflectance.transmitted(way @ n, ETA) for way in (to, view)], axis=0)
+        made = lobe[:, None] + passed[:, None] * r_d[point] / np.pi
+        true = p.surface[point, rows]
+        surface.append(np.sum(np.abs(lobe - true)) / np.sum(true))
+        light = luminance(p.total[point, rows])
+        everything.append(np.median(np.abs(luminance(made) - light) / light))
+    return 100.0 * np.array(surface), 100.0 * np.array(everything)
+
+
+def _above(
+    pairs: NDArray[np.int64], ends: list[FloatArray], place: FloatArray, normals: FloatArray
+) -> NDArray[np.int64]:
+    """Return the pairs of each point with those above its horizon first, in their order."""
+    up = [
+        np.einsum("pmk,pk->pm", _unit(end[None] - place[:, None]), normals) > LEAST_COSINE
+        for end in ends
+    ]
+    light, view = np.divmod(pairs, len(ends[1]))
+    rows = np.arange(len(place))[:, None]
+    good = up[0][rows, light] & up[1][rows, view]
+    order = np.argsort(~good, axis=1, kind="stable")
+    return np.take_along_axis(pairs, order, axis=1)
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

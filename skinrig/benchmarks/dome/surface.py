@@ -1,0 +1,174 @@
+"""Benchmarks of what is done on the surface: gathering lumitexels, filling textures."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights import LightTable
+from capture.rig import load_rig
+from reconstruction.lumitexels import Surface
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.surface import texture_fill
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.resampling import mean_error, tiled_rms
+
+RADIUS_MM, ALBEDO = 80.0, 0.4
+MEMORY_MB = 400.0
+FULL = 500_000 * 16 * 150
+HOURS = 1.0
+BLOCKS = 40
+"""Of samples, whose means scatter independently."""
+
+
+def lumitexels(*, toy: bool) -> StageBenchmark:
+    """Gather a Lambertian sphere, with tables in memory and on disk, of both precisions."""
+    width, step = (130, 30) if toy else (1300, 10)
+    names = [f"L{k:03d}" for k in range(0, 150, step)]
+    views = ["C02", "C07"] if toy else ["C02", "C07", "C13"]
+    rig = load_rig("dome").resized(width).subset(lights=names, views=views)
+    cameras = [CameraPose.nominal(view) for view in rig.views]
+    lights = LightTable.nominal(rig)
+    sphere = trimesh.creation.icosphere(subdivisions=4 if toy else 6, radius=RADIUS_MM)
+    caster = RayCaster(sphere.vertices, sphere.faces)
+    seen = [_seen(camera) for camera in cameras]
+    points = []
+    rate = peak = 0.0
+    counts = (250, 500) if toy else (2_000, 10_000, 40_000)
+    for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
+        where = sphere.vertices[:count]
+        surface = Surface(where, where / RADIUS_MM)
+        with tempfile.TemporaryDirectory() as folder:
+            tracemalloc.start()
+            start = time.perf_counter()
+            store = LumitexelStore(
+                surface,
+                cameras=cameras,
+                lights=lights,
+                caster=caster,
+                folder=Path(folder) if kind == "disk" else None,
+                dtype=np.float16 if kind == "disk" else np.float32,
+            )
+            spent = time.perf_counter() - start
+            for view in range(len(cameras)):
+                for light in range(len(names)):
+                    image = _image(seen[view], lights, light)
+                    start = time.perf_counter()
+                    store.add(view, light, image, np.full_like(image, 1e-6))
+                    spent += time.perf_counter() - start
+            errors = []
+            start = time.perf_counter()
+            for _, part in store.chunks(1000):
+                inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
+                errors.append(part.f[inner][:, 1] * np.pi / ALBEDO - 1)
+            spent += time.perf_counter() - start
+            peak = tracemalloc.get_traced_memory()[1] / 1e6
+            tracemalloc.stop()
+        off = 100 * np.abs(np.concatenate(errors))
+        rate = spent / (count * len(cameras) * len(names))
+        points.append(
+            Point(
+                {"points": count, "tables": kind},
+                Timing(spent, (spent, spent), spent, peak),
+                float(off.mean()),
+                # samples of a point err alike: blocks of points are drawn
+                mean_error([part.mean() for part in np.array_split(off, BLOCKS)]).error_interval,
+            )
+        )
+    return StageBenchmark(
+        "lumitexels",
+        "mean error of the BRDF samples, %",
+        "a Lambertian sphere in closed form; what is left is bilinear sampling",
+        0.0,
+        tuple(points),
+        (
+            Limit(
+                "memory of the largest gathering with tables on disk", peak, MEMORY_MB, "<=", "MB"
+            ),
+            Limit(
+                "hours for 500,000 points x 16 x 150 at this rate, images given",
+                rate * FULL / 3600,
+                HOURS,
+                "<=",
+                "h",
+            ),
+        ),
+        left_out=(("500,000 points x 16 x 150 itself", "takes 7 GB of disk and many minutes"),),
+        condition=("points",),
+        interval_of="samples",
+        no_bands="sampling of pictures, relative to their brightness; one albedo",
+    )
+
+
+def filling(*, toy: bool) -> StageBenchmark:
+    """Fill a smooth texture of three channels of which a part of the texels is known."""
+    side = 128 if toy else 2048
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:side, 0:side] / side
+    truth = np.stack(
+        [np.sin(9 * x) * np.cos(7 * y), x + y, np.exp(-20 * ((x - 0.5) ** 2 + (y - 0.5) ** 2))],
+        axis=-1,
+    ).astype(np.float32)
+    points = []
+    for share in (0.05, 0.15, 0.35, 0.75):
+        weight = (rng.random((side, side)) < share).astype(np.float32)
+        weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
+        ways: dict[str, Callable[[], NDArray[np.floating]]] = {
+            "push-pull": lambda w=weight: texture_fill.push_pull(truth, w).values,  # type: ignore[misc]
+            "nearest texel": lambda w=weight: _nearest(truth, w),  # type: ignore[misc]
+        }
+        for way, fill in ways.items():
+            timing = measure(fill, repeats=1 if toy else 3)
+            off = tiled_rms(
+                100 * (fill() - truth) / truth.std(), weight == 0, tile_px=max(side // 16, 8)
+            )
+            knobs: dict[str, str | int | float] = {"known": share, "way": way, "side": side}
+            points.append(Point(knobs, timing, off.error, off.error_interval))
+    return StageBenchmark(
+        "texture-fill",
+        "RMS error of filled texels, % of the texture's deviation",
+        "the smooth texture the texels were taken from",
+        0.0,
+        tuple(points),
+        condition=("known",),
+        interval_of="tiles of the texture",
+        no_bands="filling of any map: errors go with its values",
+    )
+
+
+def _nearest(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a texture whose unknown texels have the value of the nearest known one."""
+    rows, columns = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
+    return np.asarray(values[rows, columns])
+
+
+def _seen(camera: CameraPose) -> NDArray[np.float64]:
+    """Return where the pixels of a camera meet the sphere, NaN elsewhere."""
+    width, height = camera.image_size
+    row, column = np.mgrid[0:height, 0:width]
+    ways = camera.rays(np.stack([column, row], axis=-1))
+    along = ways @ camera.center_mm
+    inside = along**2 - camera.center_mm @ camera.center_mm + RADIUS_MM**2
+    root = np.sqrt(np.where(inside > 0, inside, np.nan))
+    return np.asarray(camera.center_mm + (-along - root)[..., None] * ways)
+
+
+def _image(seen: NDArray[np.float64], lights: LightTable, light: int) -> NDArray[np.float32]:
+    """Return the sphere under one light, written out here."""
+    way = lights.position_mm[light] - seen
+    distance = np.linalg.norm(way, axis=-1, keepdims=True)
+    way /= distance
+    cosine = np.clip((way * seen).sum(axis=-1) / RADIUS_MM, 0.0, None)
+    lobe = np.clip(-(way @ lights.axis[light]), 0.0, None) ** lights.exponent[light]
+    strength = (cosine * lobe)[..., None] / distance**2
+    return np.asarray(ALBEDO * lights.intensity[light] * strength, np.float32)

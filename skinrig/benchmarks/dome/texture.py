@@ -1,0 +1,251 @@
+"""Benchmark of texture matching, beside pyrtools and scikit-image in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.texture_statistics import describe, match, steerable_pyramid
+from model.texture_statistics.histograms import distance
+from model.texture_statistics.space import TextureSpace
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+TIMES_FASTER = 10.0
+SAME_DISTANCE = 1.05
+SAME_RESPONSES = 2e-6
+"""Of the image's largest value: float32 against float64."""
+FULL_SIDE, FULL_ITERATIONS = 1024, 4
+PEER = "pyrtools and scikit-image"
+SEEDS = 3
+_COLOR = np.array([0.55, 0.38, 0.28])
+_TINTS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
+
+
+def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32:
+    """Make a periodic texture: blotches, fine streaks and dark spots of their own colors.
+
+    Parameters
+    ----------
+    side : int
+        Of the image, px.
+    spots : float
+        Spots per 128 x 128 px.
+    rng
+        Draws all of it.
+
+    Returns
+    -------
+    ndarray of float32, shape (side, side, 3)
+        Reflectance.
+    """
+    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side)[None, :]
+
+    def smooth(field: Floats, up_px: float, across_px: float) -> Floats:
+        falloff = np.exp(-2.0 * np.pi**2 * ((up_px * fy) ** 2 + (across_px * fx) ** 2))
+        return np.asarray(np.fft.ifft2(np.fft.fft2(field) * falloff).real)
+
+    blotches = smooth(rng.standard_normal((side, side)), 12.0, 12.0)
+    streaks = smooth(rng.standard_normal((side, side)), 4.0, 1.2)
+    marks = np.zeros((side, side))
+    count = round(spots * side * side / 128**2)
+    marks[tuple(rng.integers(0, side, (2, count)))] = 1.0
+    dark = np.minimum(smooth(marks, 2.5, 2.5) * 40.0, 1.5)
+    density = 0.08 * (blotches / blotches.std())[..., None] * _TINTS[0]
+    density = density + 0.04 * (streaks / streaks.std())[..., None] * _TINTS[2]
+    density = density + 0.3 * dark[..., None] * _TINTS[1]
+    return (_COLOR * np.exp(-density)).astype(np.float32)
+
+
+def _error(images: list[Any], target: Floats, space: TextureSpace) -> tuple[float, Any]:
+    """Return the mean distance of images from a vector, and its interval over the images."""
+    wanted = space.histograms(target)
+    off = [
+        float(distance(space.histograms(describe(i, space=space)), wanted, space.edges).mean())
+        for i in images
+    ]
+    mean, stderr = float(np.mean(off)), float(np.std(off, ddof=1) / np.sqrt(len(off)))
+    return mean, (mean - stderr, mean + stderr)
+
+
+def _point(
+    side: int,
+    knobs: dict[str, str | int | float | bool],
+    *,
+    repeats: int,
+    levels: int = steerable_pyramid.LEVELS,
+    iterations: int = 5,
+    dtype: type = np.float32,
+    start: Literal["image", "noise"] = "image",
+) -> Point:
+    """Match plain skin to spotted skin; errors are at full depth, whatever depth is matched."""
+    rng = np.random.default_rng(0)
+    target: Any = skin_texture(side, spots=10.0, rng=rng).astype(dtype)
+    sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(SEEDS)]
+    full = TextureSpace.fit([target, *sources])
+    used = full if levels == full.levels else TextureSpace.fit([target, *sources], levels=levels)
+    vector = describe(target, space=used)
+
+    def run(source: Any) -> Any:
+        return match(
+            source, vector, space=used, iterations=iterations, noise=0.05, start=start,
+            rng=np.random.default_rng(1),
+        ).image  # fmt: skip
+
+    timing = measure(lambda: run(sources[0]), repeats=repeats)
+    error, interval = _error([run(s) for s in sources], describe(target, space=full), full)
+    return Point({"side": side, **knobs}, timing, error, interval)
+
+
+def points(toy: bool) -> tuple[Point, ...]:
+    """Measure pyramid depth and iterations (error: `matching`'s)."""
+    side, repeats = (48, 1) if toy else (256, 3)
+    depths, counts = ((1, 7), (0, 2)) if toy else ((1, 3, 5, 7), (0, 1, 2, 5, 10, 20))
+    found = [_point(side, {"levels": n, "iterations": 5}, repeats=repeats, levels=n)
+             for n in depths]  # fmt: skip
+    found += [_point(side, {"levels": 7, "iterations": n}, repeats=repeats, iterations=n)
+              for n in counts if n != 5]  # fmt: skip
+    return tuple(found)
+
+
+def matching(*, toy: bool) -> StageBenchmark:
+    """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
+    side, repeats = (48, 1) if toy else (256, 3)
+    found = list(points(toy))
+    found.append(
+        _point(side, {"levels": 7, "iterations": 5, "precision": "float64"}, repeats=repeats,
+               dtype=np.float64)
+    )  # fmt: skip
+    found.append(
+        _point(side, {"levels": 7, "iterations": 5, "start": "noise"}, repeats=repeats,
+               start="noise")
+    )  # fmt: skip
+    for other in (32,) if toy else (128, 512):
+        found.append(_point(other, {"levels": 7, "iterations": 5}, repeats=repeats))
+    limits, left_out = ((), ()) if toy else against_peer()
+    return StageBenchmark(
+        "texture-matching",
+        "mean distance of 93 histograms, spreads of the population",
+        "the histograms of the target; reference error: of another texture made as it was",
+        _same_texture(side),
+        tuple(found),
+        limits,
+        left_out,
+        condition=("side", "start"),
+        interval_of="textures",
+        no_bands="histograms relative to their own spread; melanin scales them alike",
+    )
+
+
+def _same_texture(side: int) -> float:
+    """Return how far apart two textures of one process are: what matching need not beat."""
+    rng = np.random.default_rng(2)
+    textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + SEEDS)]
+    plain = 0.9 * skin_texture(side, spots=0.0, rng=rng)
+    space = TextureSpace.fit([*textures, plain])
+    return _error(textures[1:], describe(textures[0], space=space), space)[0]
+
+
+def peer_iterations(image: ArrayLike, target: ArrayLike, iterations: int) -> Callable[[], Floats]:
+    """Return Heeger and Bergen's matching of one channel out of pyrtools and scikit-image.
+
+    The pyramid of the target is made here and not timed, as ours is given its vector.
+
+    Raises
+    ------
+    ImportError
+        When pyrtools is not installed.
+    """
+    from pyrtools.pyramids import SteerablePyramidFreq
+    from skimage.exposure import match_histograms
+
+    start, wanted = np.asarray(image, np.float64), np.asarray(target, np.float64)
+    pyramid = partial(
+        SteerablePyramidFreq,
+        height=steerable_pyramid.LEVELS,
+        order=steerable_pyramid.ORIENTATIONS - 1,
+    )
+    goals = pyramid(wanted).pyr_coeffs
+
+    def run() -> Floats:
+        now = start
+        for _ in range(iterations):
+            built = pyramid(now)
+            for key, response in built.pyr_coeffs.items():
+                built.pyr_coeffs[key] = match_histograms(response, goals[key])
+            now = match_histograms(built.recon_pyr(), wanted)
+        return np.asarray(now)
+
+    return run
+
+
+def peer_responses(image: ArrayLike) -> list[Floats]:
+    """Return pyrtools's responses in the order and unit of ours; its levels grow by 4 each."""
+    from pyrtools.pyramids import SteerablePyramidFreq
+
+    levels, orientations = steerable_pyramid.LEVELS, steerable_pyramid.ORIENTATIONS
+    found = SteerablePyramidFreq(
+        np.asarray(image, np.float64), height=levels, order=orientations - 1
+    ).pyr_coeffs
+    bands = [found[(level, k)] / 4.0**level for level in range(levels) for k in range(orientations)]
+    return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
+
+
+def against_peer(
+    side: int = FULL_SIDE,
+) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
+    """Match one channel by turns with the peer; return limits, or what is left out and why."""
+    try:
+        peer_responses(np.zeros((512, 512)))
+    except ImportError as error:
+        why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
+        return (), ((f"{TIMES_FASTER:g} x {PEER}", why),)
+    rng = np.random.default_rng(0)
+    target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
+    source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
+    space = TextureSpace.fit([target, source])
+    vector = describe(target, space=space)
+    theirs = peer_iterations(source, target, 1)
+
+    def ours(iterations: int) -> Any:
+        return match(source, vector, space=space, iterations=iterations).image
+
+    own, peer = ours(1), theirs()
+    ratios = []
+    for _ in range(3):
+        # ours measures how far the result is off as well, which the peer's does not
+        spent = [_spent(partial(ours, n)) for n in (0, FULL_ITERATIONS)]
+        ratios.append(FULL_ITERATIONS * _spent(theirs) / (spent[1] - spent[0]))
+    wall, busy = np.median(ratios, axis=0)
+    wanted = space.histograms(vector)
+    off = [
+        float(distance(space.histograms(describe(image.astype(np.float32), space=space)), wanted,
+                       space.edges).mean())
+        for image in (own, peer)
+    ]  # fmt: skip
+    apart = [
+        float(np.abs(a - b).max() / source.max())
+        for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
+    ]
+    what = f"an iteration at {side} x {side}, one channel"
+    limits = (
+        Limit(f"{what}: times as fast as {PEER}", float(wall), TIMES_FASTER, ">="),
+        Limit(f"{what}: the same of processor time", float(busy), TIMES_FASTER, ">="),
+        Limit("distance from the target over the peer's", off[0] / off[1], SAME_DISTANCE, "<="),
+        Limit("responses less the peer's, of the image", max(apart), SAME_RESPONSES, "<="),
+    )
+    return limits, ()
+
+
+def _spent(call: Callable[[], Any]) -> Floats:
+    """Return seconds on the clock and of the processor."""
+    begin = time.perf_counter(), time.process_time()
+    call()
+    return np.array([time.perf_counter() - begin[0], time.process_time() - begin[1]])

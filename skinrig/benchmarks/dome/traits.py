@@ -1,0 +1,296 @@
+"""Benchmark of trait vectors against traits that a simulated population is known to have."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.brdf import tables as brdf_tables
+from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
+from model.traits.reduced_spaces import SpaceKind
+from reconstruction import brdf_basis
+from reconstruction.correspondence import common_regions
+from rigsim.population.population import Member, shifted, table_1
+from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.fitting import traits as fitting_traits
+from skinrig.traits import albedo_vectors
+from skinrig.traits import truth as trait_truth
+from skinrig.traits.albedo_vectors import VectorKind
+from skinrig.traits.labels import Labels
+from skinrig.traits.truth import CommonFaces
+
+Floats = NDArray[np.float64]
+
+COSINE = 0.95
+RETURN = 0.1
+FALSE_ALARMS = 0.1
+"""Share of traits without any truth that p < 0.05 may let pass: of 200, 5 % and 3.2 deviations."""
+TAN = 1.5
+DRAWS = 12
+"""Random choices of so many people, whose scatter is the error's."""
+SHUFFLES = 200
+LEFT_OUT = 10
+"""Groups of people, each left out once, for the error of what all of them tell."""
+RANK = 8
+SPACES: tuple[SpaceKind, ...] = ("pca", "nmf")
+KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
+
+
+def traits(*, toy: bool) -> StageBenchmark:
+    """Learn lotion from fitted lobes and tan from albedo maps, over people, spaces and noise."""
+    people = table_1()
+    rng = np.random.default_rng(0)
+    some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if toy else 40])]
+    points, limits = _surface(some, toy=toy)
+    more, bounds = _albedo(some, toy=toy)
+    return StageBenchmark(
+        "traits",
+        "1 - cosine to the true trait",
+        "the same people simulated without noise, with the trait and without",
+        0.0,
+        (*points, *more),
+        (*limits, *bounds),
+        left_out=(
+            ("the time to fit lobes and to draw faces", "that of learning alone is measured"),
+        ),
+        condition=("trait", "noise"),
+        interval_of="random choices of people",
+        no_bands="one vector is learned of people of all skins together",
+    )
+
+
+def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
+    basis = brdf_tables.default()
+    strength = basis.strength()
+    metric = basis.kinship() * np.outer(strength, strength)
+    dressed = shifted(people, "lotion", apply={"lotion": 0.9}, rng=np.random.default_rng(1))
+    label = np.array(["lotion" in person.marks for person in dressed])
+    compared = [people[i] for i in range(0, len(people), 4 if toy else 8)]
+    worn = shifted(
+        compared, "lotion", apply={"lotion": 0.9}, share=1.0, rng=np.random.default_rng(1)
+    )
+    bare = [p for p in compared if not p.applied]
+    worn = tuple(w for w, p in zip(worn, compared, strict=True) if not p.applied)
+    truth = trait_truth.lobe_change(
+        bare, worn, points=4 if toy else 60, pairs=500 if toy else 1000,
+        rng=np.random.default_rng(2),
+    )  # fmt: skip
+
+    def judged(space: TraitSpace) -> float:
+        return truth.cosine(space.trait("trait").vector, basis)
+
+    found, limits = [], []
+    rng = np.random.default_rng(3)
+    most = 4 if toy else 20
+    seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
+    for noise, places in ((0.02, 4),) if toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
+        means = np.array([
+            trait_truth.mean_mixture(
+                p[:places], basis, pairs=60 if toy else 160, noise=noise, rng=rng
+            )
+            for p in seen
+        ])  # fmt: skip
+        for group in (2, 3) if toy else (3, 8, int(label.sum())):
+            for kind in SPACES:
+                knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
+                fit = partial(_fitted, means, label, kind, metric, basis)
+                found.append(_drawn(fit, label, group, knobs, judged))
+    space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
+    limits.append(Limit("cosine of lotion with the truth", judged(space), COSINE, ">="))
+    limits.append(_false_alarms("lobes", means, metric, toy=toy))
+    limits += _returned(means[~label], space, metric)
+    return found, limits
+
+
+def _fitted(
+    means: Floats,
+    label: NDArray[np.bool_],
+    kind: SpaceKind,
+    metric: Floats,
+    basis: brdf_tables.BrdfBasis,
+    rows: NDArray[np.intp],
+) -> TraitSpace:
+    some = means[rows]
+    mix = None
+    if kind == "nmf":
+        mix = brdf_basis.reduce(some, min(RANK, len(some) - 1), basis=basis)[1]
+    return TraitSpace.fit(some, {"trait": label[rows]}, space=kind, basis=mix, metric=metric)
+
+
+def _drawn(
+    fit: Callable[[NDArray[np.intp]], TraitSpace],
+    label: NDArray[np.bool_],
+    group: int,
+    knobs: dict[str, Any],
+    judged: Callable[[TraitSpace], float],
+) -> Point:
+    """Learn from random groups of people; the error is the median over them."""
+    sides = [np.flatnonzero(label), np.flatnonzero(~label)]
+    most = min(group, *(len(side) for side in sides))
+    whole = most == min(len(side) for side in sides)
+    rng = np.random.default_rng(5)
+    seconds, errors, told, kept = [], [], [], []
+    groups = [
+        np.sort(np.concatenate([
+            side if whole else rng.choice(side, most, replace=False) for side in sides
+        ]))
+        for _ in range(1 if whole else DRAWS)
+    ]  # fmt: skip
+    with resident_memory.watched() as rise:
+        fit(groups[0])
+    for rows in groups:
+        start = time.perf_counter()
+        space = fit(rows)
+        seconds.append(time.perf_counter() - start)
+        errors.append(1.0 - judged(space))
+        told.append(space.trait("trait").confidence.expected_cosine)
+        kept.append(len(space.basis))
+    low, middle, high = (float(v) for v in np.quantile(errors, (0.16, 0.5, 0.84)))
+    if whole:
+        half = _jackknife(lambda rows: 1.0 - judged(fit(rows)), groups[0])
+        low, high = max(middle - half, 0.0), middle + half
+    timing = Timing(
+        float(np.median(seconds)), (min(seconds), max(seconds)), seconds[0], rise.mb, "resident"
+    )
+    shown = {**knobs, "people": 2 * most if not whole else len(label)}
+    also = {
+        "components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4),
+    }  # fmt: skip
+    return Point(shown, timing, middle, (low, high), also=also)
+
+
+def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
+    """Return a value's standard error by leaving out each of :data:`LEFT_OUT` groups of people."""
+    parts = np.array_split(np.random.default_rng(9).permutation(len(rows)), LEFT_OUT)
+    values = [value(np.delete(rows, part)) for part in parts if part.size]
+    count = len(values)
+    return float(np.std(values) * np.sqrt(count - 1))
+
+
+def _false_alarms(what: str, samples: Floats, metric: Floats | None, *, toy: bool) -> Limit:
+    """Return how often shuffled labels pass for a trait."""
+    rng = np.random.default_rng(6)
+    passed = []
+    for _ in range(10 if toy else SHUFFLES):
+        label = rng.permutation(np.arange(len(samples)) < len(samples) // 3)
+        space = TraitSpace.fit(samples, {"none": label}, components=1, metric=metric)
+        passed.append(space.trait("none").confidence.p_value < 0.05)
+    return Limit(
+        f"shuffled labels of {what} that give a trait at p < 0.05", float(np.mean(passed)),
+        FALSE_ALARMS, "<=",
+    )  # fmt: skip
+
+
+def _returned(faces: Floats, space: TraitSpace, metric: Floats) -> list[Limit]:
+    """Edit the lobes of faces without the trait, and back again."""
+    size = float(reduced_spaces.lengths(space.trait("trait").vector, metric))
+    rng = np.random.default_rng(7)
+    worst_zero, back, off = 0.0, [], []
+    for face in faces[:6]:
+        others = faces[rng.choice(len(faces), 4)]
+        mix = np.vstack([face, others])  # texels between this face's mixture and others'
+        mix /= mix.sum(axis=1, keepdims=True)
+        weights = rng.dirichlet(np.full(len(mix), 0.8), 500)
+        same = lobe_edits.edit_weights(weights, mix, space, {"trait": 0.0})
+        worst_zero = max(worst_zero, float(np.abs(same.weights - weights).max()))
+        there = lobe_edits.edit_weights(weights, mix, space, {"trait": 0.6})
+        again = lobe_edits.edit_weights(there.weights, there.mix, space, {"trait": -0.6})
+        gap = again.weights @ again.mix - weights @ mix
+        back.append(reduced_spaces.lengths(gap, metric) / (0.6 * size))
+        miss = there.weights @ there.mix - weights @ mix - 0.6 * space.trait("trait").vector
+        off.append(reduced_spaces.lengths(miss, metric) / (0.6 * size))
+    return [
+        Limit("largest change of a weight by an edit of amount 0", worst_zero, 1e-12, "<="),
+        Limit("+0.6 lotion, then -0.6: RMS distance from the source over that of the edit",
+              float(np.sqrt(np.mean(np.square(back)))), RETURN, "<="),
+        Limit("+0.6 lotion, texel by texel: RMS distance from what was asked over the edit",
+              float(np.sqrt(np.mean(np.square(off)))), RETURN, "<="),
+    ]  # fmt: skip
+
+
+def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
+    tanned = shifted(people, "tan", melanin=TAN, rng=np.random.default_rng(1))
+    label = np.array(["tan" in person.marks for person in tanned])
+    faces = CommonFaces.of(people, size=64 if toy else 128, common=48 if toy else 80)
+    inside = common_regions.region("face", faces.frame)
+    compared = list(range(0, len(people), 4))
+    seen = list(range(2, len(people), 4))
+    after = shifted(people, "tan", melanin=TAN, share=1.0, rng=np.random.default_rng(1))
+    points, limits = [], []
+    for noise in (0.01,) if toy else (0.01, 0.1):
+        maps = [
+            faces.albedo(p, noise=noise, rng=np.random.default_rng([8, k]))
+            for k, p in enumerate(tanned)
+        ]
+        clean = [
+            [faces.albedo(group[i], noise=0.0, rng=np.random.default_rng(0)) for i in compared]
+            for group in (people, after)
+        ]
+        for kind in KINDS:
+            names = tuple(p.name for p in people)
+            spaces = fitting_traits.albedo_spaces(
+                maps, Labels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
+            )
+            texture = spaces["texture"]
+
+            def vectors(
+                shown: Sequence[fitting_traits.AlbedoSample],
+                texture: Any = texture,
+                kind: VectorKind = kind,
+            ) -> Floats:
+                return np.array([
+                    albedo_vectors.vector(
+                        one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
+                    )
+                    for one in shown
+                ])  # fmt: skip
+
+            before, with_it = (vectors(group) for group in clean)
+            truth = (with_it - before).mean(axis=0)
+            rows = vectors(maps)
+
+            def judged(space: TraitSpace, truth: Floats = truth) -> float:
+                return cosine(space.trait("trait").vector, truth)
+
+            for group in (2, 3) if toy else (3, 8, int(label.sum())):
+                for components in (None, 1) if toy else (None, 1, 4):
+                    knobs = {
+                        "trait": "tan", "space": f"pca of {kind}", "noise": noise,
+                        "asked": components or "chosen",
+                    }  # fmt: skip
+                    fit = partial(_learned, rows, label, components)
+                    points.append(_drawn(fit, label, group, knobs, judged))
+            # People who are seen without and with the trait; the truth is of others
+            twice = [
+                faces.albedo(group[i], noise=noise, rng=np.random.default_rng([9, i, k]))
+                for k, group in enumerate((people, after))
+                for i in seen
+            ]
+            pairs = vectors(twice)
+            tan = np.arange(len(pairs)) >= len(seen)
+            knobs = {
+                "trait": "tan", "space": f"pca of {kind}", "noise": noise, "asked": "seen twice",
+            }  # fmt: skip
+            points.append(
+                _drawn(partial(_learned, pairs, tan, None), tan, len(pairs), knobs, judged)
+            )
+            # Plain histograms are measured, and miss it: their points say by how much
+            if noise == 0.01 and kind == "quantiles":
+                limits.append(
+                    Limit(f"cosine of tan with the truth, {kind}, {len(seen)} people seen twice",
+                          1.0 - points[-1].error, COSINE, ">=")
+                )  # fmt: skip
+                limits.append(_false_alarms("albedo", rows, None, toy=toy))
+    return points, limits
+
+
+def _learned(
+    vectors: Floats, label: NDArray[np.bool_], components: int | None, rows: NDArray[np.intp]
+) -> TraitSpace:
+    return TraitSpace.fit(vectors[rows], {"trait": label[rows]}, components=components)

@@ -1,0 +1,363 @@
+"""Benchmark of expression images laid over neutral, and of what a misalignment does to blends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from model import color_table
+from model.color_table import ColorTable
+from model.facial_color import HemoglobinRig
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction.correspondence import expression_alignment
+from rigsim.subject import Subject, make_subject
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Points = dict[str, tuple[float, float]]
+
+CAMERA, LIGHT = "Nikon 5100 (NPL)", "D65"
+
+
+def smooth_displacement(
+    side: int, *, bend_px: float, rms_px: float, rng: np.random.Generator
+) -> Floats:
+    """Return a smooth random displacement.
+
+    Parameters
+    ----------
+    side
+        Pixels a side.
+    bend_px
+        Standard deviation of the Gaussian that smooths white noise, px.
+    rms_px
+        Root mean square length of the displacement, px.
+    rng
+        Draws it.
+
+    Returns
+    -------
+    ndarray of float64, shape (side, side, 2)
+        Column and row, px.
+    """
+    drawn = np.stack(
+        [gaussian_filter(rng.standard_normal((side, side)), bend_px) for _ in range(2)], axis=-1
+    )
+    return np.asarray(drawn * (rms_px / np.sqrt((drawn**2).sum(axis=-1).mean())))
+
+
+@dataclass(frozen=True, slots=True)
+class MovedFace:
+    """Two pictures of a simulated face's texture, with what is known of them.
+
+    Attributes
+    ----------
+    neutral, moving : ndarray of float32, shape (N, N, 3)
+        White-balanced linear camera RGB of diffuse light, with noise; the second in a state of
+        blood, and moved.
+    variance_neutral, variance_moving : ndarray of float32, shape (N, N, 3)
+    valid, valid_moving : ndarray of bool, shape (N, N)
+        Skin in each.
+    source_px : ndarray of float64, shape (N, N, 2)
+        Where each pixel of the neutral picture is in the moving one.
+    landmarks, landmarks_moving : dict
+        Points spread over the face, as somebody placed them.
+    melanin, hemoglobin, hemoglobin_at_rest : ndarray of float32, shape (N, N)
+        Of the neutral picture, and the state's blood seen on it.
+    hemoglobin_moving : ndarray of float32, shape (N, N)
+        The state's blood where the moving picture shows it.
+    """
+
+    neutral: NDArray[np.float32]
+    moving: NDArray[np.float32]
+    variance_neutral: NDArray[np.float32]
+    variance_moving: NDArray[np.float32]
+    valid: Bools
+    valid_moving: Bools
+    source_px: Floats
+    landmarks: Points
+    landmarks_moving: Points
+    melanin: NDArray[np.float32]
+    hemoglobin: NDArray[np.float32]
+    hemoglobin_at_rest: NDArray[np.float32]
+    hemoglobin_moving: NDArray[np.float32]
+
+
+def table() -> ColorTable:
+    """Return the color table that pictures are made with."""
+    return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
+
+
+def oval(side: int) -> Bools:
+    """Return where a texture shows the face."""
+    y, x = np.mgrid[:side, :side] / (side - 1.0) - 0.5
+    return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
+
+
+def moved_face(
+    face: Subject,
+    displacement_px: Floats,
+    *,
+    state: str = "smile",
+    noise: float = 0.01,
+    landmarks: int = 24,
+    landmark_noise_px: float = 1.0,
+    rng: np.random.Generator,
+) -> MovedFace:
+    """Picture a face in neutral, and moved in a state of its blood.
+
+    Parameters
+    ----------
+    face
+        Its texture is the neutral picture.
+    displacement_px
+        (N, N, 2): where each pixel goes. It must not fold.
+    state
+        Of `rigsim.subject.perfusion.STATES`.
+    noise
+        Relative standard deviation of each channel of each pixel.
+    landmarks, landmark_noise_px
+        How many, and how precisely somebody placed each along each axis.
+    rng
+        Draws noise.
+    """
+    side = face.size
+    rows, columns = np.mgrid[:side, :side].astype(np.float64)
+    back = np.zeros_like(displacement_px)
+    for _ in range(60):
+        at = [rows + back[..., 1], columns + back[..., 0]]
+        back = -np.stack(
+            [
+                map_coordinates(displacement_px[..., k], at, order=1, mode="nearest")
+                for k in range(2)
+            ],
+            axis=-1,
+        )
+    at = [rows + back[..., 1], columns + back[..., 0]]
+
+    def pulled(image: Floats, order: int = 3) -> Floats:
+        return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
+
+    colors = table()
+    light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
+    rest = face.hemoglobin(state)
+    mask = oval(side)
+    pictures, variances = [], []
+    for blood, moved in ((face.hemoglobin(), False), (rest, True)):
+        clean = colors.lookup(face.melanin, blood) * light[..., None]
+        if moved:
+            clean = np.stack([pulled(clean[..., k]) for k in range(3)], axis=-1)
+        pictures.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
+        variances.append(((noise * clean) ** 2).astype("f4"))
+    points = spread_points(mask, landmarks)
+    gone = points + displacement_px[points[:, 1], points[:, 0]]
+    placed = [
+        {
+            f"point {k + 1}": (float(x), float(y))
+            for k, (x, y) in enumerate(p + rng.normal(0.0, landmark_noise_px, p.shape))
+        }
+        for p in (points.astype(np.float64), gone)
+    ]
+    return MovedFace(
+        pictures[0], pictures[1], variances[0], variances[1],
+        mask, pulled(mask.astype(np.float64), 1) > 0.99,
+        np.stack([columns, rows], axis=-1) + displacement_px,
+        placed[0], placed[1],
+        face.melanin, face.hemoglobin(), rest, pulled(rest.astype(np.float64)).astype("f4"),
+    )  # fmt: skip
+
+
+def spread_points(mask: Bools, count: int) -> NDArray[np.intp]:
+    """Return points (count, 2), column and row, spread over a mask: each farthest from others."""
+    inner = distance_transform_edt(mask) > 0.02 * mask.shape[0]
+    places = np.argwhere(inner)[:, ::-1]
+    chosen = [int(np.argmin(places[:, 1]))]
+    away = np.linalg.norm(places - places[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return places[chosen]
+
+
+def face_of(preset: str, side: int, *, seed: int = 0) -> Subject:
+    """Return a simulated face with a texture of so many pixels a side."""
+    return make_subject(preset, seed=seed, size=side)
+
+
+def aligned(*, toy: bool) -> StageBenchmark:
+    """Align moved faces by landmarks few and many, by features, with and without dense flow."""
+    side = 128 if toy else 512
+    rng = np.random.default_rng(1)
+    face = face_of("III", side, seed=2)
+    away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
+    seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
+    still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
+    settings: list[tuple[int, int]] = [(8, 0), (24, 0), (48, 0), (24, 2)]
+    if not toy:
+        settings = [(8, 0), (8, 2), (24, 0), (24, 1), (24, 2), (24, 4), (48, 0), (48, 2),
+                    (0, 0), (0, 2)]  # fmt: skip
+    points = []
+    covered = None
+    for count, rounds in settings:
+
+        def run(
+            count: int = count, rounds: int = rounds, pictures: MovedFace = seen
+        ) -> expression_alignment.Alignment:
+            names = list(pictures.landmarks)[:count]
+            return expression_alignment.align(
+                pictures.moving, pictures.neutral, rounds=rounds,
+                landmarks_moving={n: pictures.landmarks_moving[n] for n in names} or None,
+                landmarks_neutral={n: pictures.landmarks[n] for n in names} or None,
+                valid_moving=pictures.valid_moving, valid_neutral=pictures.valid,
+            )  # fmt: skip
+
+        timing = measure(run, repeats=1, memory=(count, rounds) == (24, 2))
+        found = run()
+        error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
+        if (count, rounds) == (24, 2):
+            covered = float((error < 2.0 * found.error_px[found.valid]).mean())
+        points.append(
+            Point(
+                {"by": found.by, "landmarks": count, "rounds": rounds}, timing, _rms(error),
+                _rms_interval(error, side),
+            )
+        )  # fmt: skip
+    bands = {
+        name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
+    }
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        before = run(24, 2, still)
+        false_motion = np.linalg.norm(before.source_px - still.source_px, axis=-1)[before.valid]
+        by_setting = {(p.knobs["landmarks"], p.knobs["rounds"]): p.error for p in points}
+        limits = (
+            Limit("px (median) of motion seen where blood alone changed",
+                  float(np.median(false_motion)), 0.1, "<=", "px"),
+            Limit("share of pixels within twice the stated error, 24 landmarks",
+                  float(covered or 0.0), 0.95, ">="),
+            Limit("times smaller error by dense flow than by 24 landmarks alone",
+                  by_setting[24, 0] / by_setting[24, 2], 3.0, ">="),
+            Limit("seconds on 512 x 512, 24 landmarks",
+                  next(p.timing.seconds for p in points
+                       if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)),
+                  10.0, "<=", "s"),
+        )  # fmt: skip
+    return StageBenchmark(
+        "expression-alignment",
+        "root mean square error of a pixel's place, px",
+        f"the smooth displacement of {side / 50:.3g} px that moved the picture",
+        0.0,
+        tuple(points),
+        limits,
+        by_band=bands,
+        left_out=(("Cramér-Rao bound", "deformation within the flow's windows limits, not noise"),),
+        interval_of="patches of the face",
+    )
+
+
+def _on_skin(preset: str, side: int) -> BandError:
+    """Return the error on skin of a preset: 24 landmarks and dense flow, 1 % of noise."""
+    rng = np.random.default_rng(4)
+    away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
+    seen = moved_face(face_of(preset, side, seed=2), away, state="exercise", rng=rng)
+    found = expression_alignment.align(
+        seen.moving, seen.neutral, rounds=2, landmarks_moving=seen.landmarks_moving,
+        landmarks_neutral=seen.landmarks, valid_moving=seen.valid_moving, valid_neutral=seen.valid,
+    )  # fmt: skip
+    error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
+    return BandError(_rms(error), _rms_interval(error, side))
+
+
+MISALIGNED_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+
+
+def misaligned(*, toy: bool) -> StageBenchmark:
+    """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
+
+    The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
+    that are not perfect, and interpolated maps do not.
+    """
+    side = 128 if toy else 512
+    face = face_of("III", side, seed=2)
+    mask = oval(side)
+    neutral = face.hemoglobin().astype(np.float64)
+    points = []
+    errors: dict[tuple[str, float], float] = {}
+    for state in ("exercise",) if toy else ("exercise", "smile"):
+        truth = face.hemoglobin(state).astype(np.float64)
+        size = _rms((truth - neutral)[mask])
+        for off_px in MISALIGNED_PX[:3] if toy else MISALIGNED_PX:
+            map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
+
+            def interpolated(map_of_state: Floats = map_of_state) -> Floats:
+                return neutral + 1.0 * (map_of_state - neutral)
+
+            ways = [("interpolated", 0.0, interpolated)]
+            for radius in (16.0,) if toy else (8.0, 16.0, 32.0):
+
+                def blended(
+                    map_of_state: Floats = map_of_state, radius: float = radius, name: str = state
+                ) -> Floats:
+                    rig = HemoglobinRig.from_maps(
+                        neutral, {name: map_of_state}, radius_px=radius, valid=mask
+                    )
+                    return np.asarray(rig.blend({name: 1.0, "neutral": 0.0}), np.float64)
+
+                ways.append(("blended", radius, blended))
+            for way, radius, call in ways:
+                timing = measure(call, repeats=1, memory=False)
+                error = (call() - truth)[mask] / size
+                error = error[np.isfinite(error)]
+                errors[f"{way} {radius:g} {state}", off_px] = _rms(error)
+                knobs: dict[str, str | float] = {"state": state, "way": way, "off_px": off_px}
+                if radius:
+                    knobs["radius_px"] = radius
+                points.append(Point(knobs, timing, _rms(error), _rms_interval(error, side)))
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        limits = tuple(
+            Limit(f"times larger error of interpolation than of blending, {state}, 2 px off",
+                  errors[f"interpolated 0 {state}", 2.0] / errors[f"blended 16 {state}", 2.0],
+                  2.0, ">=")
+            for state in ("exercise", "smile")
+        )  # fmt: skip
+    return StageBenchmark(
+        "misalignment",
+        "root mean square error over that of the state's change",
+        "blood of the state by dilated vessels, on the unmoved face",
+        0.0,
+        tuple(points),
+        limits,
+        left_out=(("a bound", "what eq. (6) leaves out of dilated vessels is its error at 0 px"),),
+        condition=("state", "off_px"),
+        interval_of="patches of the face",
+        no_bands="maps of blood alone: melanin does not enter",
+    )
+
+
+def displaced(image: Floats, rms_px: float, *, rng: np.random.Generator) -> Floats:
+    """Return a map seen at places that are off by a smooth random displacement of so many px."""
+    if rms_px == 0.0:
+        return image
+    side = image.shape[0]
+    away = smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng)
+    rows, columns = np.mgrid[:side, :side].astype(np.float64)
+    at = [rows + away[..., 1], columns + away[..., 0]]
+    return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _rms_interval(values: Floats, side: int) -> tuple[float, float]:
+    """Return the 68 % interval of a root mean square over pixels that go together in patches."""
+    squares = np.square(values)
+    patches = max(values.size / (side / 10.0) ** 2, 2.0)
+    mean, spread = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
+    return float(np.sqrt(max(mean - spread, 0.0))), float(np.sqrt(mean + spread))

@@ -1,0 +1,116 @@
+"""Benchmark of the chromophore inversion, beside SciPy's least squares in the same run."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from model import color_table, metrics
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction import chromophores
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import median_error
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+NOISE = 0.01
+LEAST_MELANIN = 0.004
+"""Volume fraction of the palest skin that is drawn."""
+SECONDS = 0.5
+TIMES_FASTER = 1000.0
+
+
+def inversion(*, toy: bool) -> StageBenchmark:
+    """Invert a noisy picture with the shading known and free, through tables of several sizes."""
+    side, pixels = (96, 8) if toy else (2048, 40)
+    rng = np.random.default_rng(0)
+    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    y, x = np.mgrid[0:side, 0:side] / side
+    c_m = 0.02 + 0.01 * np.sin(9 * x) * np.cos(7 * y)
+    c_hd = 0.05 + 0.03 * np.cos(8 * x + 3 * y)
+    color = np.concatenate([table.lookup(m, h) for m, h in zip(c_m, c_hd, strict=True)])
+    noisy = (color * (1 + NOISE * rng.standard_normal(color.shape))).astype(np.float32)
+    picture = noisy.reshape(side, side, 3)
+    variance = (NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
+    points = []
+    limits: tuple[Limit, ...] = ()
+    for shading in ("known", "free"):
+        for size in (16, 128) if toy else (16, 32, 64, 128):
+            coarse = color_table.build(
+                "Nikon 5100 (NPL)", "D55", size=size, anisotropy=ANISOTROPY_SKIN
+            )
+            given = "known" if shading == "known" else None
+
+            def invert(
+                coarse: color_table.ColorTable = coarse, given: str | None = given
+            ) -> chromophores.ChromophoreMaps:
+                return chromophores.invert(picture, coarse, shading=given, variance=variance)
+
+            timing = measure(invert, repeats=1 if toy else 3)
+            found = invert()
+            relative = 100 * np.abs(found.melanin / c_m - 1)
+            median, interval = metrics.median_with_interval(relative[found.valid], rng=rng)
+            # the median of |error| of a normal error of the bound's size
+            bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
+            points.append(
+                Point({"shading": shading, "table": size}, timing, median, interval, bound)
+            )
+        if shading == "free":
+            peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
+            ours_s = timing.seconds / side**2
+            limits = (
+                Limit(f"seconds for {side} x {side}, free shading", timing.seconds, SECONDS, "<=",
+                      "s"),
+                Limit("times faster than SciPy's least squares", peer_s / ours_s, TIMES_FASTER,
+                      ">="),
+            )  # fmt: skip
+    return StageBenchmark(
+        "chromophores",
+        "median error of melanin, %",
+        "the chromophores that the picture was made of, 1 % noise a channel",
+        0.0,
+        tuple(points),
+        limits,
+        by_band=_by_band(table, 500 if toy else 20_000, rng),
+        condition=("shading",),
+        interval_of="pixels",
+    )
+
+
+def _by_band(
+    table: color_table.ColorTable, count: int, rng: np.random.Generator
+) -> dict[str, BandError]:
+    """Return the median error of melanin in percent, shading free, from light skin to dark."""
+    errors = {}
+    for name, band in MELANIN_BANDS.items():
+        low, high = band.melanin_range
+        c_m = rng.uniform(max(low, LEAST_MELANIN), min(high, table.c_m_max), count)
+        c_hd = rng.uniform(0.02, 0.08, count)
+        color = table.lookup(c_m, c_hd)
+        noisy = color * (1 + NOISE * rng.standard_normal(color.shape))
+        found = chromophores.invert(
+            noisy.astype(np.float32)[None], table,
+            variance=(NOISE * color[None]).astype(np.float32) ** 2,
+        )  # fmt: skip
+        valid = found.valid[0]
+        off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
+        bound = 67.45 * float(np.median((found.stderr_melanin[0] / c_m)[valid]))
+        errors[name] = median_error(off, bound=bound)
+    return errors
+
+
+def _scipy_seconds(rgb: NDArray[np.floating], table: color_table.ColorTable) -> float:
+    """Return seconds a pixel of a plain fit of cube roots and log shading."""
+    start = time.perf_counter()
+    for color in rgb:
+
+        def residual(p: Floats, color: NDArray[np.floating] = color) -> Floats:
+            c_m, c_hd = np.clip(p[:2], 1e-3, [0.79, 0.68]) ** 3
+            return np.asarray((np.exp(p[2]) * table.lookup(c_m, c_hd) / color - 1) / NOISE)
+
+        least_squares(residual, [0.27, 0.33, 0.0])
+    return (time.perf_counter() - start) / len(rgb)

@@ -1,0 +1,262 @@
+"""How near estimators come to the Cramér-Rao bound, over subjects from light to dark.
+
+Each estimator is given data that its own model made, with noise of known variance: then nothing
+but its use of the data is measured, as the mean squared error over the least that any unbiased
+estimator can have. Bounds are taken from each forward equation by differences, not from the
+estimator's own standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import color_table, fresnel, photon_table
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
+from reconstruction.photometric_stereo import light_selection
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """An estimator on draws of one subject."""
+
+    squared_errors: Callable[[], Floats]
+    """Makes the squared errors of the draws."""
+    bound: float
+    """Cramér-Rao bound on their mean."""
+    noise: float
+    """Relative noise of a reading."""
+    clear: float = np.inf
+    """Bounds between what is sought and 0, where it cannot be negative."""
+
+
+SUBJECTS: Final = {
+    "palest": (0.005, 0.03), "II": (0.014, 0.05), "III": (0.028, 0.05), "IV": (0.047, 0.05),
+    "V": (0.085, 0.05), "VI": (0.17, 0.05),
+}  # fmt: skip
+"""Melanin and hemoglobin of typical skin."""
+MOST = 1.2
+"""Mean squared error over the bound that is aimed at."""
+CLEAR, LINEAR = 2.5, 10.0
+"""Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
+cut off, and a bound on unbiased ones says nothing of it. Below the second the color bends within
+the error, so that no estimator reaches the bound: it is measured there, but not judged."""
+NOISE: Final = (0.004, 0.002, 0.001, 0.0005)
+"""Relative noise of each channel: that of a usual picture; then the first at which all is linear,
+down to the mean of 64 such pixels."""
+ALBEDO_NOISE = 0.02
+"""Relative noise of a sample of the BRDF."""
+READINGS = 0.01
+"""Relative noise of each fibre."""
+
+
+def efficiency(*, toy: bool) -> StageBenchmark:
+    """Measure mean squared errors over Cramér-Rao bounds."""
+    draws = 500 if toy else 20_000
+    points: list[Point] = []
+    limits: list[Limit] = []
+    left_out: list[tuple[str, str]] = []
+    worst: dict[str, BandError] = {}
+    for name, made in _ESTIMATORS.items():
+        ratios: dict[str, list[tuple[float, float]]] = {band: [] for band in MELANIN_BANDS}
+        for subject, trial in made(draws):
+            timing = measure(trial.squared_errors, repeats=1)
+            squared = trial.squared_errors()
+            ratio = float(squared.mean()) / trial.bound
+            spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
+            knobs: dict[str, str | float] = {
+                "estimator": name, "subject": subject, "noise_percent": round(100 * trial.noise, 2),
+            }  # fmt: skip
+            also = {"judged": trial.clear >= LINEAR}
+            points.append(Point(knobs, timing, ratio, (ratio - spread, ratio + spread), 1.0, also))
+            if trial.clear >= LINEAR:
+                ratios[str(melanin_band(SUBJECTS[subject][0]))].append((ratio, spread))
+        left_out += _left_out(name, points)
+        for band, told in ratios.items():
+            if not told:
+                continue
+            ratio = float(np.mean([one for one, _ in told]))
+            spread = float(np.sqrt(np.sum([s**2 for _, s in told]))) / len(told)
+            # what so many draws leave open of the ratio counts for the estimator
+            limits.append(
+                Limit(f"{name}, {band} skin: mean squared error over the bound",
+                      ratio - 2.0 * spread, MOST, "<=")
+            )  # fmt: skip
+            if band not in worst or ratio > worst[band].error:
+                worst[band] = BandError(ratio, (ratio - spread, ratio + spread), 1.0)
+    return StageBenchmark(
+        "efficiency",
+        "mean squared error over Cramér-Rao bound",
+        "data of the estimator's own model with noise of known variance",
+        0.0,
+        tuple(points),
+        tuple(limits),
+        tuple(left_out),
+        by_band=worst,
+        squared=True,
+        condition=("estimator", "subject", "noise_percent"),
+        interval_of="draws of noise; by band, of the worst estimator there",
+    )
+
+
+def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
+    """Return the subjects of whom an estimator was not judged."""
+    judged = {
+        p.knobs["subject"] for p in points if p.knobs["estimator"] == name and p.also["judged"]
+    }
+    why = f"a fraction is nearer to 0 than {LINEAR:g} bounds even at {100 * NOISE[-1]:g} % of noise"
+    return [(f"{name}, {subject}", why) for subject in SUBJECTS if subject not in judged]
+
+
+def _chromophores(
+    which: Literal["melanin", "hemoglobin"], shading: Literal["known", "free"], draws: int
+) -> Iterator[tuple[str, Trial]]:
+    index = 0 if which == "melanin" else 1
+
+    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    given = "known" if shading == "known" else None
+
+    def squared(noisy: Floats, sigma: Floats, truth: tuple[float, float]) -> Floats:
+        found = chromophores.invert(
+            noisy.astype(np.float32), table, shading=given,
+            variance=np.broadcast_to(np.float32(sigma**2), noisy.shape),
+        )  # fmt: skip
+        value = getattr(found, which)
+        return np.square(np.asarray(value, np.float64)[found.valid] - truth[index])
+
+    for number, (subject, truth) in enumerate(SUBJECTS.items()):
+        color = table.lookup(*truth).reshape(3)
+        slopes = _differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
+        if shading == "free":
+            slopes = np.column_stack([slopes, color])
+        relative = slopes / color[:, None]
+        least = np.diag(np.linalg.inv(relative.T @ relative))[:2]  # at noise of 1
+        for noise in NOISE:
+            clear = float(np.min(np.array(truth) / (noise * np.sqrt(least))))
+            if clear < (CLEAR if noise == NOISE[0] else LINEAR):
+                continue
+            sigma = noise * color
+            rng = np.random.default_rng([1, number])
+            noisy = color + sigma * rng.standard_normal((draws, 3))
+            call = partial(squared, noisy, sigma, truth)
+            yield subject, Trial(call, float(noise**2 * least[index]), noise, clear)
+            if clear >= LINEAR:
+                break
+
+
+def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
+    rng = np.random.default_rng(2)
+    lights = rng.normal(size=(40, 3))
+    lights[:, 2] = np.abs(lights[:, 2]) + 0.4
+    lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
+    normal = np.array([0.2, -0.1, 0.0])
+    normal[2] = np.sqrt(1.0 - normal @ normal)
+    lit = lights @ normal
+    lights, lit = lights[lit > 0.15], lit[lit > 0.15]
+    for subject, albedo in zip(SUBJECTS, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+        # shot noise of 20,000 electrons at full scale, read noise of 5
+        sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
+        told = light_selection.information(
+            normal[None], lights, (sigma / (albedo * lit))[None] ** 2
+        )
+        tilt = light_selection.predict(told, range(len(lights)), least=3).tilt_rad[0]
+        noisy = albedo * lit[:, None] + sigma[:, None] * rng.standard_normal((len(lights), draws))
+
+        def squared(noisy: Floats = noisy, sigma: Floats = sigma) -> Floats:
+            found = photometric_stereo.estimate_normals(
+                noisy, lights, variance=np.broadcast_to((sigma**2)[:, None], noisy.shape)
+            )
+            return np.asarray(np.sum(np.cross(found.normals, normal) ** 2, axis=-1), np.float64)
+
+        yield (
+            subject,
+            Trial(squared, 2.0 * float(tilt) ** 2, float(np.mean(sigma / (albedo * lit)))),
+        )
+
+
+def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
+    rng = np.random.default_rng(3)
+    ways = rng.normal(size=(2, 60, 3))
+    ways[..., 2] = np.abs(ways[..., 2]) + 0.4
+    light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+    through = np.prod([1.0 - fresnel.reflectance(way[:, 2], 1.4) for way in (light, view)], axis=0)
+    up = np.array([0.0, 0.0, 1.0])
+    for subject, albedo in zip(SUBJECTS, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+        value = albedo * through / np.pi
+        sigma = ALBEDO_NOISE * value
+        bound = 1.0 / np.sum((through / np.pi / sigma) ** 2)
+        count = draws // 4
+        noisy = value[:, None] + sigma[:, None] * rng.standard_normal((count, 60, 1))
+
+        def squared(noisy: Floats = noisy, sigma: Floats = sigma, albedo: float = albedo) -> Floats:
+            every = (len(noisy), 60, 3)
+            found = diffuse_albedo.estimate(
+                noisy, np.broadcast_to(light, every), np.broadcast_to(view, every),
+                np.broadcast_to(up, (len(noisy), 3)), eta=1.4, normal_stderr_rad=0.0,
+                variance=np.broadcast_to((sigma**2)[:, None], noisy.shape),
+            )  # fmt: skip
+            return np.square(found.r_d[found.valid, 0] - albedo)
+
+        yield subject, Trial(squared, float(bound), ALBEDO_NOISE)
+
+
+def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
+    radius = np.linspace(1.0, 15.0, 28)
+    count = draws // 20
+    for number, (subject, (sigma_a, sigma_s)) in enumerate(
+        zip(SUBJECTS, ((0.02, 1.4), (0.03, 1.3), (0.05, 1.2), (0.08, 1.2), (0.15, 1.1), (0.3, 1.0)),
+            strict=True)
+    ):  # fmt: skip
+        truth = np.array([sigma_a, sigma_s])
+        profile = photon_table.reflectance(radius, *truth)
+        sigma = READINGS * profile + 1e-3 * profile.max() * READINGS
+        slopes = _differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
+        covariance = np.linalg.inv((slopes / sigma[:, None]).T @ (slopes / sigma[:, None]))
+        along = _differences(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
+        rng = np.random.default_rng([4, number])
+        noisy = profile + sigma * rng.standard_normal((count, 28))
+
+        def squared(noisy: Floats = noisy, sigma: Floats = sigma, truth: Floats = truth) -> Floats:
+            fit = subsurface.invert(
+                radius, noisy, variance=np.broadcast_to(sigma**2, noisy.shape), g=0.8,
+                g_error=0.0, model_error=0.0,
+            )  # fmt: skip
+            return np.square(fit.sigma_tr_per_mm[fit.valid] - _sigma_tr(truth))
+
+        yield subject, Trial(squared, float(along @ covariance @ along), READINGS)
+
+
+def _sigma_tr(coefficients: Floats) -> float:
+    sigma_a, sigma_s = coefficients
+    return float(np.sqrt(3.0 * sigma_a * (sigma_a + sigma_s)))
+
+
+def _differences(value: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """Return derivatives of a vector by each parameter, by central differences."""
+    columns = []
+    for k in range(len(at)):
+        step = np.zeros(len(at))
+        step[k] = 1e-3 * at[k]
+        columns.append((value(at + step) - value(at - step)) / (2.0 * step[k]))
+    return np.column_stack(columns)
+
+
+_ESTIMATORS: Final[dict[str, Callable[[int], Iterator[tuple[str, Trial]]]]] = {
+    "melanin, shading known": partial(_chromophores, "melanin", "known"),
+    "melanin, shading free": partial(_chromophores, "melanin", "free"),
+    "hemoglobin, shading known": partial(_chromophores, "hemoglobin", "known"),
+    "hemoglobin, shading free": partial(_chromophores, "hemoglobin", "free"),
+    "normals": _normals,
+    "diffuse albedo": _albedo,
+    "sigma_tr": _subsurface,
+}

@@ -1,0 +1,228 @@
+"""Benchmark of curves of blood in time: the time constant of five places, beside scipy's fit."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeWarning, curve_fit
+
+from capture.plan.multiplexed import multiplexed_plan, phases
+from capture.rig import load_rig
+from model import color_table
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction.facial_color.perfusion_curves import FALSE_ALARM, transition
+from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
+from rigsim.subject.perfusion_course import PromptedCourse
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+PROMPT_S = 5.0
+CYCLE_S = 2 * PROMPT_S
+CONSTANT_S = 2.0
+REACTION_S = 0.16
+LEVEL, NOISE = 0.03, 4e-4
+GAPS = (0.0065, -0.002, 0.001, 0.004, 0.009)
+"""Change of blood of the five places; the noise is that of a disc of 12 px of a small picture."""
+SECONDS = 1.0
+"""Most processor time of a fit of five places in 44 frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Train:
+    """Shots of a sequence."""
+
+    captures: int
+    shot_period_s: float
+
+    @property
+    def phase_s(self) -> Floats:
+        """Phases of the shots, s."""
+        return np.asarray((np.arange(self.captures) * self.shot_period_s) % CYCLE_S + 0.007)
+
+    def levels(self, constant_s: float, reaction_s: float = REACTION_S) -> Floats:
+        """Return the simulated level of the blood at each shot, after cycles of prompts."""
+        course = PromptedCourse(
+            "smile", rise_s=constant_s, fall_s=constant_s, reaction_s=reaction_s,
+            reaction_spread_s=0.0,
+        )  # fmt: skip
+        for number in range(40):
+            course.tell(PROMPT_S * number, "smile" if number % 2 == 0 else "neutral")
+        settled_s = 10 * CYCLE_S
+        return np.array([course.level(settled_s + phase) for phase in self.phase_s])
+
+    def draw(self, constant_s: float, rng: np.random.Generator) -> Floats:
+        """Return curves of the five places, (5, captures)."""
+        clean = LEVEL + np.outer(GAPS, self.levels(constant_s))
+        return np.asarray(clean + NOISE * rng.standard_normal(clean.shape))
+
+    def bound_s(self) -> float:
+        """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
+        step = 1e-4
+        slope = (self.levels(CONSTANT_S + step) - self.levels(CONSTANT_S - step)) / (2 * step)
+        level = self.levels(CONSTANT_S)
+        shift = self.levels(CONSTANT_S, REACTION_S + step)
+        shift = (shift - self.levels(CONSTANT_S, REACTION_S - step)) / (2 * step)
+        size = 2 + 2 * len(GAPS)
+        information = np.zeros((size, size))
+        for place, gap in enumerate(GAPS):
+            rows = np.zeros((size, self.captures))
+            rows[0], rows[1] = gap * slope, gap * shift
+            rows[2 + 2 * place], rows[3 + 2 * place] = 1.0, level
+            information += rows @ rows.T / NOISE**2
+        scale = np.sqrt(np.diag(information))
+        covariance = np.linalg.inv(information / np.outer(scale, scale))
+        return float(np.sqrt(covariance[0, 0]) / scale[0])
+
+
+def scipy_fit(phase_s: Floats, value: Floats) -> tuple[float, float]:
+    """Return time constant and standard error of one curve by scipy's curve_fit, its usual way."""
+
+    def model(phase: Floats, low: float, gap: float, delay: float, constant: float) -> Floats:
+        into = (phase - delay) % CYCLE_S
+        down = np.exp(-PROMPT_S / constant)
+        begin = down / (1.0 + down)
+        rising = 1.0 - (1.0 - begin) * np.exp(-into / constant)
+        falling = (1.0 - begin) * np.exp(-(into - PROMPT_S) / constant)
+        return np.asarray(low + gap * np.where(into < PROMPT_S, rising, falling))
+
+    start = (float(value.min()), float(np.ptp(value)), 0.1, 1.0)
+    bounds = ([-1.0, -1.0, 0.0, 1e-2], [1.0, 1.0, 2.5, 40.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OptimizeWarning)
+        found, covariance = curve_fit(model, phase_s, value, p0=start, bounds=bounds)
+    return float(found[3]), float(np.sqrt(covariance[3, 3]))
+
+
+def curves(*, toy: bool) -> StageBenchmark:
+    """Fit five places: number of shots, together or each alone, and scipy's fit beside it."""
+    trains = [Train(22, 5.5), Train(44, 10.25)]
+    if not toy:
+        trains = [Train(11, 5.5), *trains, Train(88, 10.25)]
+    runs = 3 if toy else 30
+    points = []
+    errors: dict[tuple[str, int], float] = {}
+    for train in trains:
+        phase = train.phase_s
+        for way in ("five places", "best place", "best place, scipy"):
+            rng = np.random.default_rng(0)
+            draws = [train.draw(CONSTANT_S, rng) for _ in range(runs)]
+
+            def one(values: Floats, way: str = way, phase: Floats = phase) -> float:
+                if way == "five places":
+                    return fit_cycle(phase, values, cycle_s=CYCLE_S).time_constant_s
+                if way == "best place":
+                    return fit_cycle(phase, values[-1], cycle_s=CYCLE_S).time_constant_s
+                return scipy_fit(phase, values[-1])[0]
+
+            off = np.array([one(values) for values in draws]) - CONSTANT_S
+            error = float(np.sqrt(np.mean(off**2)))
+            errors[way, train.captures] = error
+            spread = error / np.sqrt(2 * runs)
+            timing: Timing = measure(lambda one=one, v=draws[0]: one(v), repeats=3)  # type: ignore[misc]
+            points.append(
+                Point(
+                    {"captures": train.captures, "every s": train.shot_period_s, "fit": way},
+                    timing,
+                    error,
+                    (error - spread, error + spread),
+                    train.bound_s() if way == "five places" else None,
+                )
+            )
+    bands = {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
+    limits = () if toy else _limits(runs, errors, trains)
+    return StageBenchmark(
+        "perfusion-curves",
+        "root mean square error of a time constant of 2 s, s",
+        "the simulated course of five places in noise",
+        0.0,
+        tuple(points),
+        limits,
+        interval_of="runs",
+        by_band=bands,
+    )
+
+
+def noise_by_band() -> dict[str, float]:
+    """Return how much noisier than on light skin the blood of each band is, of equal pictures.
+
+    By the Cramér-Rao bound of hemoglobin at the same count of electrons in a white pixel.
+    """
+    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    found = {}
+    for name, band in MELANIN_BANDS.items():
+        at = np.array([band.melanin, band.hemoglobin])
+        color = table.lookup(*at)
+        step = np.diag(1e-3 * at)
+        slopes = np.stack(
+            [(table.lookup(*(at + d)) - table.lookup(*(at - d))) / (2.0 * d.sum()) for d in step],
+            axis=-1,
+        ).reshape(3, 2)
+        # shot noise: the variance goes with the light
+        information = slopes.T @ (slopes / color.reshape(3, 1))
+        found[name] = float(np.sqrt(np.linalg.inv(information)[1, 1]))
+    least = found["light"]
+    return {name: value / least for name, value in found.items()}
+
+
+def _on_skin(noisier: float, runs: int) -> BandError:
+    """Return the error of five places in 44 captures, with so many times the noise."""
+    train, rng = Train(44, 10.25), np.random.default_rng(0)
+    clean = LEVEL + np.outer(GAPS, train.levels(CONSTANT_S))
+    off = np.array(
+        [
+            fit_cycle(
+                train.phase_s, clean + noisier * NOISE * rng.standard_normal(clean.shape),
+                cycle_s=CYCLE_S,
+            ).time_constant_s
+            for _ in range(runs)
+        ]
+    ) - CONSTANT_S  # fmt: skip
+    error = float(np.sqrt(np.mean(off**2)))
+    spread = error / np.sqrt(2 * runs)
+    return BandError(error, (error - spread, error + spread), noisier * train.bound_s())
+
+
+def _limits(
+    runs: int, errors: dict[tuple[str, int], float], trains: list[Train]
+) -> tuple[Limit, ...]:
+    rig = load_rig("flash")
+    half, quarter = (phases(multiplexed_plan(rig, shot_period_s=s)) for s in ("5.5", "10.25"))
+    rng = np.random.default_rng(1)
+    coarse, fine = Train(22, 5.5), Train(44, 10.25)
+    quick: list[RelaxationFit] = []
+    alarms = held = 0
+    for _ in range(runs):
+        values = coarse.draw(0.01, rng)
+        quick.append(fit_cycle(coarse.phase_s, values, cycle_s=CYCLE_S))
+        found = transition(coarse.phase_s, values[-1], cycle_s=CYCLE_S)
+        alarms += found.seen
+        slow = fit_cycle(fine.phase_s, fine.draw(CONSTANT_S, rng), cycle_s=CYCLE_S)
+        held += slow.interval_s[0] <= CONSTANT_S <= slow.interval_s[1]
+    begin = time.process_time()
+    fit_cycle(fine.phase_s, fine.draw(CONSTANT_S, rng), cycle_s=CYCLE_S)
+    spent_s = time.process_time() - begin
+    bound_s = next(train for train in trains if train.captures == 44).bound_s()
+    # three binomial standard deviations beyond the stated rates
+    beyond = 3 * float(np.sqrt(FALSE_ALARM * (1 - FALSE_ALARM) / runs))
+    return (
+        Limit("phases met by 22 captures every 5.5 s", half.distinct, 20, ">="),
+        Limit("phases met by 44 captures every 10.25 s", quarter.distinct, 40, ">="),
+        Limit("largest bound of a course of 0.01 s, sampled every 0.5 s",
+              max(fit.interval_s[1] for fit in quick), 0.5, "<=", "s"),
+        Limit("rate of transitions seen where there is none", alarms / runs,
+              FALSE_ALARM + beyond, "<="),
+        Limit("part of 95 % intervals that hold the time constant", held / runs,
+              0.95 - beyond, ">="),
+        Limit("error over the Cramér-Rao bound, 44 captures", errors["five places", 44] / bound_s,
+              1.0 + 3 / float(np.sqrt(2 * runs)), "<="),
+        Limit("error over that of scipy's fit of the best place, 44 captures",
+              errors["five places", 44] / errors["best place, scipy", 44], 1.0, "<="),
+        Limit("processor seconds of a fit of five places, 44 captures", spent_s, SECONDS, "<=",
+              "s"),
+    )  # fmt: skip

@@ -1,0 +1,194 @@
+"""Benchmark of states inverted together, with one melanin, beside each by itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.facial_color import shared_melanin
+from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import median_error
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+STATES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
+NOISE = 0.003
+"""Relative noise of a superpixel of the flash rig's camera on light skin."""
+LIGHT_CHANGE = 0.05
+"""How much the light of a state differs, smoothly over the face."""
+FULL_SIDE = 1024
+SECONDS_FULL = 90.0
+CORES = 2
+
+
+def inversion(*, toy: bool) -> StageBenchmark:
+    """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
+    side = 64 if toy else 192
+    rng = np.random.default_rng(0)
+    colors, prior, covariance = table(), shading_prior.of_faces(), model_error.load()
+    face = face_of("II", side, seed=3)
+    mask = oval(side)
+    blood = np.stack([face.hemoglobin(state) for state in STATES]).astype(np.float64)
+    rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=rng)
+    valid = np.broadcast_to(mask, blood.shape)
+    truth = blood[1] - blood[0]
+
+    def alone() -> Floats:
+        each = [
+            chromophore_posterior.weigh(
+                rgb[k], colors, prior=prior, variance=variance[k], model_error=covariance,
+                valid=mask,
+            )
+            for k in (0, 1)
+        ]  # fmt: skip
+        return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
+
+    def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
+        return shared_melanin.weigh(
+            rgb[:count], colors, prior=prior, variance=variance[:count], model_error=covariance,
+            valid=valid[:count], shading_window_px=window,
+        )  # fmt: skip
+
+    points = [_point({"way": "each alone", "states": 2}, alone, lambda: alone() - truth, mask)]
+    settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
+    if not toy:
+        settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
+    for count, window in settings:
+        points.append(
+            _point(
+                {"way": "together", "states": count, "light": "free" if window is None else window},
+                lambda count=count, window=window: together(count, window),  # type: ignore[misc]
+                lambda count=count, window=window: together(count, window).change[1] - truth,  # type: ignore[misc]
+                mask,
+            )
+        )
+    bands = {
+        name: _on_skin(band.preset, side, colors, prior, covariance)
+        for name, band in MELANIN_BANDS.items()
+    }
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        found = together(7, 3.0)
+        error = np.abs(found.change[1] - truth)[mask]
+        within = float(np.mean(error < 2.0 * found.stderr_change[1][mask]))
+        limits = (
+            Limit("times smaller error of a change of blood than each state alone",
+                  points[0].error / points[4].error, 2.0, ">="),
+            Limit("share of changes within twice the stated error", within, 0.93, ">="),
+            *_melanin_limits(colors, prior),
+            _full_size(colors, prior, covariance),
+        )  # fmt: skip
+    return StageBenchmark(
+        "shared-melanin",
+        "median error of smile's change of blood, volume fraction",
+        "blood and melanin of a simulated face; light that differs by 5 % smoothly",
+        0.0,
+        tuple(points),
+        limits,
+        by_band=bands,
+        left_out=(("Cramér-Rao bound", "differs by pixel; unit tests hold errors to it"),),
+        interval_of="pixels",
+    )
+
+
+def pictures(
+    colors: ColorTable,
+    melanin: NDArray[np.floating],
+    blood: Floats,
+    covariance: Floats,
+    *,
+    rng: np.random.Generator,
+    noise: float = NOISE,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return colors (S, H, W, 3) of one melanin and S bloods, and their variance.
+
+    Each pixel has an error of the model that all its states share, and each state a light that
+    differs smoothly over the face.
+    """
+    rows, columns = np.mgrid[: melanin.shape[0], : melanin.shape[1]] / melanin.shape[0]
+    light = np.stack(
+        [
+            0.6 * np.exp(LIGHT_CHANGE * np.sin(3 * columns + k) * np.cos(2 * rows - k))
+            for k in range(len(blood))
+        ]
+    )
+    shared = rng.multivariate_normal(np.zeros(3), covariance, melanin.shape)
+    clean = colors.lookup(np.broadcast_to(melanin, blood.shape), blood)
+    clean = clean * np.exp(shared) * light[..., None]
+    seen = clean * (1.0 + noise * rng.standard_normal(clean.shape))
+    return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
+
+
+def _on_skin(
+    preset: str, side: int, colors: ColorTable, prior: ShadingPrior, covariance: Floats
+) -> BandError:
+    """Return the error of smile's change of blood on skin of a preset, three states together."""
+    face, mask = face_of(preset, side, seed=3), oval(side)
+    blood = np.stack([face.hemoglobin(state) for state in STATES[:3]]).astype(np.float64)
+    rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
+    found = shared_melanin.weigh(
+        rgb, colors, prior=prior, variance=variance, model_error=covariance,
+        valid=np.broadcast_to(mask, blood.shape), shading_window_px=3.0,
+    )  # fmt: skip
+    return median_error(np.abs(found.change[1] - (blood[1] - blood[0]))[mask])
+
+
+def _point(
+    knobs: dict[str, str | int | float],
+    call: Callable[[], object],
+    error: Callable[[], Floats],
+    mask: NDArray[np.bool_],
+) -> Point:
+    timing = measure(call, repeats=1, memory=False)
+    off = np.abs(error())[mask]
+    off = off[np.isfinite(off)]
+    middle = float(np.median(off))
+    # standard error of a median, by the density about it
+    low, high = np.quantile(off, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(off.size))
+    return Point(knobs, timing, middle, (float(low), float(high)))
+
+
+def _melanin_limits(colors: ColorTable, prior: ShadingPrior) -> tuple[Limit, ...]:
+    """Check how melanin's variance by noise goes with the number of states."""
+    rng = np.random.default_rng(1)
+    variances = {}
+    for count in (1, 7):
+        clean = 0.6 * np.broadcast_to(colors.lookup(0.02, 0.025), (count, 4000, 3))
+        seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
+        found = shared_melanin.weigh(seen, colors, prior=prior, variance=(2e-3 * clean) ** 2)
+        variances[count] = float(found.melanin.var())
+    return (
+        Limit("times smaller variance of melanin by noise, 7 states against 1",
+              variances[1] / variances[7], 6.0, ">="),
+    )  # fmt: skip
+
+
+def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Floats) -> Limit:
+    """Time 7 states of a megapixel by a band of it."""
+    rng = np.random.default_rng(2)
+    band = 96
+    melanin = np.full((band, FULL_SIDE), 0.02)
+    blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATES), band, FULL_SIDE)) ** 3
+    rgb, variance = pictures(colors, melanin, blood, covariance, rng=rng)
+    seconds = []
+    for _ in range(2):
+        begin = time.process_time()
+        shared_melanin.weigh(
+            rgb, colors, prior=prior, variance=variance, model_error=covariance,
+            shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+        )  # fmt: skip
+        seconds.append(time.process_time() - begin)
+    whole = min(seconds) * FULL_SIDE / band / CORES
+    return Limit(
+        "processor seconds on each of 2 cores, 7 states of 1024 x 1024, by a band of 96 rows",
+        whole, SECONDS_FULL, "<=", "s",
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Benchmarks of the gradient rig's estimators."""

@@ -1,0 +1,114 @@
+"""Benchmark of the gradient sphere's calibration: errors over the exposures of the glass ball."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fiber.spot_photometry import Shot, shot
+from capture.calibration.led_sphere.survey import SphereSurvey, survey_sphere
+from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
+from capture.raw import RawFrame
+from capture.rig import Rig, load_rig
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
+
+SEED = 7
+DIRECTION_DEG = 0.05
+INTENSITY_PERCENT = 1.0
+MISALIGNMENT_SIGMAS = 4.0
+
+
+def sphere_lights(*, toy: bool) -> StageBenchmark:
+    """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
+    from rigsim.as_built.sphere import build_sphere
+    from rigsim.scenes.gradient.scene import GradientScene
+
+    points, last = [], (np.inf, np.inf, np.inf)
+    for width_px in (192,) if toy else (512, 1024):
+        rig = load_rig("gradient").resized(width_px)
+        sphere = build_sphere(rig, seed=SEED)
+        scene = GradientScene(rig, "ball", sphere=sphere, seed=SEED)
+        shots = _shots(scene, rig)
+        fewer = ((0, 80, 90), (0, 90, 100)) if toy else ()
+        for readings in (*fewer, (0, 90), (0, 80, 90, 100)):
+            part = [one for one in shots if one.reading_deg in readings]
+
+            def call(part: Sequence[Shot] = part, rig: Rig = rig) -> SphereSurvey:
+                return survey_sphere(part, rig)
+
+            # nine tenths of a small survey's seconds are the LEDs': it is made once
+            timing, result = once(call) if toy else (measure(call), call())
+            good = result.lights.valid & ~result.lights.dead
+            place = sphere.position_mm
+            true = sphere.intensity / np.sum(place**2, axis=1)
+            error = 100 * (result.lights.intensities * true[good].mean() / true - 1)[good]
+            stated = 100 * (result.lights.intensities_stderr / result.lights.intensities)[good]
+            points.append(
+                Point(
+                    {"pixels": width_px, "readings": " ".join(map(str, readings))},
+                    timing,
+                    float(np.median(np.abs(error))),
+                    _interval(np.abs(error)),
+                    # the median of a normal distribution's size is 0.674 of its deviation
+                    float(0.674 * np.median(stated)),
+                )
+            )
+            aim = place / np.linalg.norm(place, axis=1, keepdims=True)
+            off = np.degrees(np.linalg.norm(result.lights.directions - aim, axis=1))
+            zero = np.degrees(result.films.misalignment_rad) - scene.films.analyser_zero_deg
+            sigmas = abs(zero) / np.degrees(result.films.misalignment_stderr_rad)
+            last = (
+                float(np.median(off[result.lights.seen])),
+                float(np.median(np.abs(error))),
+                float(sigmas),
+            )
+    return StageBenchmark(
+        "sphere-lights",
+        "median error of an LED's intensity, %",
+        "the simulated sphere as built",
+        0.0,
+        tuple(points),
+        (
+            Limit("median error of a direction", last[0], DIRECTION_DEG, "<=", "degrees"),
+            Limit("median error of an intensity", last[1], INTENSITY_PERCENT, "<=", "%"),
+            Limit("analyser's misalignment over its error", last[2], MISALIGNMENT_SIGMAS, "<="),
+        ),
+        (("the whole sensor", "2048 px: four times the pixels, and its pictures take minutes"),),
+        interval_of="LEDs",
+        no_bands="a calibration by targets: no skin is in the pictures",
+    )
+
+
+def _shots(scene: object, rig: Rig) -> list[Shot]:
+    from rigsim.boxes.gradient_sphere import PatternLight
+    from rigsim.scenes.gradient.scene import GradientScene
+    from rigsim.sensor import vignetting_map
+
+    if not isinstance(scene, GradientScene):
+        raise TypeError(f"scene: got {type(scene).__name__}, expected GradientScene")
+    view = rig.views[0]
+    sensor = scene.sensor()
+    flat = vignetting_map(sensor.vignetting, view.height_px, view.width_px)
+    shots: list[Shot] = []
+    for reading, levels in BALL_SERIES.items():
+        for level in levels:
+            light = PatternLight("full", level, 0.0, EXPOSURE_S, float(reading))
+            cfa = scene.exposure(view.name, pops=[light], exposure_s=EXPOSURE_S, seed=len(shots))
+            frame = RawFrame(
+                cfa=cfa, pattern=view.cfa, black=(float(view.black_level),),
+                white=view.white_level, noise_profile=sensor.noise_profile(EXPOSURE_S),
+            )  # fmt: skip
+            shots.append(
+                shot(frame, amount_s=EXPOSURE_S * level, reading_deg=float(reading), flat=flat)
+            )
+    return shots
+
+
+def _interval(sizes: NDArray[np.float64]) -> tuple[float, float]:
+    """Return a bootstrap interval of a median, 68 %."""
+    rng = np.random.default_rng(0)
+    again = np.median(sizes[rng.integers(0, len(sizes), (400, len(sizes)))], axis=1)
+    low, high = np.quantile(again, [0.16, 0.84])
+    return float(low), float(high)

@@ -1,0 +1,264 @@
+"""Benchmark of gradient normals on simulated skin: patterns, corrections, filters, pixels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from threadpoolctl import threadpool_limits
+
+from capture.rig import Rig, load_rig
+from model.metrics import angular_error_rad
+from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
+from reconstruction.normal_maps import NormalMaps
+from rigsim.as_built.sphere import BuiltSphere, as_drawn
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.subject.pigment import MELANIN_PRESETS
+from rigsim.world.taped_skin import GripState
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
+
+Floats = NDArray[np.float64]
+Images = Mapping[tuple[str, str], NDArray[np.floating]]
+
+NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
+EXPOSURE_S = 0.03
+PRESET = "III"
+"""Of the skin's melanin."""
+NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
+READINGS = {"parallel": 0.0, "crossed": 90.0}
+SMOOTH_PX = 8.0
+"""Of the relief's texels, by which skin is smoothed that stands for a smooth relief."""
+CLEAN_DEG, NOISY_DEG, SECONDS, TIMES_FORMULA = 0.3, 1.5, 3.0, 8.0
+CORES = 2
+"""Cores of the limit; processor time does not see who else keeps them busy."""
+EDGE_PX = 6
+"""Border that is not judged: the lens brings in what is beyond it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Skin in the gradient rig, without noise."""
+
+    images: dict[tuple[str, str], NDArray[np.float32]]
+    """Fractions of full scale."""
+    seen: Floats
+    """Normals at the lens' resolution, (H, W, 3)."""
+    sharp: Floats
+    lights: SphereLights
+    geometry: dict[str, Any]
+    """View and place of each pixel."""
+    noise: SensorNoise
+
+
+def lights_of(sphere: BuiltSphere) -> SphereLights:
+    """Return a sphere's lights as a perfect calibration would."""
+    far = np.linalg.norm(sphere.position_mm, axis=1)
+    ways = sphere.position_mm / far[:, None]
+    fields = np.cross(sphere.absorbs, ways)
+    middle = float(np.median(far))
+    return SphereLights(
+        ways, sphere.intensity * (middle / far) ** 2, programmed=sphere.weights[:, 1:],
+        polarizers=fields / np.linalg.norm(fields, axis=1)[:, None], distance_mm=middle,
+    )  # fmt: skip
+
+
+def pixel_geometry(rig: Rig) -> dict[str, Any]:
+    """Return the view and the place of each pixel on the patch, as `from_patterns` takes them."""
+    view = rig.views[0]
+    distance = float(np.linalg.norm(view.position_mm))
+    pixel = view.pixel_um * 1e-3 * distance / view.focal_mm
+    x = (np.arange(view.width_px) - (view.width_px - 1) / 2) * pixel
+    y = ((view.height_px - 1) / 2 - np.arange(view.height_px)) * pixel
+    points = np.stack([*np.meshgrid(x, y), np.zeros((view.height_px, view.width_px))], axis=-1)
+    way = np.array([0.0, 0.0, distance]) - points
+    return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
+
+
+def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
+    """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
+    rig = load_rig("gradient").cropped(side)
+    size_mm = max(0.006 * side + 0.8, 1.2)
+    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=PRESET)
+    if smooth:
+        height = gaussian_filter(skin.height_um, SMOOTH_PX, mode="wrap").astype(np.float32)
+        skin = replace(skin, height_um=height)
+    sphere = as_drawn(rig)
+    scene = GradientScene(rig, skin, sphere=sphere)
+    images = {
+        (name, polarizer): EXPOSURE_S
+        * scene.radiance(name, grip=NEUTRAL, analyser_deg=READINGS[polarizer])
+        for name in NAMES
+        for polarizer in READINGS
+    }
+    truth = scene.truth_appearance([NEUTRAL]).maps
+    view = rig.views[0]
+    # as fractions of full scale; a full well is one
+    noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)
+    return Patch(
+        images, np.asarray(truth["normals_seen_a000_n0"].values, np.float64),
+        np.asarray(truth["normals"].values, np.float64), lights_of(sphere), pixel_geometry(rig),
+        noise,
+    )  # fmt: skip
+
+
+def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], NDArray[np.float32]]:
+    """Return the pictures with the sensor's noise."""
+    read, gain = patch.noise.read_variance, patch.noise.gain
+    return {
+        key: (
+            image + np.sqrt(read + gain * image) * rng.standard_normal(image.shape, np.float32)
+        ).astype(np.float32)
+        for key, image in patch.images.items()
+    }
+
+
+def vectors_alone(images: Images) -> Floats:
+    """Return normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
+    s = {
+        name: images[name, "parallel"].astype(np.float64) - images[name, "crossed"]
+        for name in NAMES[:7]
+    }
+    c = np.stack([s[axis] - s[f"-{axis}"] for axis in "xyz"], axis=-1)
+    n = c / np.linalg.norm(c, axis=-1, keepdims=True) + [0.0, 0.0, 1.0]
+    return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
+
+
+def _judged(
+    normals: NDArray[np.floating], valid: NDArray[np.bool_], truth: Floats, seed: int = 0
+) -> tuple[float, tuple[float, float]]:
+    inner = (slice(EDGE_PX, -EDGE_PX),) * 2
+    good = valid[inner]
+    error = np.degrees(angular_error_rad(normals[inner][good], truth[inner][good]))
+    # neighbours share their error: blocks of lines are drawn, not pixels
+    rng = np.random.default_rng(seed)
+    parts = [part.mean() for part in np.array_split(error, 64) if part.size]
+    means = rng.choice(parts, (200, len(parts))).mean(axis=1)
+    return float(error.mean()), (float(np.quantile(means, 0.16)), float(np.quantile(means, 0.84)))
+
+
+def normals(*, toy: bool) -> StageBenchmark:
+    """Compute the normals of a patch of skin: patterns, corrections, filters; then all pixels."""
+    rng = np.random.default_rng(0)
+    side = 40 if toy else 192
+    patch = skin_patch(side, smooth=False)
+    noisy = exposed(patch, rng)
+    points: list[Point] = []
+    told = {"lights": patch.lights, **patch.geometry}
+
+    def add(knobs: dict[str, str | int | float], images: Images, **options: Any) -> float:
+        def run() -> NormalMaps:
+            return from_patterns(images, **options)
+
+        knobs.setdefault("noise", "the sensor's")
+        timing = measure(run, repeats=1 if toy else 3)
+        found = run()
+        error, interval = _judged(found.normals, found.valid, patch.seen)
+        bound = None
+        if "variance" in options and not ({"wiener", "smooth_px"} & set(options)):
+            # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
+            bound = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
+        points.append(Point(knobs, timing, error, interval, bound))
+        return error
+
+    subsets = {
+        "16": NAMES,
+        "14, no dark": NAMES[:7],
+        "14, no -x": tuple(n for n in NAMES if n != "-x"),
+        "8": ("full", "x", "y", "z"),
+        "8, x and -x": ("x", "-x", "y", "z"),
+    }
+    base = {**told, "variance": patch.noise, "wiener": True}
+    worst = 0.0
+    for label, names in subsets.items():
+        some = {key: image for key, image in noisy.items() if key[0] in names}
+        error = add({"patterns": label, "filter": "Wiener"}, some, **base)
+        worst = error if label == "16" else worst
+        if toy and label != "16":
+            break
+    plain = {**told, "variance": patch.noise}
+    add({"patterns": "16", "filter": "none"}, noisy, **plain)
+    for sigma in (1.0,) if toy else (0.7, 1.0, 1.5):
+        add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smooth_px=sigma, **plain)
+    add({"patterns": "16", "filter": "Wiener", "lights": "ideal"}, noisy, variance=patch.noise,
+        wiener=True)  # fmt: skip
+    add({"patterns": "16", "noise": "none"}, patch.images, **told)
+    add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
+    bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
+    limits = () if toy else _limits(worst, rng)
+    return StageBenchmark(
+        "gradient-normals",
+        "mean error of specular normals, degrees",
+        "the relief's slopes as lens and pixels average them; noise of the rig's sensor, 30 ms",
+        0.0,
+        tuple(points),
+        limits,
+        condition=("noise",),
+        interval_of="blocks of pixels",
+        by_band=bands,
+    )
+
+
+def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
+    """Return the error on the same relief with a band's pigment: 16 patterns, all corrections.
+
+    Crossed pictures hold half of the diffuse light and no specular; parallel ones hold the other
+    half besides: with another albedo both change by so much of the crossed one.
+    """
+    usual = replace(band, melanin=MELANIN_PRESETS[PRESET]).reflectance()
+    share = float((band.reflectance() / usual)[1])
+    images = {
+        (name, way): image - np.float32(1.0 - share) * patch.images[name, "crossed"]
+        for (name, way), image in patch.images.items()
+    }
+    seen = replace(patch, images=images)
+    found = from_patterns(
+        exposed(seen, np.random.default_rng(0)), lights=patch.lights, variance=patch.noise,
+        wiener=True, **patch.geometry,
+    )  # fmt: skip
+    return BandError(*_judged(found.normals, found.valid, patch.seen))
+
+
+def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
+    smooth = skin_patch(128, smooth=True)
+    found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
+    against = {
+        "lens' resolution": _judged(found.normals, found.valid, smooth.seen)[0],
+        "as it is": _judged(found.normals, found.valid, smooth.sharp)[0],
+    }
+    big = {
+        key: np.tile(image, (16, 16)).astype(np.float32)
+        for key, image in exposed(smooth, rng).items()
+    }
+    options: dict[str, Any] = {
+        "lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise,
+    }  # fmt: skip
+    spent = []
+    for _ in range(3):
+        begin = time.process_time()
+        from_patterns(big, **options)
+        spent.append(time.process_time() - begin)
+    begin = time.process_time()
+    with threadpool_limits(1):
+        vectors_alone(big)
+    peer_s = time.process_time() - begin
+    ours_s = min(spent) / CORES
+    return (
+        *(
+            Limit(f"mean error without noise on smooth relief, {name}", error, CLEAN_DEG,
+                  "<=", "degrees")
+            for name, error in against.items()
+        ),
+        Limit("mean error at the demo's noise, lens' resolution", worst, NOISY_DEG, "<=",
+              "degrees"),
+        Limit("processor seconds on each of 2 cores for 2048 x 2048 x 16", ours_s, SECONDS,
+              "<=", "s"),
+        Limit("times the processor time of the formula alone in NumPy", CORES * ours_s / peer_s,
+              TIMES_FORMULA, "<="),
+    )  # fmt: skip

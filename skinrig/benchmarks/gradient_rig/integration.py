@@ -1,0 +1,251 @@
+"""Benchmark of height from normals, beside Frankot-Chellappa, cosines and a sparse direct solve."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, sparse
+from scipy.sparse.linalg import splu
+
+from reconstruction.normal_integration import Settings, integrate, integrate_map, slope_fields
+from reconstruction.normal_integration.discontinuities import integrate_broken
+from reconstruction.normal_integration.height_errors import expected_rms
+from reconstruction.normal_integration.height_filters import high_pass
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+Floats = NDArray[np.float64]
+
+PIXEL_UM = 6.0
+CUTOFF_UM = 1000.0
+NOISE_RAD = np.radians(1.5)
+"""Root mean square angle of the normals' noise."""
+RELIEF_UM = 12.0
+CORES = 2
+"""Cores of the limits; processor time does not see who else keeps them busy."""
+SECONDS = 1.5
+BROKEN_SECONDS = 1.0
+RESIDUAL = 1e-5
+ERROR = 0.05
+
+
+def relief(side: int, *, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Make a relief of ridged cells on a bulge, and its normals (y up) without noise.
+
+    Periodic, of 90 um to 1 mm wavelength; slopes are exact derivatives of the height's waves.
+
+    Returns
+    -------
+    tuple of ndarray
+        height (side, side) in um, normals (side, side, 3).
+    """
+    theta_y = 2.0 * np.pi * np.fft.fftfreq(side)[:, None]
+    theta_x = 2.0 * np.pi * np.fft.rfftfreq(side)[None, :]
+    theta = np.hypot(theta_x, theta_y)
+    low, high = (2.0 * np.pi * PIXEL_UM / length for length in (CUTOFF_UM, 90.0))
+    band = (theta / low) ** 2 * np.exp(-((theta / (0.45 * high)) ** 2))
+    smooth = fft.irfft2(fft.rfft2(rng.standard_normal((side, side))) * band, (side, side))
+    ridged = -np.abs(smooth / smooth.std())
+    waves = fft.rfft2(ridged - ridged.mean()) * np.exp(-((theta / high) ** 2))
+    waves[0, 0] = 0.0
+    waves *= RELIEF_UM / fft.irfft2(waves, (side, side)).std()
+    waves[1, 1] += 0.25 * side * side * 60.0  # the bulge
+    # no derivative of the highest wave of an even number
+    odd_x = np.where(theta_x >= np.pi - 1e-9, 0.0, theta_x)
+    odd_y = np.where(np.abs(theta_y) >= np.pi - 1e-9, 0.0, theta_y)
+    height = fft.irfft2(waves, (side, side))
+    right = fft.irfft2(1j * odd_x * waves, (side, side)) / PIXEL_UM
+    down = fft.irfft2(1j * odd_y * waves, (side, side)) / PIXEL_UM
+    n = np.stack([-right, down, np.ones_like(height)], axis=-1)
+    return height, n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+
+def frankot_chellappa(normals: Floats, *, pixel: float) -> Floats:
+    """Integrate slopes of a periodic picture by the Fourier transform.
+
+    Frankot and Chellappa 1988, doi 10.1109/34.3909.
+    """
+    gx, gy = -normals[..., 0] / normals[..., 2], normals[..., 1] / normals[..., 2]
+    v = 2.0 * np.pi * np.fft.fftfreq(gx.shape[0])[:, None]
+    u = 2.0 * np.pi * np.fft.rfftfreq(gx.shape[1])[None, :]
+    squared = u * u + v * v
+    squared[0, 0] = np.inf
+    waves = -1j * (fft.rfft2(gx) * u + fft.rfft2(gy) * v) / squared
+    return np.asarray(pixel * fft.irfft2(waves, gx.shape))
+
+
+def sparse_direct(
+    normals: Floats, valid: NDArray[np.bool_], *, pixel: float, order: int = 4
+) -> Floats:
+    """Solve the same normal equations with SciPy's SuperLU; one connected part."""
+    ax, ay, dx, dy = slope_fields.edges(
+        slope_fields.from_normals(normals, valid=valid), order=order
+    )
+    number = np.full(ax.shape, -1)
+    inside = np.pad(valid, 1)
+    number[inside] = np.arange(np.count_nonzero(inside))
+    h, v = ax > 0, ay > 0
+    begin = np.concatenate([number[h], number[v]])
+    end = np.concatenate([number[np.roll(h, 1, axis=1)], number[np.roll(v, 1, axis=0)]])
+    wanted = np.concatenate([dx[h], dy[v]])
+    ones, rows = np.ones(begin.size), np.arange(begin.size)
+    D = sparse.csc_matrix(
+        (np.concatenate([-ones, ones]), (np.tile(rows, 2), np.concatenate([begin, end]))),
+        shape=(begin.size, int(number.max()) + 1),
+    )
+    A = (D.T @ D).tolil()
+    A[0, 0] += 1.0
+    x = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
+        D.T @ wanted
+    )
+    height = np.zeros(valid.shape)
+    height[valid] = pixel * (x - x.mean())
+    return height
+
+
+def integration(*, toy: bool) -> StageBenchmark:
+    """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
+    rng = np.random.default_rng(0)
+    side = 64 if toy else 512
+    truth, clean = relief(side, rng=rng)
+    noisy = clean + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
+    whole = np.ones((side, side), bool)
+    disc = _disc(side)
+    points: list[Point] = []
+
+    def add(
+        knobs: dict[str, str | int | float],
+        call: Callable[[Floats], NDArray[np.floating]],
+        normals: Floats,
+        valid: NDArray[np.bool_],
+        stderr: float,
+    ) -> None:
+        timing = measure(lambda: call(normals), repeats=1 if toy else 3)
+        error = high_pass(
+            np.where(valid, call(normals) - truth, 0.0),
+            pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=valid,
+        )  # fmt: skip
+        tiles = [float(np.mean(t[m] ** 2)) for t, m in _tiles(error, valid) if m.any()]
+        means = np.mean(rng.choice(tiles, (200, len(tiles))), axis=1)
+        low, high = np.sqrt(np.quantile(means, [0.16, 0.84]))
+        rms = float(np.sqrt(np.mean(error[valid] ** 2)))
+        bound = None
+        if stderr > 0.0:
+            slope = stderr / np.sqrt(2.0)
+            bound = expected_rms(
+                normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM
+            )  # fmt: skip
+        points.append(
+            Point(knobs, timing, rms, (min(float(low), rms), max(float(high), rms)), bound)
+        )
+
+    def ours(valid: NDArray[np.bool_], **options: object) -> Callable[[Floats], NDArray]:
+        return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
+
+    for name, normals, sigma in (("none", clean, 0.0), ("1.5 deg", noisy, NOISE_RAD)):
+        base: dict[str, str | int | float] = {"noise": name}
+        for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
+            settings = Settings(tolerance=tolerance)
+            add({**base, "method": "multigrid", "mask": "disc", "tolerance": tolerance},
+                ours(disc, settings=settings), normals, disc, sigma)  # fmt: skip
+        add({**base, "method": "multigrid", "mask": "disc", "order": 2},
+            ours(disc, settings=Settings(order=2)), normals, disc, sigma)  # fmt: skip
+        add({**base, "method": "cosines", "mask": "none"}, ours(whole), normals, whole, sigma)
+        add({**base, "method": "Frankot-Chellappa", "mask": "none"},
+            lambda n: frankot_chellappa(n, pixel=PIXEL_UM), normals, whole, sigma)  # fmt: skip
+    add({"noise": "1.5 deg", "method": "multigrid", "mask": "disc", "denoise": 1},
+        ours(disc, stderr_rad=NOISE_RAD, denoise=1.0), noisy, disc, NOISE_RAD)  # fmt: skip
+    add({"noise": "1.5 deg", "method": "bilateral", "mask": "disc"},
+        lambda n: integrate_broken(n, pixel=PIXEL_UM, valid=disc).height,
+        noisy, disc, NOISE_RAD)  # fmt: skip
+    add({"noise": "none", "method": "sparse direct", "mask": "disc"},
+        lambda n: sparse_direct(n, disc, pixel=PIXEL_UM), clean, disc, 0.0)  # fmt: skip
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        error = high_pass(
+            np.where(disc, integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, 0.0),
+            pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=disc,
+        )  # fmt: skip
+        kept = high_pass(np.where(disc, truth, 0.0), pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=disc)
+        limits = (
+            Limit("RMS error over RMS relief after high-pass, noise of 1.5 degrees",
+                  float(np.std(error[disc]) / np.std(kept[disc])), ERROR, "<="),
+            *_full_size(rng),
+        )  # fmt: skip
+    return StageBenchmark(
+        "normal-integration",
+        "RMS error of height after a high-pass of 1 mm, um",
+        f"the relief itself ({RELIEF_UM:g} um RMS), whose normals are exact",
+        0.0,
+        tuple(points),
+        limits,
+        condition=("noise", "mask"),
+        interval_of="tiles of the relief",
+        no_bands="shape alone: no color of skin enters",
+    )
+
+
+def _disc(side: int) -> NDArray[np.bool_]:
+    y, x = np.mgrid[0:side, 0:side] - 0.5 * side
+    holes = (x - 0.1 * side) ** 2 + (y + 0.2 * side) ** 2 < (0.05 * side) ** 2
+    return np.asarray((x * x + y * y < (0.47 * side) ** 2) & ~holes)
+
+
+def _tiles(
+    error: NDArray[np.floating], valid: NDArray[np.bool_]
+) -> list[tuple[NDArray[np.floating], NDArray[np.bool_]]]:
+    step = max(1, len(error) // 8)
+    places = range(0, len(error), step)
+    return [
+        (error[i : i + step, j : j + step], valid[i : i + step, j : j + step])
+        for i in places
+        for j in places
+    ]
+
+
+def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+    """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
+    _, normals = relief(2048, rng=rng)
+    noisy = (normals + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
+        np.float32
+    )
+    disc = _disc(2048)
+    found = integrate_map(noisy[:64, :64], method="multigrid")
+    spent = []
+    for _ in range(3):
+        begin = time.process_time()
+        found = integrate_map(noisy, pixel=PIXEL_UM, valid=disc)
+        spent.append(time.process_time() - begin)
+    small = np.ascontiguousarray(noisy[:1024, :1024])
+    integrate_broken(small[:64, :64])
+    broken = []
+    for _ in range(3):
+        begin = time.process_time()
+        integrate_broken(small, pixel=PIXEL_UM)
+        broken.append(time.process_time() - begin)
+    part = _disc(512)
+    flat = np.asarray(noisy[:512, :512], float)
+    mine = integrate(flat, pixel=PIXEL_UM, valid=part)
+    ours = []
+    for _ in range(3):
+        begin = time.process_time()
+        integrate(flat, pixel=PIXEL_UM, valid=part)
+        ours.append(time.process_time() - begin)
+    ours_s = min(ours)
+    begin = time.process_time()
+    theirs = sparse_direct(flat, part, pixel=PIXEL_UM)
+    peer_s = time.process_time() - begin
+    return (
+        Limit("processor seconds on each of 2 cores, 2048 x 2048 with a mask",
+              min(spent) / CORES, SECONDS, "<=", "s"),
+        Limit("relative residual of the same, in float64",
+              found.convergence.residual, RESIDUAL, "<="),
+        Limit("processor seconds on each of 2 cores, bilateral, 1024 x 1024",
+              min(broken) / CORES, BROKEN_SECONDS, "<=", "s"),
+        Limit("times less processor time than SuperLU, 512 x 512 with a mask",
+              peer_s / ours_s, 1.0, ">="),
+        Limit("largest difference to SuperLU over the RMS height",
+              float(np.abs(mine - theirs)[part].max() / np.std(theirs[part])), 1e-3, "<="),
+    )  # fmt: skip

@@ -1,0 +1,264 @@
+"""Benchmarks of histograms of normals and of the search for kernels, beside plain NumPy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+from reconstruction import kernel_fit, normal_histogram
+from reconstruction.kernel_fit import neutral_relief
+from reconstruction.kernel_fit import outcome as kernel_outcome
+from reconstruction.kernel_fit import search as kernel_search
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.normal_histogram import relief_slopes
+from reconstruction.normal_histogram import statistics as normal_statistics
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import mean_error
+
+Floats = NDArray[np.float64]
+
+PIXEL_UM = 6.0
+STRETCH = 0.88
+CORES = 2
+"""Cores of the limits; processor time does not see who else keeps them busy."""
+HIERARCHICAL_S = 15.0
+TIMES_FASTER = 100.0
+FULL_SIDE = 2000
+PEER_CANDIDATES = 3
+"""Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
+
+
+def relief(side: int, *, rng: np.random.Generator) -> Floats:
+    """Return heights of a skin-like relief, um: grain, ridges, and a network of furrows.
+
+    Parameters
+    ----------
+    side : int
+        Pixels of 6 um a side.
+    rng
+        Draws the relief.
+    """
+
+    def field(correlation_px: float) -> Floats:
+        white = rng.standard_normal((side, side), np.float32)
+        smooth = gaussian_filter(white, correlation_px, mode="wrap").astype(np.float64)
+        return np.asarray(smooth / smooth.std())
+
+    furrows = np.exp(-((field(12.0) / 0.25) ** 2))
+    return np.asarray(field(2.0) + 5.0 * field(6.0) - 12.0 * furrows + 8.0 * field(25.0))
+
+
+def strained(height: Floats, *, rng: np.random.Generator) -> Floats:
+    """Return a relief that no kernel makes: furrows deepen more than ridges rise, with noise."""
+    about = height - height.mean()
+    deeper = 1.12 * height - 0.02 * about**2 * (about < 0)
+    grain = gaussian_filter(rng.standard_normal(height.shape, np.float32), 1.0)
+    return np.asarray(deeper + 0.5 * grain)
+
+
+def numpy_distance(height: Floats, target: Floats, alpha: float, sigma_um: float) -> float:
+    """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
+    blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
+    dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
+    dx /= STRETCH
+    w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
+    edges = np.linspace(-1.0, 1.0, 65)
+    counts = np.histogram2d((dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
+    return float(np.abs(counts / counts.sum() - target).sum())
+
+
+def _spent(call: Callable[[], object], repeats: int = 1) -> float:
+    """Return the least processor time of some calls on one thread, s.
+
+    Of two threads the one that is done first spins until the other is, which counts as its time:
+    where other programs keep the cores busy that is up to as much as the work.
+    """
+    seconds, threads = [], numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        for _ in range(repeats):
+            begin = time.process_time()
+            call()
+            seconds.append(time.process_time() - begin)
+    finally:
+        numba.set_num_threads(threads)
+    return min(seconds)
+
+
+def search(*, toy: bool) -> StageBenchmark:
+    """Fit kernels: pixels used, search and its first sample; then 2000 x 2000 beside NumPy."""
+    rng = np.random.default_rng(0)
+    side = 64 if toy else 256
+    height = relief(side, rng=rng)
+    target = normal_histogram.histogram(
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+    )
+    alphas, sigmas = (ALPHAS[::50], SIGMAS_UM[::20]) if toy else (ALPHAS, SIGMAS_UM)
+
+    def fit(
+        way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
+    ) -> kernel_outcome.KernelFit:
+        return kernel_fit.fit_kernel(
+            height[:part, :part], target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM,
+            search=way, first_sample=first, alphas=alphas[::thin], sigmas_um=sigmas[::thin],
+        )  # fmt: skip
+
+    best = fit("exhaustive", side, 2)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    points = []
+    ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
+        ("exhaustive", side, 2, 1),
+        ("exhaustive", side, 2, 2 if toy else 5),
+        ("exhaustive", side // 2, 2, 1),
+        ("hierarchical", side, 512 if toy else 4096, 1),
+    ]
+    if not toy:
+        ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
+    for way, part, first, thin in ways:
+        timing = measure(
+            lambda way=way, part=part, first=first, thin=thin: fit(way, part, first, thin),  # type: ignore[misc]
+            repeats=1,
+            memory=False,
+        )
+        found = fit(way, part, first, thin)
+        change = whole.change(found.sigma_um)
+        there = buckets.distances((whole.along, whole.across), change, np.array([found.alpha]))
+        error = float(there[0]) - best.distance
+        knobs: dict[str, str | int | float] = {"search": way, "side": part, "every": thin}
+        if way == "hierarchical":
+            knobs["first sample"] = first
+        points.append(Point(knobs, timing, error, (error, error)))
+    limits = () if toy else _full_size(rng)
+    return StageBenchmark(
+        "kernel-fit",
+        "distance above that of the exhaustive search on all pixels",
+        "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
+        0.0,
+        tuple(points),
+        limits,
+        interval_of="nothing: one search on one relief, distances computed exactly",
+        no_bands="shape alone: no color of skin enters",
+    )
+
+
+def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+    """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
+    height = relief(FULL_SIDE, rng=rng)
+    target = normal_histogram.histogram(
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+    )
+    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    few = SIGMAS_UM[[10, 60, 150]]
+    ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHAS, few))
+    ours_s *= SIGMAS_UM.size / few.size
+    tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:PEER_CANDIDATES]
+    peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
+    peer_s *= ALPHAS.size * SIGMAS_UM.size / len(tried)
+    mismatch = max(
+        abs(
+            numpy_distance(height, target, alpha, sigma)
+            - float(
+                buckets.distances(
+                    (whole.along, whole.across), whole.change(sigma), np.array([alpha])
+                )[0]
+            )
+        )
+        for alpha, sigma in tried
+    )
+    default_s = []
+    for made in ("no kernel", "a kernel"):
+        if made == "a kernel":
+            moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
+            target = normal_histogram.histogram(
+                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+            )
+
+        def run(target: Floats = target) -> kernel_outcome.KernelFit:
+            return kernel_fit.fit_kernel(
+                height, target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM
+            )
+
+        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / CORES)
+    found = run()
+    return (
+        Limit("processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
+              default_s[0], HIERARCHICAL_S, "<=", "s"),
+        Limit("the same, relief made by a kernel", default_s[1], HIERARCHICAL_S, "<=", "s"),
+        Limit("steps of alpha from the kernel that made the relief", abs(found.alpha + 0.63) / 0.01,
+              1e-6, "<="),
+        Limit("um of sigma from the kernel that made the relief", abs(found.sigma_um - 17.5), 1e-9,
+              "<=", "um"),
+        Limit("times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
+              peer_s / (ours_s / CORES), TIMES_FASTER, ">="),
+        Limit("difference of distances from NumPy's", mismatch, 1e-3, "<="),
+    )  # fmt: skip
+
+
+def histograms(*, toy: bool) -> StageBenchmark:
+    """Make histograms of normals: pixels and buckets; beside numpy.histogram2d."""
+    rng = np.random.default_rng(0)
+    side = 96 if toy else 1024
+    truth_side = 256 if toy else 2048
+    truth_map = relief(truth_side, rng=rng)
+    points = []
+    for bins in (32, 64) if toy else (16, 32, 64, 128):
+        truth = normal_statistics.measure(truth_map, pixel=PIXEL_UM, bins=bins)
+        for part in (side // 2, side) if toy else (128, 256, 512, 1024):
+            patches = [
+                np.ascontiguousarray(truth_map[rows, columns])
+                for rows in (slice(part), slice(-part, None))
+                for columns in (slice(part), slice(-part, None))
+            ]
+
+            def run(
+                height: Floats = patches[0], bins: int = bins
+            ) -> normal_statistics.NormalStatistics:
+                return normal_statistics.measure(height, pixel=PIXEL_UM, bins=bins)
+
+            timing = measure(run, repeats=1 if toy else 3, memory=part == side)
+            off = mean_error(
+                [
+                    normal_histogram.distance(run(patch).histogram, truth.histogram)
+                    for patch in patches
+                ]
+            )
+            knobs: dict[str, str | int | float] = {"side": part, "bins": bins}
+            points.append(Point(knobs, timing, off.error, off.error_interval))
+    height = truth_map[:side, :side]
+    dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
+    edges = np.linspace(-1.0, 1.0, 65)
+
+    def theirs() -> Floats:
+        w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
+        counts = np.histogram2d((-dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
+        return np.asarray(counts / counts.sum())
+
+    def ours() -> Floats:
+        return normal_histogram.from_slopes(dx, dy)
+
+    repeats = 1 if toy else 3
+    times = _spent(theirs, repeats) / max(_spent(ours, repeats), 1e-9)
+    limits = (
+        Limit("times less processor time than numpy.histogram2d, same slopes", times, 3.0, ">="),
+        Limit("distance from numpy.histogram2d's histogram",
+              normal_histogram.distance(ours(), theirs()), 1e-5, "<="),
+    )  # fmt: skip
+    return StageBenchmark(
+        "normal-histogram",
+        "distance to the histogram of a larger patch, 0...2",
+        f"the histogram of {truth_side} x {truth_side} pixels that hold the patch",
+        float(normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)),
+        tuple(points),
+        () if toy else limits,
+        condition=("bins",),
+        interval_of="patches of that size",
+        no_bands="shape alone: no color of skin enters",
+    )

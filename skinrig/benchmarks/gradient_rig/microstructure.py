@@ -1,0 +1,495 @@
+"""Benchmarks of reliefs under strain: against skin that settled, and of the convolution itself."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
+from model.microstructure.convolution import (
+    LineKernels,
+    Sampling,
+    convolve,
+    convolve_tiled,
+    tiles_of,
+)
+from model.microstructure.map_windows import Window
+from model.microstructure.mesh_strain import strain
+from model.microstructure.strain_fields import rasterize
+from reconstruction import kernel_fit, normal_histogram
+from reconstruction.kernel_fit import table as kernel_table
+from reconstruction.normal_histogram import relief_slopes
+from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import StretchedSkin, deform
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+TEXEL_UM = 10.0
+FITTED_STATES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
+"""Stretch ratios that the table is fitted to, on other patches than those it is judged on."""
+JUDGED_STATES = (0.8, 0.9, 1.1, 1.2)
+ALPHAS = np.round(np.arange(-2.0, 1.001, 0.05), 2)
+SIGMAS_UM = np.arange(4.0, 101.0, 4.0)
+ACROSS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
+    (0.0, "none"), (30.0, "none"), (30.0, "volume"),
+)  # fmt: skip
+"""Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
+width, and where it does not, both passes act."""
+CORES = 2
+"""Cores of the limits; processor time does not see who else keeps them busy."""
+TIMES_FASTER = 5.0
+STATIC_PART = 0.6
+"""The fitted kernels' error is at most so much of the error of a relief that does not change."""
+FULL_SIDE = 4096
+PEER_ROWS = 256
+"""Rows of the full map that the straightforward convolution is timed on."""
+TILED_SIDE = 16_384
+TILED_MB = 6000.0
+GRADUAL = 0.02
+"""Turn of axes, rad, and relative change of sigma, within one sigma, that are called gradual."""
+GRADUAL_ERROR = 2.0
+"""Percent of the change that two passes may be off there."""
+WAVES = 60
+
+
+def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Floats, Floats]:
+    """Return slopes along and across the jaws of a relief that goes along with the skin."""
+    dx, dy, known = relief_slopes.slopes(height, pixel=TEXEL_UM)
+    inverse = np.linalg.inv(state.gradient)
+    along_x = dx[known] * inverse[0, 0] + dy[known] * inverse[1, 0]
+    along_y = dx[known] * inverse[0, 1] + dy[known] * inverse[1, 1]
+    return relief_slopes.turned(along_x, along_y, math.radians(state.angle_deg))
+
+
+def fitted_table(
+    skins: list[MicroSkin], states: tuple[float, ...], *, every: int = 1
+) -> KernelTable:
+    """Fit a table as from caliper sessions: each state's kernel, then lines through them.
+
+    Parameters
+    ----------
+    skins, states
+        Patches of `TEXEL_UM`, and the stretch ratios that each settles under.
+    every
+        Steps of the grid of kernels that are searched.
+    """
+    found = []
+    for skin in skins:
+        for r in states:
+            settled = deform(skin, stretch=r, angle_deg=0.0, compensation="none")
+            target = normal_histogram.histogram(
+                settled.height_um, pixel=(TEXEL_UM, TEXEL_UM * settled.stretch_s)
+            )
+            fit = kernel_fit.fit_kernel(
+                skin.height_um, target, stretch=r, axis="x", pixel_um=TEXEL_UM,
+                alphas=ALPHAS[::every], sigmas_um=SIGMAS_UM[::every],
+            )  # fmt: skip
+            found.append((r, fit.alpha, fit.sigma_um))
+    r, alpha, sigma = np.array(found).T
+    return kernel_table.fit_table(r, alpha, sigma, source="fitted to settled skin").table
+
+
+def strained_relief(
+    skin: MicroSkin, state: StretchedSkin, table: KernelTable, sampling: Sampling
+) -> Float32:
+    """Return the relief that a table's kernels make of a neutral one."""
+    angle = math.radians(state.angle_deg)
+    alpha, sigma_um = kernel_parameters([state.stretch_s, state.stretch_t], table)
+    return convolve(
+        skin.height_um,
+        (math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle)),  # rows go down
+        alpha[0], sigma_um[0] / TEXEL_UM, alpha[1], sigma_um[1] / TEXEL_UM, sampling=sampling,
+    )  # fmt: skip
+
+
+def _judged(
+    made: Callable[[MicroSkin, StretchedSkin], Float32],
+    skins: list[MicroSkin],
+    settled: list[list[StretchedSkin]],
+) -> tuple[float, float, float]:
+    """Return the mean distance of normals, its standard error over skins, and slopes' variance's.
+
+    The last is the mean absolute logarithm of its ratio, along the jaws.
+    """
+    off, wrong = [], []
+    for skin, own in zip(skins, settled, strict=True):
+        for state in own:
+            there = slopes_under(state.height_um, state)
+            ours = slopes_under(made(skin, state), state)
+            off.append(
+                normal_histogram.distance(
+                    normal_histogram.from_slopes(*there), normal_histogram.from_slopes(*ours)
+                )
+            )
+            wrong.append(abs(math.log(ours[0].var() / there[0].var())))
+    by_skin = np.asarray(off).reshape(len(skins), -1).mean(axis=1)
+    spread = float(by_skin.std(ddof=1) / math.sqrt(len(skins))) if len(skins) > 1 else 0.0
+    return float(by_skin.mean()), spread, float(np.mean(wrong))
+
+
+def truth(*, toy: bool) -> StageBenchmark:
+    """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
+    size_mm = 0.8 if toy else 2.4
+    states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STATES
+    table = fitted_table(
+        [make_micro_skin("forehead", seed=1, size_mm=size_mm, texel_um=TEXEL_UM)],
+        states,
+        every=4 if toy else 1,
+    )  # fmt: skip
+    seeds = (7, 8) if toy else (7, 8, 9)
+    skins = [
+        make_micro_skin("forehead", seed=seed, size_mm=size_mm, texel_um=TEXEL_UM) for seed in seeds
+    ]
+    points = []
+    errors: dict[tuple[str, str, str], float] = {}
+    variances: dict[tuple[str, str, str], float] = {}
+    for angle, across in ACROSS[-1:] if toy else ACROSS:
+        settled = [
+            [deform(skin, stretch=r, angle_deg=angle, compensation=across)
+             for r in (JUDGED_STATES[::3] if toy else JUDGED_STATES)]
+            for skin in skins
+        ]  # fmt: skip
+        ways: list[tuple[str, KernelTable | None, Sampling]] = [
+            ("none", None, "cubic"),
+            ("the paper's forehead", FOREHEAD, "cubic"),
+            ("fitted", table, "cubic"),
+            ("fitted", table, "linear"),
+        ]
+        for name, kernels, sampling in ways:
+            if sampling == "linear" and across == "none":
+                continue
+
+            def made(
+                skin: MicroSkin, state: StretchedSkin,
+                kernels: KernelTable | None = kernels, sampling: Sampling = sampling,
+            ) -> Float32:  # fmt: skip
+                if kernels is None:
+                    return skin.height_um
+                return strained_relief(skin, state, kernels, sampling)
+
+            def run(
+                made: Callable[..., Float32] = made,
+                settled: list[list[StretchedSkin]] = settled,
+            ) -> list[Float32]:
+                pairs = zip(skins, settled, strict=True)
+                return [made(skin, state) for skin, own in pairs for state in own]
+
+            timing = measure(run, repeats=1, memory=False)
+            error, spread, wrong = _judged(made, skins, settled)
+            errors[name, across, sampling], variances[name, across, sampling] = error, wrong
+            knobs: dict[str, str | int | float] = {
+                "kernels": name, "jaws_deg": angle, "across": across, "sampling": sampling,
+            }  # fmt: skip
+            also = {"variance_error_percent": 100.0 * math.expm1(wrong)}
+            interval = (error - spread, error + spread)
+            points.append(Point(knobs, timing, error, interval, also=also))
+
+    def left(of: dict[tuple[str, str, str], float], across: str) -> float:
+        return of["fitted", across, "cubic"] / of["none", across, "cubic"]
+
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        limits = (
+            Limit("fitted kernels' distance of normals over the static relief's, width kept",
+                  left(errors, "none"), STATIC_PART, "<="),
+            Limit("their error of slopes' variance along the jaws over the static relief's",
+                  left(variances, "none"), STATIC_PART, "<="),
+            Limit("the same distance where the width changes by volume", left(errors, "volume"),
+                  1.0, "<="),
+            Limit("the same error where the width changes by volume", left(variances, "volume"),
+                  1.0, "<="),
+            *_full_size(),
+        )  # fmt: skip
+    return StageBenchmark(
+        "microstructure",
+        "distance of normals from those of settled skin, 0...2 (eq. 7)",
+        "a stiff layer on soft tissue at rest; jaws between 0.8 and 1.2",
+        0.0,
+        tuple(points),
+        limits,
+        condition=("jaws_deg", "across"),
+        interval_of="patches of skin",
+        no_bands="shape alone: no color of skin enters",
+    )
+
+
+def varying_fields(
+    side: int, rows: int, *, first_row: int = 0, mean_px: float = 1.5
+) -> tuple[Float32, ...]:
+    """Return axes, strengths and sigmas as a face has them: they turn, blur here, sharpen there.
+
+    Parameters
+    ----------
+    side, rows, first_row : int
+        Size of the whole map, and the rows that are returned.
+    mean_px : float
+        Mean sigma, px.
+
+    Returns
+    -------
+    axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t
+        float32, shapes (rows, side[, 2]).
+    """
+    y = (np.arange(first_row, first_row + rows, dtype=np.float32)[:, None] / side) * np.float32(9.0)
+    x = (np.arange(side, dtype=np.float32)[None, :] / side) * np.float32(9.0)
+    angle = 1.3 * np.sin(x) + 0.8 * np.cos(y)
+    c, s = np.cos(angle), np.sin(angle)
+    alpha = np.clip(1.2 * np.sin(x + 1.0) * np.cos(y), -2.0, 1.0)
+    sigma = mean_px * (1.0 + 0.6 * np.sin(x + y))
+    return tuple(
+        np.ascontiguousarray(values, np.float32)
+        for values in (
+            np.stack([c, s], -1), np.stack([-s, c], -1), alpha, sigma,
+            np.minimum(-alpha, 1.0), 0.9 * sigma
+        )
+    )  # fmt: skip
+
+
+def numpy_convolve(height: Float32, fields: tuple[Float32, ...]) -> Float32:
+    """Return eqs. (4)-(6) in vectorised NumPy and SciPy, with bilinear samples."""
+    axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t = fields
+    y, x = np.mgrid[: height.shape[0], : height.shape[1]].astype(np.float32)
+    for axis, alpha, sigma in ((axis_s, alpha_s, sigma_s), (axis_t, alpha_t, sigma_t)):
+        total, norm = height.copy(), np.ones_like(height)
+        radius = np.floor(4.0 * sigma + 0.5)
+        for i in range(1, int(radius.max()) + 1):
+            w = np.where(i <= radius, np.exp(-0.5 * (i / sigma) ** 2), 0.0)
+            for step in (i, -i):
+                at = (y + step * axis[..., 1], x + step * axis[..., 0])
+                total += w * map_coordinates(height, at, order=1, mode="reflect")
+            norm += 2.0 * w
+        height = (1.0 - alpha) * height + alpha * total / norm
+    return height
+
+
+def _spent(call: Callable[[], object], repeats: int = 1) -> float:
+    """Return the least processor time of some calls, s."""
+    seconds = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        call()
+        seconds.append(time.process_time() - begin)
+    return min(seconds)
+
+
+def _full_size() -> tuple[Limit, ...]:
+    """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
+    rng = np.random.default_rng(0)
+    height = rng.standard_normal((FULL_SIDE, FULL_SIDE), np.float32)
+    fields = varying_fields(FULL_SIDE, FULL_SIDE)
+    own: dict[str, float] = {}
+    both: tuple[Sampling, ...] = ("cubic", "linear")
+    for sampling in both:
+        run = partial(convolve, height, *fields, sampling=sampling)
+        run()
+        own[sampling] = _spent(run, 2) / CORES
+    strip = height[:PEER_ROWS]
+    own_strip = tuple(values[:PEER_ROWS] for values in fields)
+    peer_s = _spent(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE / PEER_ROWS
+    mismatch = np.abs(
+        numpy_convolve(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
+    ).max()
+    del fields, height
+    raster_s = _spent(_rasterized(FULL_SIDE), 2) / CORES
+    tile_s, peak_mb = _tiles_of_16k()
+    return (
+        Limit("times faster on 2 cores than NumPy on its one, 4096 x 4096, cubic samples",
+              peer_s / own["cubic"], TIMES_FASTER, ">="),
+        Limit("the same, bilinear samples as NumPy's", peer_s / own["linear"], TIMES_FASTER, ">="),
+        Limit("largest difference from NumPy's, bilinear, of heights about 1", float(mismatch),
+              1e-3, "<="),
+        Limit("processor seconds on each of 2 cores, 4096 x 4096, cubic", own["cubic"], 10.0, "<=",
+              "s"),
+        Limit("the same, strain of 18,432 triangles filled into it", raster_s, 3.0, "<=", "s"),
+        Limit("the same for 16,384 x 16,384 in tiles of 2048, by two of 64", tile_s, 200.0, "<=",
+              "s"),
+        Limit("arrays held for that", peak_mb, TILED_MB, "<=", "MB"),
+    )  # fmt: skip
+
+
+def _rasterized(side: int) -> Callable[[], object]:
+    """Return a call that fills a texture with the strain of a sheet of some 18,000 triangles."""
+    n = 97
+    at = np.linspace(0.0, 1.0, n)
+    u, v = np.meshgrid(at, at)
+    points = 200.0 * np.stack([u, v, 0.2 * np.sin(6.0 * u)], axis=-1).reshape(-1, 3)
+    number = np.arange(n * n).reshape(n, n)
+    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
+    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    uv = np.stack([u, v], axis=-1).reshape(-1, 2)
+    moved = points + 4.0 * np.sin(points[:, [1, 2, 0]] / 20.0)
+    found = strain(points, moved, faces, uv)
+    return lambda: rasterize(found, faces, uv, (side, side))
+
+
+def _tiles_of_16k() -> tuple[float, float]:
+    """Return processor seconds a core for the whole of 16K, by two tiles, and MB held."""
+    shape = (TILED_SIDE, TILED_SIDE)
+    count = len(tiles_of(shape, 2048))
+    chosen = (0, count // 2 + 3)
+
+    def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
+        s, t, alpha_s, sigma_s, alpha_t, sigma_t = (
+            np.ascontiguousarray(values[:, window.columns])
+            for values in varying_fields(TILED_SIDE, window.shape[0], first_row=window.top)
+        )
+        return LineKernels(s, alpha_s, sigma_s), LineKernels(t, alpha_t, sigma_t)
+
+    with tempfile.TemporaryDirectory() as folder:
+        source = np.memmap(Path(folder) / "neutral", np.float32, "w+", shape=shape)
+        target = np.memmap(Path(folder) / "strained", np.float32, "w+", shape=shape)
+        run = partial(
+            convolve_tiled, source, target, fields_at,
+            finished=[number for number in range(count) if number not in chosen],
+        )  # fmt: skip
+        spent = _spent(run)
+        tracemalloc.start()
+        try:
+            run()
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        del source, target
+    return spent / CORES * count / len(chosen), peak / 1e6
+
+
+def waves(side: int, sigma_px: float, *, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Return wave vectors (N, 2), rad per px, amplitudes and phases of a relief of many waves.
+
+    Wavelengths are 4 to 12 sigmas (no shorter than 5 px), where kernels do most.
+    """
+    length = sigma_px * rng.uniform(4.0, 12.0, WAVES)
+    k = 2.0 * np.pi / np.maximum(length, 5.0)
+    direction = rng.uniform(0.0, np.pi, WAVES)
+    vectors = k[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return vectors, np.full(WAVES, WAVES**-0.5), rng.uniform(0.0, 2.0 * np.pi, WAVES)
+
+
+def two_passes_error(
+    *,
+    turn: float,
+    growth: float,
+    sigma_px: float = 3.0,
+    alpha: tuple[float, float] = (0.8, -1.2),
+    side: int = 160,
+    sampling: Sampling = "cubic",
+    rng: np.random.Generator,
+) -> tuple[float, Callable[[], NDArray[np.floating]]]:
+    """Return how far two passes are from the true convolution whose kernel varies, and the call.
+
+    The true one (eqs. 1 and 2, with the kernel of the pixel it is written to) is known exactly of
+    a relief of waves: each is scaled by the response of that pixel's kernel.
+
+    Parameters
+    ----------
+    turn, growth : float
+        Turn of the axes, rad, and largest relative change of sigma, over one sigma.
+    sigma_px : float
+        Sigma in the middle of the map, px.
+    alpha : (float, float)
+        Strengths along s and t.
+    side : int
+        Pixels a side.
+    sampling : {"cubic", "linear"}
+    rng : Generator
+        Draws the waves.
+
+    Returns
+    -------
+    error : float
+        RMS of the difference over that of the change by the true convolution.
+    call : callable
+        The convolution, for timing.
+    """
+    margin = round(10.0 * sigma_px)
+    whole = side + 2 * margin
+    y, x = np.mgrid[:whole, :whole].astype(np.float64) - 0.5 * (whole - 1)
+    vectors, amplitudes, phases = waves(side, sigma_px, rng=rng)
+    angle = 0.4 + turn / sigma_px * (x * np.cos(0.9) + y * np.sin(0.9))
+    sigma = sigma_px * (1.0 + 0.5 * np.sin(2.0 * growth / sigma_px * (0.9 * x - 0.44 * y)))
+    axis_s = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    axis_t = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    height, expected = np.zeros((2, whole, whole))
+    for vector, amplitude, phase in zip(vectors, amplitudes, phases, strict=True):
+        wave = amplitude * np.cos(vector[0] * x + vector[1] * y + phase)
+        response = np.ones((whole, whole))
+        for axis, strength in ((axis_s, alpha[0]), (axis_t, alpha[1])):
+            along = axis @ vector
+            response *= 1.0 - strength + strength * np.exp(-0.5 * (sigma * along) ** 2)
+        height += wave
+        expected += response * wave
+    inner = slice(margin, -margin), slice(margin, -margin)
+    stored = height.astype(np.float32)
+
+    def call() -> NDArray[np.floating]:
+        return convolve(stored, axis_s, axis_t, alpha[0], sigma, alpha[1], sigma, sampling=sampling)
+
+    off = (call() - expected)[inner]
+    change = (expected - height)[inner]
+    return float(np.sqrt(np.mean(off**2) / np.mean(change**2))), call
+
+
+def passes(*, toy: bool) -> StageBenchmark:
+    """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
+    tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
+    if not toy:
+        values = (0.01, GRADUAL, 0.05, 0.1, 0.2)
+        tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
+    points, errors = [], {}
+    draws = 2 if toy else 3
+    samplings: tuple[Sampling, ...] = ("cubic", "linear")
+    for sigma_px in (2.0,) if toy else (1.5, 3.0):
+        for sampling in samplings:
+            for turn, growth in tried if sampling == "cubic" else tried[::5]:
+                found = []
+                for seed in range(draws):
+                    error, call = two_passes_error(
+                        turn=turn, growth=growth, sigma_px=sigma_px, sampling=sampling,
+                        side=48 if toy else 160, rng=np.random.default_rng(seed),
+                    )  # fmt: skip
+                    found.append(100.0 * error)
+                mean = float(np.mean(found))
+                spread = float(np.std(found, ddof=1) / math.sqrt(draws)) if draws > 1 else 0.0
+                errors[sigma_px, sampling, turn, growth] = mean
+                points.append(
+                    Point(
+                        {"turn_rad_per_sigma": turn, "growth_per_sigma": growth,
+                         "sigma_px": sigma_px, "sampling": sampling},
+                        measure(call, repeats=1, memory=False), mean,
+                        (mean - spread, mean + spread),
+                    )
+                )  # fmt: skip
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        limits = (
+            Limit("error where nothing varies, sigma 3 px", errors[3.0, "cubic", 0.0, 0.0], 1.0,
+                  "<=", "%"),
+            Limit("error where axes turn gradually, sigma 3 px",
+                  errors[3.0, "cubic", GRADUAL, 0.0], GRADUAL_ERROR, "<=", "%"),
+            Limit("error where sigma grows gradually, sigma 3 px",
+                  errors[3.0, "cubic", 0.0, GRADUAL], GRADUAL_ERROR, "<=", "%"),
+        )  # fmt: skip
+    return StageBenchmark(
+        "microstructure-passes",
+        "error of two passes, % of the change",
+        "the response of each pixel's own kernel to 60 waves, exact",
+        0.0,
+        tuple(points),
+        limits,
+        condition=("turn_rad_per_sigma", "growth_per_sigma", "sigma_px"),
+        interval_of="reliefs of waves",
+        no_bands="shape alone: no color of skin enters",
+    )

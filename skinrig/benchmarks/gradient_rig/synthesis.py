@@ -1,0 +1,238 @@
+"""Benchmark of maps grown from patches, beside histogram-preserving blending."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import ndtri
+
+from model.displacement_synthesis import growth as displacement_synthesis
+from reconstruction import normal_histogram
+from reconstruction.normal_histogram import relief_slopes
+from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+
+Float32Array = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+PIXEL_UM = 10.0
+LARGEST_PX = 16_384
+THREADS = 2
+CLOSE = 0.03
+"""Half the sum of differences of 64 x 64 buckets that a map may be off its patches."""
+MEMORY_GB = 6.0
+
+
+def blended(
+    patches: Sequence[Float32Array], size_px: int, *, edge_px: int, rng: np.random.Generator
+) -> Float32Array:
+    """Grow patches by blending hexagonal tiles, their histogram of heights preserved.
+
+    Heights become normally distributed by their rank, three tiles are blended at each pixel with
+    weights divided by the root of their sum of squares, and ranks are turned back (Heitz and
+    Neyret 2018, doi:10.1145/3233304). The method that was not taken; here as a peer.
+
+    Parameters
+    ----------
+    patches : sequence of (H, W) float32
+        Heights, of at least ``2 * edge_px + 2`` pixels a side.
+    size_px : int
+        Side of the map.
+    edge_px : int
+        Edge of the triangles whose corners are the middles of tiles.
+    rng
+        Draws which part of which patch a tile shows.
+    """
+    stack = np.stack(patches)
+    ordered = np.sort(stack, axis=None)
+    ranks = np.empty(stack.size)
+    ranks[np.argsort(stack, axis=None, kind="stable")] = (np.arange(stack.size) + 0.5) / stack.size
+    normal = ndtri(ranks).reshape(stack.shape)
+    high = np.sqrt(0.75) * edge_px
+    y, x = np.meshgrid(np.arange(size_px), np.arange(size_px), indexing="ij")
+    b = y / high
+    a = x / edge_px - 0.5 * b
+    corner_a, corner_b = np.floor(a).astype(int), np.floor(b).astype(int)
+    fa, fb = a - corner_a, b - corner_b
+    upper = fa + fb > 1.0
+    lowest = int(corner_a.min())
+    shape = (int(corner_b.max()) + 2, int(corner_a.max()) - lowest + 2)
+    which = rng.integers(len(patches), size=shape)
+    reach = stack.shape[1] - 2 * edge_px - 2
+    from_y, from_x = rng.integers(reach + 1, size=(2, *shape))
+    total, square = np.zeros((size_px, size_px)), np.zeros((size_px, size_px))
+    for da, db, share in (
+        (np.where(upper, 1, 0), np.where(upper, 1, 0), np.where(upper, fa + fb - 1, 1 - fa - fb)),
+        (np.where(upper, 0, 1), np.where(upper, 1, 0), np.where(upper, 1 - fa, fa)),
+        (np.where(upper, 1, 0), np.where(upper, 0, 1), np.where(upper, 1 - fb, fb)),
+    ):
+        ca, cb = corner_a + da, corner_b + db
+        local_y = np.rint(y - cb * high).astype(int) + edge_px
+        local_x = np.rint(x - (ca + 0.5 * cb) * edge_px).astype(int) + edge_px
+        place = (cb, ca - lowest)
+        value = normal[which[place], from_y[place] + local_y, from_x[place] + local_x]
+        total += share * value
+        square += share**2
+    shares = (np.arange(4096) + 0.5) / 4096
+    quantile = np.interp(total / np.sqrt(square), ndtri(shares), np.quantile(ordered, shares))
+    return quantile.astype(np.float32)
+
+
+def slope_histogram(heights: Sequence[Float32Array]) -> Floats:
+    """Return the mean 64 x 64 histogram of normals of several maps."""
+    return np.asarray(
+        np.mean([normal_histogram.histogram(h, pixel=PIXEL_UM) for h in heights], axis=0)
+    )
+
+
+def autocorrelation(height: Float32Array, *, reach_px: int = 64) -> Floats:
+    """Return the autocorrelation of a map's slopes along y at distances up to a reach."""
+    slope = np.gradient(height.astype(np.float64), axis=0)
+    rows, columns = (fft.next_fast_len(n + reach_px) for n in slope.shape)
+    power = np.abs(fft.rfft2(slope - slope.mean(), s=(rows, columns))) ** 2
+    ones = np.abs(fft.rfft2(np.ones(slope.shape), s=(rows, columns))) ** 2
+    whole = fft.irfft2(power, s=(rows, columns)) / fft.irfft2(ones, s=(rows, columns))
+    near = np.roll(whole, (reach_px, reach_px), (0, 1))[: 2 * reach_px + 1, : 2 * reach_px + 1]
+    return np.asarray(near / near[reach_px, reach_px])
+
+
+def skewness_of_curvature(height: Float32Array) -> float:
+    """Return the skewness of minus Laplace: furrows are sharp and ridges round, so it is not 0."""
+    bend = -sum(np.roll(height, s, a) for s in (-1, 1) for a in (0, 1)) + 4.0 * height
+    inner = bend[1:-1, 1:-1].astype(np.float64)
+    return float(((inner - inner.mean()) ** 3).mean() / inner.std() ** 3)
+
+
+def growth(*, toy: bool) -> StageBenchmark:
+    """Grow a map: cells, what they share, windows tried; beside blending; then the largest map."""
+    site = "forehead"
+    count, size_mm, side = (2, 1.6, 200) if toy else (4, 8.0, 2048)
+    patches = [
+        displacement_synthesis.leveled(
+            make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM).height_um,
+            pixel_um=PIXEL_UM,
+        )
+        for seed in range(count)
+    ]
+    truth = slope_histogram(patches)
+    halves = [slope_histogram(patches[part::2]) for part in (0, 1)]
+    knobs = (
+        ((24, 8, 4), (32, 12, 4), (40, 16, 4))
+        if toy
+        else ((64, 32, 16), (96, 32, 16), (128, 64, 16), (192, 64, 1), (192, 64, 16),
+              (192, 64, 64), (256, 64, 16), (256, 128, 16))
+    )  # fmt: skip
+    points = []
+    for cell, overlap, tried in knobs:
+        made: list[Float32Array] = []
+
+        def run(
+            cell: int = cell,
+            overlap: int = overlap,
+            tried: int = tried,
+            made: list[Float32Array] = made,
+        ) -> None:
+            made[:] = [
+                displacement_synthesis.grow(
+                    patches, side, rng=np.random.default_rng(1), cell_px=cell,
+                    overlap_px=overlap, candidates=tried,
+                )
+            ]  # fmt: skip
+
+        timing = measure(run, repeats=1, memory=(cell, tried) == (knobs[-1][0], knobs[-1][2]))
+        about: dict[str, str | int | float | bool] = {
+            "method": "cut", "cell": cell, "overlap": overlap, "candidates": tried,
+        }  # fmt: skip
+        points.append(_point(about, timing, made[0], truth))
+    edge = 40 if toy else 128
+
+    theirs: list[Float32Array] = []
+
+    def peer() -> None:
+        theirs[:] = [blended(patches, side, edge_px=edge, rng=np.random.default_rng(1))]
+
+    timing = measure(peer, repeats=1, memory=False)
+    points.append(_point({"method": "blend", "cell": edge}, timing, theirs[0], truth))
+    return StageBenchmark(
+        "displacement-synthesis",
+        "half the sum of differences of 64 x 64 buckets of slopes, 0...1",
+        f"the histogram of {count} patches of {size_mm:g} mm; maps of {side} x {side} px",
+        normal_histogram.halved_distance(*halves),
+        tuple(points),
+        () if toy else _judged(patches, truth, theirs[0]),
+        left_out=(("the whole map of 16,384 x 16,384", "judged by its tiles: all are made alike"),),
+        interval_of="quarters of the map",
+        no_bands="shape alone: no color of skin enters",
+    )
+
+
+def _point(
+    knobs: Mapping[str, str | int | float | bool],
+    timing: Timing,
+    height: Float32Array,
+    truth: Floats,
+) -> Point:
+    """Return a point with the spread of its quarters as the error's interval."""
+    error = normal_histogram.halved_distance(slope_histogram([height]), truth)
+    half = height.shape[0] // 2
+    quarters = [
+        normal_histogram.histogram(part, pixel=PIXEL_UM)
+        for part in (height[:half, :half], height[:half, half:], height[half:, :half],
+                     height[half:, half:])
+    ]  # fmt: skip
+    left_out = [
+        normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
+    ]
+    spread = float(np.sqrt(0.75 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
+    return Point(knobs, timing, error, (max(error - spread, 0.0), error + spread))
+
+
+def _judged(
+    patches: Sequence[Float32Array], truth: Floats, theirs: Float32Array
+) -> tuple[Limit, ...]:
+    """Lay out the largest map, draw a band of its tiles, and judge them."""
+    begin = time.process_time()
+    layout = displacement_synthesis.lay_out(
+        patches, LARGEST_PX, rng=np.random.default_rng(0), threads=THREADS
+    )
+    laid_s = time.process_time() - begin
+    tile = layout.tile(0, 0)
+    rows, columns = tile.shape
+    timing = measure(lambda: layout.tile(rows, columns), repeats=1)
+    begin = time.process_time()
+    layout.tile(rows, columns)
+    tile_s = time.process_time() - begin
+    tiles = sum(1 for _ in layout.tiles())
+    site = layout.sites[0]
+    held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes
+    held += site.cells.nbytes + site.across.nbytes + site.down.nbytes
+    memory_gb = (held + 1e6 * THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2) / 1e9
+    part = layout.draw((0, 2 * rows), (0, 2 * columns))
+    cuts = layout.at_cuts((0, 2 * rows), (0, 2 * columns))
+    slope_x, slope_y, _ = relief_slopes.slopes(part, pixel=PIXEL_UM)
+    square = slope_x**2 + slope_y**2
+    ours = normal_histogram.halved_distance(slope_histogram([part]), truth)
+    skew = [skewness_of_curvature(h) for h in (part, theirs)]
+    ought = float(np.mean([skewness_of_curvature(patch) for patch in patches]))
+    alike = np.mean([autocorrelation(patch) for patch in patches], axis=0)
+    apart = [float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, theirs)]
+    blend = normal_histogram.halved_distance(slope_histogram([theirs]), truth)
+    return (
+        Limit("half the sum of differences of 64 x 64 buckets from the patches'", ours, CLOSE,
+              "<="),
+        Limit("rms slope at cuts over that elsewhere",
+              float(np.sqrt(square[cuts].mean() / square[~cuts].mean())), 1.1, "<="),
+        Limit("memory of 16,384 x 16,384 on 2 threads with the map held in memory", memory_gb,
+              MEMORY_GB, "<=", "GB"),
+        Limit("processor minutes of 16,384 x 16,384, by one tile", (laid_s + tiles * tile_s) / 60.0,
+              10.0, "<=", "min"),
+        Limit("times nearer to the patches' slopes than blended tiles", blend / ours, 1.0, ">="),
+        Limit("times nearer in the skewness of curvature (furrows) than blended tiles",
+              abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9), 2.0, ">="),
+        Limit("rms error of the autocorrelation of slopes within 64 px, over the blended tiles'",
+              apart[0] / apart[1], 1.0, "<="),
+    )  # fmt: skip

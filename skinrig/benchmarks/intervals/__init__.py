@@ -1,0 +1,1 @@
+"""Coverage of credible intervals over simulated sessions."""

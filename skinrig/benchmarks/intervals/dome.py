@@ -1,0 +1,154 @@
+"""Trials of the light dome's intervals: normals, diffuse albedo and surface lobes of faces."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import metrics, store
+from model.skin import SkinAppearance
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.dome.stages import WEIGHTS
+from skinrig.benchmarks.intervals.coverage import Trial
+from skinrig.benchmarks.intervals.trials import (
+    Floats,
+    forget,
+    of_map,
+    of_normals,
+    truth_of,
+    valid_of,
+)
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import reflection, skin_bands
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.simulating.simulation import simulate_session
+
+FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface": 2.5}
+"""Half width of a 95 % interval over that of the 68 % one, to 0.1, set on faces of seeds 0 to 5 and
+types I to V that are not judged (R_d: of seeds 1 to 3, types V, I and II): tails are heavier than a
+Gaussian's where one point in twenty is not like the others."""
+NORMALS: Final[Mapping[str, str]] = {
+    "normals": "normals of the dome", "normals_refined": "refined normals of the dome"
+}  # fmt: skip
+COLORS: Final = ("red", "green", "blue")
+
+
+def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+    """Yield trials of normals, diffuse albedo and lobes of faces.
+
+    Each seed has a dome of its own, built off the drawing, with its own calibration: errors of
+    calibration are drawn anew with each subject. Parameters as of `interval_trials_flash.flash`.
+    """
+    for seed, preset in subjects.items():
+        calibration = folder / "calibration"
+        targets = [folder / f"session-{name}" for name in ("charuco", "mirror", "white")]
+        for target in targets:
+            name = target.name.removeprefix("session-")
+            simulate_session("dome", target, target=name, seed=seed, width_px=width_px)
+        calibrate("geometry", targets[:1], calibration)
+        calibrate("lights", targets[1:], calibration)
+        done = simulate_session(
+            "dome", folder / "session-subject", subject=preset, seed=seed, width_px=width_px
+        )
+        pipeline.reconstruct(
+            done.session, want=[*NORMALS, "r_d", *WEIGHTS], out=folder / "maps",
+            calibration=calibration,
+        )  # fmt: skip
+        yield from of_face(
+            store.read(folder / "maps"), store.read(truth_of(done)), f"{preset} {seed}"
+        )
+        forget(folder, done)
+        for place in (*targets, calibration):
+            shutil.rmtree(place)
+
+
+def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Iterator[Trial]:
+    """Yield the trials of one face.
+
+    Parameters
+    ----------
+    found
+        Its maps, of the dome.
+    truth
+        Of the same face.
+    subject
+        Preset and seed.
+    """
+    pairs = surface_evaluation.match(found, truth)
+    true_normals, true_albedo = (
+        truth.maps[key].values.reshape(-1, 3).astype(np.float64)[pairs.truth]
+        for key in ("normals", "r_d")
+    )
+    band = str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(true_albedo))))
+    for name, quantity in NORMALS.items():
+        normals = found.maps[name]
+        good = valid_of(normals)[pairs.rows, pairs.columns]
+        if normals.stderr is not None:
+            at = (pairs.rows[good], pairs.columns[good])
+            yield of_normals(
+                quantity,
+                metrics.angular_error_rad(normals.values[at], true_normals[good]),
+                normals.stderr[at][:, 0].astype(np.float64), subject=subject, band=band,
+                factor_95=FACTORS_95["normals"],
+            )  # fmt: skip
+    albedo = found.maps["r_d"]
+    shape = valid_of(albedo).shape
+    true = np.zeros((*shape, 3))
+    true[pairs.rows, pairs.columns] = true_albedo
+    told = np.zeros(shape, bool)
+    told[pairs.rows, pairs.columns] = True
+    for channel, color in enumerate(COLORS):
+        yield of_map(f"R_d, {color}", albedo, true, told, subject=subject, band=band,
+                      channel=channel, factor_95=FACTORS_95["R_d"])  # fmt: skip
+    off, stderr = lobe_strength(found, truth)
+    width = float(100.0 * np.median(stderr)) if stderr.size else float("nan")
+    yield Trial("light from the surface, dome", subject, band, np.abs(off) / stderr, width, "%",
+                FACTORS_95["surface"])  # fmt: skip
+
+
+def lobe_strength(
+    found: SkinAppearance, truth: SkinAppearance
+) -> tuple[Floats, NDArray[np.float64]]:
+    """Return by how much fitted lobes are off in the light that a surface gives off, relative.
+
+    Single weights are not determined where lobes resemble each other; how much light all of them
+    give off together is what their standard error speaks of.
+
+    Parameters
+    ----------
+    found
+        With normals, albedo, weights and their basis.
+    truth
+        With the file of directions that no light had.
+
+    Returns
+    -------
+    off, stderr : ndarray of float64, shape (n,)
+        Of each point of the test that has weights: (true - fitted) / fitted of the mean over its
+        directions of f_r cos(light), and the stated standard error of it.
+    """
+    test = reflection.surface_test(found, truth)
+    if test is None:
+        return np.zeros(0), np.zeros(0)
+    weights = [found.maps[name] for name in WEIGHTS]
+    valid = valid_of(weights[0]).reshape(-1)[test.texels]
+    shares, errors = (
+        np.stack(
+            [
+                np.zeros(valid.shape)
+                if part is None
+                else part.reshape(-1)[test.texels].astype(np.float64)
+                for part in parts
+            ]
+        )
+        for parts in ([w.values for w in weights], [w.stderr for w in weights])
+    )
+    level, spread = shares.sum(axis=0), errors.sum(axis=0)
+    fitted, true = test.fitted.mean(axis=1), test.true.mean(axis=1)
+    good = valid & (level > 0) & (fitted > 0) & (spread > 0)
+    return true[good] / fitted[good] - 1.0, spread[good] / level[good]

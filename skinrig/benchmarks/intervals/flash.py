@@ -1,0 +1,128 @@
+"""Trials of the flash rig's intervals: chromophores, and how blood changes with a state.
+
+Stated errors are of people who do not stand exactly where the white tile stood
+(`reconstruction.chromophores.shading_prior.SOFTNESS`), and so each subject is drawn a place off it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from capture.rig import load_rig
+from model import store
+from reconstruction.chromophores import shading_prior
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.flash.facial_color import UnknownBloodError
+from skinrig.benchmarks.intervals.coverage import Trial
+from skinrig.benchmarks.intervals.trials import (
+    band_of,
+    calibrated,
+    forget,
+    of_map,
+    truth_of,
+    valid_of,
+)
+from skinrig.simulating.simulation import Simulated, simulate_session
+
+BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
+FACTOR_95: Final = 2.4
+"""Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
+subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
+
+STANCE_SHARE: Final = 0.5 * shading_prior.SOFTNESS
+"""Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
+what the stated errors take it for. Light goes with the square of the distance."""
+_STANCE: Final = 1
+"""Beside a subject's seed: of the draw of its place."""
+
+
+def nearer_mm(seed: int) -> float:
+    """Return how much nearer to the camera than the tile's place the subject of a seed stands.
+
+    Examples
+    --------
+    >>> round(nearer_mm(520), 1) == round(nearer_mm(520), 1) != round(nearer_mm(521), 1)
+    True
+    """
+    drawn = np.random.default_rng([seed, _STANCE]).standard_normal()
+    return float(STANCE_SHARE * load_rig("flash").views[0].distance_mm * drawn)
+
+
+def flash(
+    folder: Path,
+    subjects: Mapping[int, str],
+    *,
+    width_px: int,
+    moving: bool = True,
+    resolution: str = "",
+) -> Iterator[Trial]:
+    """Yield trials of melanin and hemoglobin, and of the hemoglobin rig's blood and its change.
+
+    Parameters
+    ----------
+    folder
+        For sessions and maps; those of a subject are gone when the next begins.
+    subjects
+        Seed of each and its preset.
+    width_px
+        Pixels across the camera.
+    moving
+        Whether each is captured in a second state, for the blood of a hemoglobin rig.
+    resolution
+        Said behind the quantities' names.
+    """
+    targets = {"sensor": "flat", "white": "white", "polarization": "malus"}
+    calibrated("flash", folder, targets, width_px=width_px)
+    for seed, preset in subjects.items():
+        state = BLOOD_STATES[seed % len(BLOOD_STATES)]
+        name = f"{preset} {seed}"
+        done = simulate_session(
+            "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
+            states=("neutral", state) if moving else ("neutral",), nearer_mm=nearer_mm(seed),
+        )  # fmt: skip
+        pipeline.reconstruct(
+            done.session, want=["melanin", "hemoglobin"], out=folder / "maps",
+            calibration=folder / "calibration",
+        )  # fmt: skip
+        found, truth = store.read(folder / "maps"), store.read(truth_of(done))
+        skin = truth.maps["mask"].values > 0.5
+        band = band_of(truth, "reflectance_blurred", skin)
+        for quantity in ("melanin", "hemoglobin"):
+            true = truth.maps[f"{quantity}_blurred"].values
+            yield of_map(f"{quantity}{resolution}", found.maps[quantity], true, skin, subject=name,
+                         band=band, factor_95=FACTOR_95)  # fmt: skip
+        if moving:
+            yield from _of_rig(done, folder, state, subject=name, band=band)
+        forget(folder, done)
+
+
+def _of_rig(
+    done: Simulated, folder: Path, state: str, *, subject: str, band: str
+) -> Iterator[Trial]:
+    from skinrig.evaluating import facial_color
+    from skinrig.fitting.facial_color import fit_facial_color
+    from skinrig.simulating.simulation import truth_folder
+
+    try:
+        fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
+    except UnknownBloodError:
+        return  # of the darkest skin: it states no interval
+    maps = store.read(folder / "moving").maps
+    blood, found = maps.get(f"hemoglobin_{state}"), maps.get(f"change_{state}")
+    neutral = truth_folder(done.session)
+    truths = [neutral, neutral.with_name(f"{neutral.name}-{state}")]
+    rest, moved = (
+        facial_color.true_blood(store.read(place)) if place.is_dir() else None for place in truths
+    )
+    if blood is None or found is None or rest is None or moved is None:
+        return
+    both = valid_of(rest) & valid_of(moved) & (moved.values > 0)
+    change = moved.values.astype(np.float64) - rest.values
+    yield of_map("hemoglobin of the rig", blood, moved.values, both, subject=subject, band=band,
+                 factor_95=FACTOR_95)  # fmt: skip
+    yield of_map("change of hemoglobin", found, change, both, subject=subject, band=band,
+                 over=rest.values)  # fmt: skip

@@ -1,0 +1,193 @@
+"""Trials of the gradient sphere's intervals: normals, heights, stretch and kernels of skin.
+
+Kernels are compared with those of more of the same skin, seven to ten times the patch: found by the
+same definition, eq. (7), from true heights and the true stretch. So the trial tells what another
+patch of the skin would change, which standard errors state, together with errors of pictures, lens
+and strain. Both reliefs of the truth are of one piece of skin, as the patch's are: histograms of
+other skin lead to narrower and stronger kernels.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from model import metrics, store
+from model.skin import SkinAppearance
+from reconstruction.kernel_fit import fit_kernel
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.outcome import KernelFit
+from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
+from reconstruction.pipeline.gradient.strain_kernels import COARSER
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
+from skinrig.benchmarks.intervals.trials import ANY_BAND, forget, of_normals, truth_of, valid_of
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.simulating.simulation import simulate_session
+
+FACTORS_95: Final[Mapping[str, float]] = {
+    "normals": 1.9,
+    "height": 2.1,
+    "stretch": GAUSSIAN_95,
+}
+"""Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
+13 that are not judged: tails are heavier than a Gaussian's. Kernels state both half widths."""
+
+
+STRETCH_STEP: Final = 2
+"""Steps of the caliper to either side of neutral at which the skin's stretch is told."""
+SKIN_MM: Final = 2.4
+"""Side of the skin whose kernels are true."""
+EDGE_MM: Final = 1.0
+"""What is simulated besides: skin at the border of the simulation is not looked at."""
+
+
+def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+    """Yield trials of normals and heights at rest, and of stretch and kernels to either side.
+
+    Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
+    as of `interval_trials_flash.flash`; a subject is a site of the face.
+    """
+    from skinrig.evaluating.microrelief import compare_stretch, true_relief
+
+    for seed, site in subjects.items():
+        name = f"{site} {seed}"
+        ball, calibration = folder / "session-ball", folder / "calibration"
+        simulate_session("gradient", ball, target="ball", seed=seed)
+        for kind in ("lights", "polarization"):
+            calibrate(kind, [ball], calibration)
+        done = simulate_session(
+            "gradient", folder / "session-subject", site=site, seed=seed, width_px=width_px,
+            angles=(0.0,), steps=(-STRETCH_STEP, STRETCH_STEP),
+        )  # fmt: skip
+        pipeline.reconstruct(
+            done.session, want=["normals", "height", "strain", "kernels"], out=folder / "maps",
+            calibration=calibration,
+        )  # fmt: skip
+        found, truth = store.read(folder / "maps"), store.read(truth_of(done))
+        state = next(
+            key.removeprefix("normals_")
+            for key in found.maps
+            if key.startswith("normals_a") and key.endswith("_n0")
+        )
+        normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
+        good = valid_of(normals) & valid_of(seen)
+        if normals.stderr is not None:
+            angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
+            yield of_normals(
+                "normals of the gradient sphere", angle,
+                normals.stderr[good][:, 0].astype(np.float64), subject=name,
+                factor_95=FACTORS_95["normals"],
+            )  # fmt: skip
+        height = found.maps[f"height_{state}"]
+        relief = true_relief(found, truth, state)
+        good = valid_of(height) & valid_of(truth.maps[f"height_{state}"])
+        if height.stderr is not None:
+            stderr = height.stderr[good].astype(np.float64)
+            off = np.abs(height.values.astype(np.float64)[good] - relief[good]) / stderr
+            yield Trial("height", name, ANY_BAND, off, float(np.median(stderr)), "um",
+                        FACTORS_95["height"])  # fmt: skip
+        # the neutral state is what stretch is told against: exact by definition
+        rows = [row for row in compare_stretch(found, truth) if row.state != state]
+        spread = np.array([row.stderr for row in rows])
+        width = float(100.0 * np.median(spread)) if rows else float("nan")
+        yield Trial("stretch ratio", name, ANY_BAND,
+                    np.array([abs(row.error) for row in rows]) / spread, width, "%",
+                    FACTORS_95["stretch"])  # fmt: skip
+        yield from _kernels(found, truth, site=site, seed=seed)
+        forget(folder, done)
+        for place in (ball, calibration):
+            shutil.rmtree(place)
+
+
+def _kernels(
+    found: SkinAppearance, truth: SkinAppearance, *, site: str, seed: int
+) -> Iterator[Trial]:
+    """Compare the kernels of strained states with those of more of the same skin."""
+    from skinrig.evaluating.microrelief import document_of
+
+    document = document_of(found, KERNEL_FILE)
+    fits = [fit for fit in document["fits"] if fit["valid"]] if document else []
+    known = truth.parameters["states"]
+    states = {str(s["name"]): s for s in known} if isinstance(known, list) else {}
+    pixel_um = float(str(found.parameters["pixel_um"]))
+    off: dict[str, list[float]] = {"alpha": [], "sigma": []}
+    widths: dict[str, list[float]] = {"alpha": [], "sigma": []}
+    for fit in fits:
+        gradient = np.asarray(states[str(fit["name"])]["gradient"], np.float64)
+        true = kernel_of_skin(
+            site, seed=seed, stretch=float(np.linalg.norm(gradient[:, 0])), pixel_um=pixel_um
+        )
+        for key, value, stated, likely, likely_95 in (
+            ("alpha", true.alpha, "alpha", "alpha_stderr", "alpha_95"),
+            ("sigma", true.sigma_um, "sigma_um", "sigma_stderr_um", "sigma_95_um"),
+        ):
+            off[key].append(
+                deviation(
+                    abs(float(fit[stated]) - value), float(fit[likely]), float(fit[likely_95])
+                )
+            )
+            widths[key].append(float(fit[likely]))
+    for key, unit in (("alpha", ""), ("sigma", "um")):
+        width = float(np.median(widths[key])) if widths[key] else float("nan")
+        yield Trial(f"{key} of kernels", f"{site} {seed}", ANY_BAND, np.array(off[key]), width,
+                    unit, GAUSSIAN_95)  # fmt: skip
+
+
+def deviation(error: float, half: float, half_95: float) -> float:
+    """Return an error in half widths of a 68 % interval whose 95 % one is stated by itself.
+
+    Up to the first as it is, beyond so that the second is at a Gaussian's 1.96.
+
+    Examples
+    --------
+    >>> deviation(0.5, 1.0, 4.0), round(deviation(4.0, 1.0, 4.0), 2)
+    (0.5, 1.96)
+    """
+    if error <= half:
+        return error / half
+    return 1.0 + (GAUSSIAN_95 - 1.0) * (error - half) / (half_95 - half)
+
+
+def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> KernelFit:
+    """Fit the kernel of `SKIN_MM` of a simulated skin, of which a session's patch is the middle.
+
+    Parameters
+    ----------
+    site, seed
+        Of the skin.
+    stretch : float
+        Its ratio r along x.
+    pixel_um : float
+        Distance of the heights, um.
+    """
+    from rigsim.skin_patch.microrelief import make_micro_skin
+    from rigsim.skin_patch.stretch import deform
+
+    skin = make_micro_skin(site, seed=seed, size_mm=SKIN_MM + EDGE_MM)
+    strained = deform(skin, stretch=stretch, angle_deg=0.0)
+    shown = []
+    for state, sides in (
+        (deform(skin, stretch=1.0, angle_deg=0.0), (1.0, 1.0)),
+        (strained, (strained.gradient[0, 0], strained.gradient[1, 1])),
+    ):
+        columns, rows = (round(1e3 * SKIN_MM * side / pixel_um) for side in sides)
+        x, y = np.meshgrid(
+            (np.arange(columns) - 0.5 * (columns - 1)) * 1e-3 * pixel_um,
+            (0.5 * (rows - 1) - np.arange(rows)) * 1e-3 * pixel_um,
+        )
+        height = state.sample(x, y).height_um
+        shown.append(high_pass(height, pixel=pixel_um, cutoff=CUTOFF_UM))
+    target = measure(shown[1], pixel=pixel_um)
+    return fit_kernel(
+        shown[0], target.histogram, stretch=float(strained.gradient[0, 0]),
+        stretch_across=float(strained.gradient[1, 1]), axis="x", pixel_um=pixel_um,
+        alphas=ALPHAS[::COARSER], sigmas_um=SIGMAS_UM[::COARSER],
+        target_samples=target.effective_samples,
+    )  # fmt: skip

@@ -1,0 +1,244 @@
+"""Trials of the fibre probe's intervals: media, skin of two layers, and directions."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from model import store
+from model.skin import SkinAppearance
+from reconstruction.anisotropy import estimation as anisotropy
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
+from skinrig.benchmarks.intervals.trials import ANY_BAND, Floats, forget, truth_of
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import skin_bands
+from skinrig.evaluating import subsurface as evaluation
+from skinrig.simulating.simulation import Simulated, simulate_session
+
+PHOTONS: Final = "full"
+"""Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,
+two percent, passes for errors of the probe. Skin's truth is of the very profile that is read."""
+BLOCKS: Final = 90_000
+"""Added to a subject's seed for that of its phantom."""
+DIRECTIONS: Final = 8
+"""Of the head on tissue that scatters by direction."""
+COEFFICIENTS: Final[Mapping[str, str]] = {
+    "sigma_a": "sigma_a of media", "sigma_s_prime": "sigma_s' of media"
+}  # fmt: skip
+
+
+def probe(
+    folder: Path,
+    media: Mapping[int, str],
+    *,
+    skin: Mapping[int, str] | None = None,
+    directed: Mapping[int, str] | None = None,
+) -> Iterator[Trial]:
+    """Yield trials of what the fibre probe tells of media, of skin and of directions.
+
+    Parameters
+    ----------
+    folder
+        As of `interval_trials_flash.flash`.
+    media
+        Seed of each and "homogeneous:SIGMA_A,SIGMA_S_PRIME,G": sigma_tr, sigma_a and sigma_s'.
+    skin
+        Seed of each and its preset: sigma_tr of layers, which is that of the nearest medium by
+        definition, on three sites.
+    directed
+        Seed of each and "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG": axis and ratio.
+    """
+    for seed, medium in media.items():
+        done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTONS)
+        found, truth = _maps(folder, done, "subsurface")
+        name = f"{medium} {seed}"
+        yield of_decay("sigma_tr of media", found, truth, subject=name, band=ANY_BAND)
+        for coefficient in COEFFICIENTS:
+            yield of_coefficient(coefficient, found, truth, subject=name)
+        forget(folder, done)
+    for seed, preset in (skin or {}).items():
+        done = _subject(folder, preset, seed)
+        found, truth = _maps(folder, done, "subsurface")
+        band = melanin_band_of(preset)
+        yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
+        forget(folder, done)
+    for seed, medium in (directed or {}).items():
+        done = _subject(folder, medium, seed, sites=("cheek",), angles=(DIRECTIONS,))
+        found, truth = _maps(folder, done, "anisotropy")
+        yield from of_directions(found, truth, _farthest_deg(medium), f"{medium} {seed}")
+        forget(folder, done)
+
+
+def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
+    """Simulate a subject under a probe that was calibrated for it, with a block of its own.
+
+    Subjects that share a calibration share its errors, and the block's: they are one draw.
+    """
+    phantom = folder / "session-phantom"
+    shutil.rmtree(phantom, ignore_errors=True)
+    shutil.rmtree(folder / "truth-phantom", ignore_errors=True)
+    simulate_session("probe", phantom, target="phantom", seed=BLOCKS + seed, size=PHOTONS)
+    paper = folder / "block.json"
+    paper.write_text(json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCKS]))))
+    calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
+    return simulate_session(
+        "probe", folder / "session-subject", subject=subject, seed=seed, **asked
+    )
+
+
+def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
+    """Return a certificate that is off the simulated block by errors as it states them.
+
+    Parameters
+    ----------
+    rng
+        Of the two errors, of sigma_a and of sigma_s'.
+
+    Examples
+    --------
+    >>> one, two = (drawn_certificate(np.random.default_rng(k))["sigma_a_per_mm"] for k in (1, 2))
+    >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
+    True
+    """
+    from rigsim.fiber.probe_tissue import AS_MADE, phantom_certificate
+
+    paper = dict(phantom_certificate())
+    for name, made in zip(COEFFICIENTS, AS_MADE, strict=True):
+        unsure = float(paper["uncertainty"][name])
+        factor = (1.0 + made * unsure) / (1.0 + unsure * float(rng.standard_normal()))
+        paper[f"{name}_per_mm"] = [factor * value for value in paper[f"{name}_per_mm"]]
+    return paper
+
+
+def melanin_band_of(preset: str) -> str:
+    """Return the band of melanin of a preset of the simulated people.
+
+    Examples
+    --------
+    >>> melanin_band_of("II"), melanin_band_of("VI")
+    ('light', 'dark')
+    """
+    from rigsim.subject.pigment import MELANIN_PRESETS
+
+    return str(skin_bands.melanin_band(MELANIN_PRESETS[preset]))
+
+
+def of_decay(
+    quantity: str, found: SkinAppearance, truth: SkinAppearance, *, subject: str, band: str
+) -> Trial:
+    """Compare valid fits of sigma_tr; their interval is one of the logarithm, its halves alike.
+
+    Parameters
+    ----------
+    quantity, subject, band
+        Of the trial.
+    found, truth
+        With fits, and with true profiles.
+    """
+    fits = [
+        fit
+        for fit in evaluation.compare_fits(found, truth)
+        if fit.method == evaluation.RECOMMENDED and fit.valid
+    ]
+    half = np.array([0.5 * np.log(fit.interval[1] / fit.interval[0]) for fit in fits])
+    center = np.array([0.5 * np.log(fit.interval[1] * fit.interval[0]) for fit in fits])
+    true = np.log(np.array([fit.truth for fit in fits]))
+    return Trial(
+        quantity, subject, band, np.abs(center - true) / half, _width(half), "%", GAUSSIAN_95
+    )
+
+
+def of_coefficient(
+    name: str, found: SkinAppearance, truth: SkinAppearance, *, subject: str
+) -> Trial:
+    """Compare sigma_a or sigma_s' of a homogeneous medium, where the fit says that it is told.
+
+    Parameters
+    ----------
+    name
+        "sigma_a" or "sigma_s_prime".
+    found, truth
+        With fits, and with true profiles.
+    subject
+        Of the trial.
+    """
+    known = evaluation.true_profiles(truth)
+    fitted = evaluation.document_of(found, SUBSURFACE_FILE) or {"measurements": []}
+    off, stderr = [], []
+    for entry in fitted["measurements"]:
+        true = known[evaluation.name_of(entry)][f"{name}_per_mm"]
+        for fit in entry["fits"]:
+            told = fit["valid"] and fit["coefficients_identified"]
+            if fit["method"] != evaluation.RECOMMENDED or not told:
+                continue
+            value = evaluation.number(fit[f"{name}_per_mm"])
+            off.append(abs(value / true[CHANNELS.index(fit["channel"])] - 1.0))
+            stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
+    spread = np.array(stderr)
+    return Trial(
+        COEFFICIENTS[name], subject, ANY_BAND, np.array(off) / spread, _width(spread), "%",
+        GAUSSIAN_95,
+    )  # fmt: skip
+
+
+def of_directions(
+    found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: str
+) -> Iterator[Trial]:
+    """Yield trials of axis and ratio of a medium that scatters by direction.
+
+    Parameters
+    ----------
+    found, truth
+        With the anisotropy's document, and with true profiles in each direction.
+    axis_deg
+        The medium's own direction in which least is scattered.
+    subject
+        Of the trials.
+
+    Notes
+    -----
+    A ratio has a truth by definition only: that of the ellipse through the true sigma_tr.
+    """
+    rows = [row for row in json.loads(found.files[ANISOTROPY_FILE])["sites"] if row["valid"]]
+    profiles: list[dict[str, Any]] = list(evaluation.true_profiles(truth).values())  # type: ignore[arg-type]
+    angle = np.radians([float(profile["angle_deg"]) for profile in profiles])
+    true = anisotropy.estimate(
+        angle, np.array([profile["sigma_tr_per_mm"] for profile in profiles]), outliers=False
+    )
+    turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
+    stderr = np.array([row["axis_stderr_deg"] for row in rows])
+    yield Trial(
+        "axis of anisotropy", subject, ANY_BAND, turn / stderr,
+        float(np.median(stderr)) if len(rows) else float("nan"), "degrees", GAUSSIAN_95,
+    )  # fmt: skip
+    ratio = np.array([true.ratio[CHANNELS.index(row["channel"])] for row in rows])
+    off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
+    spread = np.array([row["ratio_stderr"] for row in rows])
+    yield Trial(
+        "ratio of anisotropy", subject, ANY_BAND, off / spread, _width(spread / ratio), "%",
+        GAUSSIAN_95,
+    )  # fmt: skip
+
+
+def _maps(folder: Path, done: Simulated, want: str) -> tuple[SkinAppearance, SkinAppearance]:
+    pipeline.reconstruct(
+        done.session, want=[want], out=folder / "maps", calibration=folder / "calibration"
+    )
+    return store.read(folder / "maps"), store.read(truth_of(done))
+
+
+def _farthest_deg(medium: str) -> float:
+    """Return the direction in which light goes farthest: where it is scattered least."""
+    strength, axis_deg = (float(number) for number in medium.split(",")[2:4])
+    return axis_deg if strength < 0.0 else axis_deg + 90.0
+
+
+def _width(relative: Floats) -> float:
+    return float(100.0 * np.median(relative)) if relative.size else float("nan")

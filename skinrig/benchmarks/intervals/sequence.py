@@ -1,0 +1,176 @@
+"""Trials of intervals in time: time constants of blood after an event, and of its prompted change.
+
+Of prompts the delay, too: the mean time from prompt to movement.
+
+A subject is a person with a time constant of their own; the places of the face are the truths.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from model import store
+from reconstruction.pipeline import recipes as pipeline
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
+from skinrig.benchmarks.intervals.trials import band_of, calibrated, forget, truth_of
+from skinrig.capturing.sequences import SequenceOrder
+from skinrig.simulating.sequence import COURSE_FILE
+from skinrig.simulating.simulation import simulate_session
+
+CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
+    "exercise": (15.0, 30.0, 60.0),
+    "smile": (1.0, 2.0, 4.0),
+}
+"""Time constants that are simulated, s, of an event and of prompts."""
+REACTIONS_S: Final = (0.1, 0.4)
+"""Between which mean times from a prompt to the movement a person's own is drawn, s: from that of
+one who knows the rhythm to that of one who is slow."""
+
+
+def sequences(
+    folder: Path, subjects: Mapping[int, str], *, width_px: int, state: str
+) -> Iterator[Trial]:
+    """Yield trials of the time constant at each place of a face, and of the delay after prompts.
+
+    Parameters
+    ----------
+    folder
+        For sessions and curves; those of a subject are gone when the next begins.
+    subjects
+        Seed of each and its preset.
+    width_px
+        Pixels across the camera.
+    state
+        One of `CONSTANTS_S`.
+    """
+    calibrated("flash", folder, {"white": "white"}, width_px=width_px)
+    for seed, preset in subjects.items():
+        constant_s = CONSTANTS_S[state][seed % len(CONSTANTS_S[state])]
+        done = simulate_session(
+            "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
+            sequence=order_of(state, seed), relaxation_s=constant_s,
+        )  # fmt: skip
+        truth = truth_of(done)
+        pipeline.reconstruct(
+            done.session, want=["perfusion_curves"], out=folder / "maps",
+            calibration=folder / "calibration", landmarks=truth / "landmarks.csv",
+        )  # fmt: skip
+        told = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
+        subject, band = f"{preset} {seed}", _band(truth)
+        fits = list(told["fits"].values())
+        yield of_fits(f"time constant after {state}", fits, constant_s, subject=subject, band=band)
+        course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
+        if "reaction_s" in course:
+            yield of_fits(
+                f"delay of {state}", fits, course["reaction_s"],
+                subject=subject, band=band, delay=True,
+            )  # fmt: skip
+        forget(folder, done)
+
+
+def order_of(state: str, seed: int) -> SequenceOrder:
+    """Return the sequence of a subject, of prompts with a reaction time of their own.
+
+    Parameters
+    ----------
+    state
+        One of `CONSTANTS_S`.
+    seed
+        Of the subject.
+    """
+    order = SequenceOrder(state=state)
+    if not order.prompted:
+        return order
+    reaction_s = float(np.random.default_rng([seed, 16]).uniform(*REACTIONS_S))
+    return dataclasses.replace(order, reaction_s=reaction_s)
+
+
+def of_fits(
+    quantity: str,
+    fits: Iterable[Mapping[str, Any]],
+    true_s: float,
+    *,
+    subject: str,
+    band: str,
+    delay: bool = False,
+) -> Trial:
+    """Compare fits with the true time constant, or the true delay.
+
+    A time constant counts by its own two intervals, which differ in length to both sides, and a
+    delay by its standard error and its 95 % interval. Bounds of a time constant are intervals that
+    are open to one side: to leave them out would leave out the large ones of those that are
+    estimated. Fits that tell nothing are left out; of delays as well those that tell a bound alone,
+    as delays mean little where blood hardly changes.
+
+    Parameters
+    ----------
+    quantity, subject, band
+        Of the trial.
+    fits
+        As in the document of curves.
+    true_s
+        The true time, s.
+    delay
+        Whether it is the delay.
+    """
+    off, widths = [], []
+    for fit in fits:
+        if fit["known"] == "unknown" or (delay and fit["known"] != "estimated"):
+            continue
+        if delay:
+            half = float(fit["stderr_delay_s"])
+            best = float(fit["delay_s"])
+            inner, outer = (best - half, best + half), _ends(fit["delay_interval_s"])
+        else:
+            best = float(fit["time_constant_s"])
+            inner, outer = _ends(fit["interval_68_s"]), _ends(fit["interval_s"])
+        off.append(deviation(best, true_s, inner, outer))
+        if fit["known"] == "estimated":
+            widths.append(100.0 * 0.5 * (inner[1] - inner[0]) / true_s)
+    width = float(np.median(widths)) if widths else float("nan")
+    return Trial(quantity, subject, band, np.array(off), width, "%", GAUSSIAN_95)
+
+
+def deviation(
+    best: float, true: float, inner: tuple[float, float], outer: tuple[float, float]
+) -> float:
+    """Return how far off an estimate is in half widths of its 68 % interval to that side.
+
+    Up to 1 just where that holds the truth, and up to `GAUSSIAN_95` just where the 95 % one does.
+
+    Parameters
+    ----------
+    best
+        The estimate.
+    true
+        The truth.
+    inner, outer
+        The 68 % and 95 % interval, the one within the other; infinite where an end is open.
+    """
+    if inner[0] <= true <= inner[1]:
+        end = inner[0] if true < best else inner[1]
+        # a best beyond the tried constants may lie outside the interval
+        share = abs(true - best) / max(abs(end - best), 1e-300) if math.isfinite(end) else 0.0
+        return min(share, 1.0)
+    if outer[0] <= true <= outer[1]:
+        return GAUSSIAN_95
+    return 2.0 * GAUSSIAN_95
+
+
+def _ends(interval: Sequence[float | None]) -> tuple[float, float]:
+    """Return an interval as written, where null stands for an open upper end."""
+    low, high = interval
+    return 0.0 if low is None else float(low), math.inf if high is None else float(high)
+
+
+def _band(truth: Path) -> str:
+    found = store.read(truth)
+    name = "reflectance_blurred" if "reflectance_blurred" in found.maps else "reflectance"
+    return band_of(found, name, found.maps["mask"].values > 0.5)

@@ -1,0 +1,156 @@
+"""From a simulated subject's maps to trials of their intervals; what all rigs' trials share.
+
+Each trial goes the whole way of a user, from calibration targets to maps, at the sensor's noise:
+`interval_trials_flash` and its like of the other rigs. Nothing there knows the model: maps are
+compared with the truth that the simulator wrote.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, RAYLEIGH_95, Trial
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import skin_bands
+from skinrig.simulating.simulation import Simulated, simulate_session
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+ANY_BAND: Final = "any"
+"""Band of quantities that do not depend on the color of the skin."""
+RAYLEIGH_68: Final = float(np.sqrt(-2.0 * np.log(1.0 - 0.6827)))
+"""Of an error with the same deviation in two directions, the length that 68.27 % stay below."""
+
+
+def band_of(truth: SkinAppearance, name: str, skin: Bools) -> str:
+    """Return the band of the median color of a subject's skin.
+
+    Parameters
+    ----------
+    truth
+        Of the subject.
+    name
+        Of its map of linear color.
+    skin
+        (H, W): pixels of skin.
+    """
+    color = truth.maps[name].values[skin]
+    return str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(color))))
+
+
+def valid_of(skin_map: SkinMap) -> Bools:
+    """Return where a map means something, (H, W)."""
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def of_map(
+    quantity: str, estimate: SkinMap, true: NDArray[np.floating], skin: Bools, *, subject: str,
+    band: str, channel: int | None = None, factor_95: float = GAUSSIAN_95,
+    over: NDArray[np.floating] | None = None,
+) -> Trial:  # fmt: skip
+    """Compare a map of numbers with the truth, where it is valid; widths are relative.
+
+    Parameters
+    ----------
+    quantity, subject, band, factor_95
+        Of the trial.
+    estimate
+        With its standard error.
+    true
+        Of the map's shape.
+    skin
+        (H, W): where there is a truth.
+    channel
+        Of a map of several.
+    over
+        Of the map's shape: what widths are relative to, such as what a change is one of. None: the
+        truth.
+
+    Raises
+    ------
+    ValueError
+        When the map has no standard error.
+    """
+    spread = estimate.stderr
+    if spread is None:
+        raise ValueError(f"{quantity}: has no standard error, expected one")
+    good = skin & valid_of(estimate)
+    part = (good,) if channel is None else (good, channel)
+    value = estimate.values[part].astype(np.float64)
+    stderr = spread[part].astype(np.float64)
+    truth = np.asarray(true, np.float64)[part]
+    whole = truth if over is None else np.asarray(over, np.float64)[part]
+    with np.errstate(divide="ignore"):  # what is nothing has a width of infinity
+        width = float(100.0 * np.median(stderr / np.abs(whole))) if value.size else float("nan")
+    return Trial(quantity, subject, band, np.abs(value - truth) / stderr, width, "%", factor_95)
+
+
+def of_normals(
+    quantity: str, angle_rad: Floats, stderr_rad: Floats, *, subject: str, band: str = ANY_BAND,
+    factor_95: float = RAYLEIGH_95,
+) -> Trial:  # fmt: skip
+    """Compare directions: the 68 % region is a cone about the estimate.
+
+    Parameters
+    ----------
+    quantity, subject, band, factor_95
+        Of the trial.
+    angle_rad
+        (n,): between estimates and truths.
+    stderr_rad
+        (n,): standard error of each of two directions across.
+    """
+    reach = RAYLEIGH_68 * stderr_rad
+    width = float(np.degrees(np.median(reach))) if reach.size else float("nan")
+    return Trial(quantity, subject, band, angle_rad / reach, width, "degrees", factor_95)
+
+
+def calibrated(rig: str, folder: Path, targets: Mapping[str, str], *, width_px: int | None) -> None:
+    """Calibrate a simulated rig into a folder's `calibration`.
+
+    Parameters
+    ----------
+    rig
+        Its name.
+    folder
+        For sessions and the calibration.
+    targets
+        Kind of each calibration and the target it takes.
+    width_px
+        Pixels across the camera; None: the rig's small size.
+    """
+    for kind, target in targets.items():
+        session = folder / f"session-{target}"
+        if not session.exists():
+            simulate_session(rig, session, target=target, seed=900, width_px=width_px)
+        calibrate(kind, [session], folder / "calibration")
+
+
+def truth_of(done: Simulated) -> Path:
+    """Return the folder of a simulated session's truth.
+
+    Raises
+    ------
+    ValueError
+        When it has none.
+    """
+    if done.truth is None:
+        raise ValueError("simulated session: has no truth, expected one")
+    return done.truth
+
+
+def forget(folder: Path, done: Simulated) -> None:
+    """Take a subject's folders away: the next one's have their names."""
+    for place in (done.session, folder / "maps", folder / "moving"):
+        shutil.rmtree(place, ignore_errors=True)
+    for place in folder.glob("truth-subject*"):
+        shutil.rmtree(place)

@@ -1,0 +1,211 @@
+"""Error against run time: how a stage is measured, and what is kept of it."""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from skinrig.benchmarks import resident_memory
+
+Made = TypeVar("Made")
+
+TRACED_S = 0.1
+"""Calls that are quicker are run once more for their memory, asked or not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Seconds and memory of one call."""
+
+    seconds: float
+    """Median of the warm calls, s."""
+    spread_s: tuple[float, float]
+    """Fastest and slowest warm call, s."""
+    cold_s: float
+    """The first call, with compilation and caches to fill, s."""
+    peak_memory_mb: float | None
+    """Most memory held during a call, MB; None: not measured."""
+    memory_of: Literal["allocated", "resident"] = "allocated"
+    """Whether that is what Python and NumPy allocated, or how far the process's resident memory
+    rose."""
+    no_memory: str = "this system does not tell"
+    """Why it was not measured, where it was not."""
+
+
+def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = True) -> Timing:
+    """Time ``call``: once cold, ``repeats`` times warm, and once more for its memory.
+
+    Parameters
+    ----------
+    call
+        Takes no argument; its result is dropped.
+    repeats
+        Warm calls, at least 1.
+    memory
+        False spares a call that takes long the extra one in which its allocations are traced:
+        then how far resident memory rose in a warm call is taken (None on systems that do not
+        tell). None never traces: for calls into the renderer, whose own threads free what Python
+        allocated, which tracing does not survive (one process in ten or so ends).
+
+    Returns
+    -------
+    Timing
+
+    Examples
+    --------
+    >>> measure(lambda: sum(range(100)), repeats=3).seconds < 1.0
+    True
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats: got {repeats}, expected at least 1")
+    start = time.perf_counter()
+    call()
+    cold = time.perf_counter() - start
+    seconds = []
+    with resident_memory.watched() as rise:
+        for _ in range(repeats):
+            start = time.perf_counter()
+            call()
+            seconds.append(time.perf_counter() - start)
+    traced = memory is not None and (memory or min(seconds) < TRACED_S)
+    return Timing(
+        seconds=float(np.median(seconds)),
+        spread_s=(min(seconds), max(seconds)),
+        cold_s=cold,
+        peak_memory_mb=_allocated_mb(call) if traced else rise.mb,
+        memory_of="allocated" if traced else "resident",
+    )
+
+
+def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
+    """Make something a single time, for a call too long to repeat: cold and warm are one.
+
+    Returns
+    -------
+    timing : Timing
+    made
+        What the call returned.
+
+    Examples
+    --------
+    >>> once(lambda: sum(range(100)))[1]
+    4950
+    """
+    with resident_memory.watched() as rise:
+        start = time.perf_counter()
+        made = call()
+        seconds = time.perf_counter() - start
+    return Timing(seconds, (seconds, seconds), seconds, rise.mb, "resident"), made
+
+
+def _allocated_mb(call: Callable[[], Any]) -> float:
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One setting of a stage's effort knobs."""
+
+    knobs: Mapping[str, str | int | float | bool]
+    """What was set; the report labels the point with it."""
+    timing: Timing
+    error: float
+    """Error against the stage's reference, in the stage's unit."""
+    error_interval: tuple[float, float]
+    """68 % interval of ``error``."""
+    cramer_rao_bound: float | None = None
+    """Least error that any unbiased estimator could have, same unit; None: not known."""
+    also: Mapping[str, str | int | float | bool] = field(default_factory=dict)
+    """What else was measured at this setting; no knob."""
+
+    def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
+        """Return variance over the least variance, with its 68 % interval; None without a bound.
+
+        1 is perfect. Where the error is a median or a mean the bound is that of a normal error,
+        so that the ratio of squares holds too.
+
+        Parameters
+        ----------
+        squared
+            Whether error and bound are squares already.
+        """
+        if self.cramer_rao_bound is None or not self.cramer_rao_bound > 0.0:
+            return None
+        low, high = self.error_interval
+        value, low, high = (
+            (error / self.cramer_rao_bound) ** (1 if squared else 2)
+            for error in (self.error, max(low, 0.0), high)
+        )
+        return value, low, high
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A promise about a stage that this run checked."""
+
+    name: str
+    got: float
+    bound: float
+    sense: Literal["<=", ">="]
+    unit: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether ``got`` keeps to ``bound``; NaN does not."""
+        return self.got <= self.bound if self.sense == "<=" else self.got >= self.bound
+
+
+@dataclass(frozen=True, slots=True)
+class BandError:
+    """Error in one band of skin, with the setting that is usual."""
+
+    error: float
+    error_interval: tuple[float, float]
+    """68 % interval of ``error``."""
+    cramer_rao_bound: float | None = None
+    """Least error that any unbiased estimator could have there; None: not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageBenchmark:
+    """All points of one stage."""
+
+    name: str
+    error_name: str
+    """What the error is, with its unit, for the axis of the plot."""
+    reference: str
+    """What the error is taken against."""
+    reference_error: float
+    """How far the reference itself may be off, in the error's unit."""
+    points: tuple[Point, ...]
+    limits: tuple[Limit, ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
+    """What this run did not measure, and why."""
+    by_band: Mapping[str, BandError | float] = field(default_factory=dict)
+    """Error by melanin band, from light to dark, same unit; see `skinrig.evaluating.skin_bands`."""
+    no_bands: str = ""
+    """Why errors do not depend on how dark skin is, where there are no bands."""
+    condition: tuple[str, ...] = ()
+    """Knobs that say what is measured (noise, subject), not with how much effort: each set of their
+    values has a front of its own. A point that lacks such a knob is of the condition ``None``."""
+    interval_of: str = ""
+    """What errors scatter over within their intervals."""
+    squared: bool = False
+    """Whether errors and bounds are squares (variances), not sizes."""
+
+    @property
+    def reference_error_means(self) -> str:
+        """What `reference_error` says."""
+        if self.reference_error == 0.0:
+            return "exact: the truth that the data were made of, or errors are defined by it"
+        return "how far the reference itself may be off, in the error's unit"

@@ -1,0 +1,200 @@
+"""Benchmark of reading a probe's fibres: errors over the number of exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fiber.merge import color_masks
+from capture.calibration.fiber.readings import FibreReadings, read_fibres
+from capture.calibration.fiber.spots import FibreSpots
+from capture.plan.probe import exposure_series_s
+from capture.rig import load_rig
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+SEED = 5
+DECADES = 7.0
+COUNTS = (1, 2, 3, 5, 8, 12, 23)
+DRAWS = 6
+"""Series of each number of exposures, of one probe with new noise."""
+WORST_PERCENT = 1.0
+"""Within five decades of the brightest."""
+ABOVE_BOUND = 1.15
+COVERAGE = (60.0, 76.0)
+
+FloatArray = NDArray[np.float64]
+Frames = list[NDArray[np.uint16]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bench:
+    """A probe's camera and light of known amount."""
+
+    frames: list[Frames]
+    """Of each draw, all exposures."""
+    times: FloatArray
+    spots: FibreSpots
+    darks: DarkModel
+    noise: CameraNoise
+    rate: FloatArray
+    """Light of each pixel, full scales per second, (H, W)."""
+    truth: FloatArray
+    """Of each fibre and color, summed over its aperture, (F, 3)."""
+
+
+def fibre_readings(*, toy: bool) -> StageBenchmark:
+    """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
+    bench = _bench(draws=2 if toy else DRAWS)
+    points = []
+    away: FloatArray = np.zeros(0)
+    relative: FloatArray = np.zeros(0)
+    bound: FloatArray = np.ones(1)
+    for count in (1, 3, 8, 23) if toy else COUNTS:
+        chosen = _spread(len(bench.times), count)
+
+        def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FibreReadings:
+            return _read(bench, chosen, draw)
+
+        results = [call(draw=draw) for draw in range(len(bench.frames))]
+        valid = np.array([r.valid for r in results])
+        signal = np.array([r.signal for r in results])
+        stderr = np.array([r.stderr for r in results])
+        # what is saturated in every exposure is not known at all
+        miss = np.where(valid, np.abs(signal / bench.truth - 1), 1.0)
+        low, high = _interval(miss.reshape(len(miss), -1))
+        bound = np.sqrt(_bound(bench, chosen)) / bench.truth
+        known = np.isfinite(bound)
+        points.append(
+            Point(
+                {"exposures": count},
+                measure(call, repeats=1 if toy else 3),
+                100 * float(np.median(miss)),
+                (100 * low, 100 * high),
+                # the median of a normal distribution's size is 0.674 of its deviation
+                67.4 * float(np.median(np.where(known, bound, 1 / 0.674))),
+                {"exposed_s": round(float(bench.times[chosen].sum()), 1),
+                 "measured_percent": round(100 * float(valid.mean()), 1)},
+            )
+        )  # fmt: skip
+        away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
+        relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
+    near = bench.truth.ravel() > 1e-5 * bench.truth.max()
+    worst = 100 * float(np.sqrt((relative[:, near] ** 2).mean(axis=0)).max())
+    ratio = float(np.sqrt((relative**2 / bound.ravel() ** 2).mean()))
+    inside = 100 * float((np.abs(away) < 1).mean())
+    return StageBenchmark(
+        "fibre-readings",
+        "median relative error of a fibre's light, %",
+        "the light that the frames were drawn from: shot, dark, read and rounding noise",
+        0.0,
+        tuple(points),
+        (
+            Limit("largest RMS error within five decades, 23 exposures", worst, WORST_PERCENT,
+                  "<=", "%"),
+            Limit("RMS error over the Cramér-Rao bound, 23 exposures", ratio, ABOVE_BOUND, "<="),
+            Limit("68 % intervals that hold", inside, COVERAGE[0], ">=", "%"),
+            Limit("68 % intervals that hold, at most", inside, COVERAGE[1], "<=", "%"),
+        ),
+        (("steadiness of the source", "steady here; tests/unit/capture/test_fibre_readings.py"),),
+        interval_of="fibres and colors",
+        no_bands="light of fibres over seven decades, whatever sends it",
+    )  # fmt: skip
+
+
+def _bench(*, draws: int) -> _Bench:
+    from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
+    from rigsim.sensor import expose, fixed_pattern, sensor_of
+
+    rig = load_rig("probe")
+    view = rig.views[0]
+    build = build_probe(rig, seed=SEED, tolerances=ProbeTolerances(crosstalk=0, wings=0, veil=0))
+    sensor = sensor_of(view, dark_e_per_s=0.3, vignetting=0.1)
+    noise = CameraNoise.of_view(view)
+    times = np.array(exposure_series_s())
+    shape = (view.height_px, view.width_px)
+    # the brightest reaches half of full scale in the shortest exposure
+    light = 0.5 / times[0] * np.geomspace(1, 10.0**-DECADES, len(build.gain))[:, None]
+    light = light * np.array([0.6, 1.0, 0.5])
+    images = unit_images(build, view).astype(np.float64)
+    colors = color_masks(shape, view.cfa)
+    response = fixed_pattern(sensor, shape).response.astype(np.float64)
+    rate = np.zeros(shape)
+    for c, mask in enumerate(colors):
+        rate[mask] = (np.tensordot(light[:, c], images, 1) * response)[mask]
+    names = tuple(fibre.name for fibre in rig.probe.fibres) if rig.probe else ()
+    count = np.full(len(names), 1.0)
+    spots = FibreSpots(
+        names, build.spot_px, np.zeros((len(names), 2)), build.radius_px, 0 * count,
+        build.edge_px * count, count > 0, float(build.radius_px.mean() + 3.0),
+    )  # fmt: skip
+    truth = np.array(
+        [
+            [
+                (light[i, c] * images[i] * response)[spots.mask(i, shape) & mask].sum()
+                for c, mask in enumerate(colors)
+            ]
+            for i in range(len(names))
+        ]
+    )
+    rng = np.random.default_rng(SEED)
+    dark_s = [times[k] for k in (0, 16, 22) for _ in range(4)]
+    nothing = np.zeros((*shape, 3), np.float32)
+    darks = [expose(nothing, sensor=sensor, rng=rng, exposure_s=t) for t in dark_s]
+    flat = np.divide(rate, response)[..., None] * np.ones(3)
+    frames = [
+        [expose((flat * t).astype(np.float32), sensor=sensor, rng=rng, exposure_s=t) for t in times]
+        for _ in range(draws)
+    ]
+    model = measure_darks(darks, dark_s, noise=noise)
+    return _Bench(frames, times, spots, model, noise, rate, truth)
+
+
+def _read(bench: _Bench, chosen: Sequence[int], draw: int) -> FibreReadings:
+    frames = [bench.frames[draw][k] for k in chosen]
+    return read_fibres(
+        frames, bench.times[list(chosen)], spots=bench.spots, darks=bench.darks, noise=bench.noise
+    )
+
+
+def _bound(bench: _Bench, chosen: Sequence[int]) -> FloatArray:
+    """Return the least variance of each fibre's light, infinite where a pixel is saturated.
+
+    Of all pixels' light known from the frames that are not saturated, the dark signal known.
+    """
+    noise = bench.noise
+    span, gain = noise.span_dn, noise.gain_e_per_dn
+    information = np.zeros(bench.rate.shape)
+    for t in bench.times[list(chosen)]:
+        signal = bench.rate * t * span
+        dark = bench.darks.mean_rate_dn_per_s * t
+        variance = (signal + dark) / gain + noise.floor_dn2
+        information += np.where(signal + dark < span, (t * span) ** 2 / variance, 0.0)
+    with np.errstate(divide="ignore"):
+        least = 1.0 / information
+    colors = color_masks(bench.rate.shape, noise.pattern)
+    return np.array(
+        [
+            [float(least[bench.spots.mask(i, least.shape) & mask].sum()) for mask in colors]
+            for i in range(len(bench.spots.names))
+        ]
+    )
+
+
+def _spread(total: int, count: int) -> list[int]:
+    """Return which exposures to take: the longest, or evenly from the shortest to the longest."""
+    if count == 1:
+        return [total - 1]
+    return [round(k) for k in np.linspace(0, total - 1, count)]
+
+
+def _interval(sizes: FloatArray) -> tuple[float, float]:
+    """Return a bootstrap interval over fibres of the median of all draws (draws, F), 68 %."""
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, sizes.shape[1], (400, sizes.shape[1]))
+    again = np.median(sizes[:, chosen], axis=(0, 2))
+    low, high = np.quantile(again, [0.16, 0.84])
+    return float(low), float(high)

@@ -1,0 +1,148 @@
+"""Benchmark of the fibre probe from end to end: sigma_tr of media through simulated sessions."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.probe.stages import METHODS
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import subsurface as evaluation
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.simulating.simulation import simulate_session, truth_folder
+
+MEDIA = 8
+SEED = 40
+SIGMA_TR_PER_MM = (0.3, 3.0)
+SIGMA_S_PRIME_PER_MM = (0.7, 3.0)
+G = (0.7, 0.9)
+BAND_G = 0.8
+"""g of the media that stand for bands of skin."""
+DIPOLE_BIAS = 0.05
+"""The paper's fit must show its own bias: a truth made by the dipole would not."""
+
+
+def session(*, toy: bool) -> StageBenchmark:
+    """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
+    with _bench() as folder:
+        simulate_session("probe", folder / "session-phantom", target="phantom", seed=SEED)
+        calibrate("fibre", [folder / "session-phantom"], folder / "calibration")
+        like_skin = {
+            name: _captured(
+                folder, name, (band.sigma_a_per_mm, band.sigma_s_prime_per_mm, BAND_G), seed
+            )
+            for seed, (name, band) in enumerate(MELANIN_BANDS.items())
+        }
+        of_bands = {name: _invert(folder, place) for name, place in like_skin.items()}
+        rows = [row for some in of_bands.values() for row in some] if toy else []
+        last = like_skin["dark"]
+        for seed in () if toy else range(SEED, SEED + MEDIA):
+            last = _captured(folder, f"{seed}", medium(seed), seed)
+            rows += _invert(folder, last)
+        bands = {name: _best(some) for name, some in of_bands.items()}
+        timing = measure(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
+    by_method = {row.method: row for row in evaluation.by_method(rows)}
+    points = []
+    for method in (name for name in METHODS if name in by_method):
+        valid = [row for row in rows if row.method == method and row.valid]
+        for channel in ("all", *sorted({row.channel for row in valid})):
+            sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
+            points.append(
+                Point(
+                    {"method": method, "channel": channel,
+                     "media": len({row.name for row in rows})},
+                    timing, 100 * float(np.median(sizes)), _interval(sizes),
+                )
+            )  # fmt: skip
+    return StageBenchmark(
+        "probe-session",
+        "median error of sigma_tr, %",
+        "the media's own coefficients",
+        0.0,
+        tuple(points),
+        () if toy else _limits(by_method),
+        condition=("channel",),
+        interval_of="media and channels; by band, channels",
+        by_band=bands,
+    )
+
+
+def medium(seed: int) -> tuple[float, float, float]:
+    """Return sigma_a and sigma_s' in 1/mm, and g, of a medium drawn by its seed.
+
+    sigma_tr and sigma_s' are spread evenly in their logarithms, g evenly.
+
+    Examples
+    --------
+    >>> sigma_a, sigma_s_prime, g = medium(3)
+    >>> 0.3 <= math.sqrt(3 * sigma_a * (sigma_a + sigma_s_prime)) <= 3.0
+    True
+    """
+    rng = np.random.default_rng(seed)
+    sigma_tr, sigma_s_prime = (
+        math.exp(rng.uniform(*np.log(span))) for span in (SIGMA_TR_PER_MM, SIGMA_S_PRIME_PER_MM)
+    )
+    g = rng.uniform(*G)
+    # sigma_tr^2 = 3 a (a + s')
+    sigma_a = 0.5 * (math.sqrt(sigma_s_prime**2 + 4.0 / 3.0 * sigma_tr**2) - sigma_s_prime)
+    return sigma_a, sigma_s_prime, g
+
+
+def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitError]:
+    out = folder / f"appearance-{name or session.name}"
+    pipeline.reconstruct(
+        session, want=("profiles", "subsurface"), out=out, calibration=folder / "calibration",
+        truth=truth_folder(session).name,
+    )  # fmt: skip
+    return evaluation.compare_fits(store.read(out), store.read(truth_folder(session)))
+
+
+def _limits(by_method: Mapping[str, evaluation.MethodError]) -> tuple[Limit, ...]:
+    best, dipole = by_method[METHODS[0]], by_method["dipole"]
+    return (
+        Limit("sigma_tr, median error", 100 * best.median, 100 * evaluation.MEDIAN_LIMIT, "<=",
+              "%"),
+        Limit("sigma_tr, worst error", 100 * best.worst, 100 * evaluation.WORST_LIMIT, "<=", "%"),
+        Limit("fits that are valid", best.fits, 3.0 * MEDIA, ">="),
+        Limit("the dipole's median error", 100 * dipole.median, 100 * DIPOLE_BIAS, ">=", "%"),
+    )  # fmt: skip
+
+
+def _captured(folder: Path, name: str, coefficients: tuple[float, float, float], seed: int) -> Path:
+    """Return a session of a medium by its sigma_a, sigma_s' and g."""
+    sigma_a, sigma_s_prime, g = coefficients
+    simulate_session(
+        "probe", folder / f"session-{name}", sites=("cheek",), seed=seed,
+        subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
+    )  # fmt: skip
+    return folder / f"session-{name}"
+
+
+def _best(rows: list[evaluation.FitError]) -> BandError:
+    """Return the error of the usual method over the channels of one medium, %."""
+    sizes = [abs(row.relative) for row in rows if row.method == METHODS[0] and row.valid]
+    return BandError(100 * float(np.median(sizes)), _interval(sizes))
+
+
+def _interval(sizes: list[float]) -> tuple[float, float]:
+    """Return a bootstrap interval of a median in percent, 68 %."""
+    rng = np.random.default_rng(0)
+    values: NDArray[np.float64] = np.array(sizes)
+    again = np.median(values[rng.integers(0, len(values), (400, len(values)))], axis=1)
+    low, high = np.quantile(again, [0.16, 0.84])
+    return 100 * float(low), 100 * float(high)
+
+
+@contextmanager
+def _bench() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as folder:
+        yield Path(folder)

@@ -1,0 +1,250 @@
+"""Benchmark of light gathered in skin, beside the direct sum in NumPy in the same run."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from model.dipole import direct_sum as dipole_sum
+from model.dipole.direct_sum import Media, exitance_directly
+from model.dipole.gather import TOLERANCE, SourceTree, gather
+from model.fresnel import ETA_SKIN
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+SIDE = 512
+SECONDS = 5.0
+ERROR_PERCENT = 1.0
+TIMES_FASTER = 1000.0
+DIM = 0.01
+"""Of the brightest exitance: what is darker is left out where errors are over the local value."""
+R_D = np.array([0.55, 0.35, 0.25])
+TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
+"""Of a mean face, table 2 of Weyrich et al. 2005."""
+USUAL_STEP_MM = 0.8
+"""Of the sources where errors are told by skin."""
+EDGE_MM = np.linspace(-3.0, 3.0, 60)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A face as texels, lit from one side, with a cast shadow."""
+
+    place: Floats
+    area: Floats
+    entered: Floats
+    r_d: Floats
+    translucency_mm: Floats
+
+
+def face(side: int) -> Scene:
+    """Make a face of 160 mm x 220 mm as side x side texels, albedo and translucency varying."""
+    u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
+    x, y = 80.0 * u, 110.0 * v
+    z = 80.0 * np.sqrt(1.3 - 0.8 * u**2 - 0.4 * v**2) + 20.0 * np.exp(-(x**2 + y**2) / 300.0)
+    place = np.stack([x, y, z], axis=-1)
+    across = np.cross(np.gradient(place, axis=1), -np.gradient(place, axis=0))
+    area = np.linalg.norm(across, axis=-1)
+    lit = np.clip(across @ np.array([0.8, 0.3, 0.52]) / area, 0.0, None)
+    lit[(x - y > 20.0) & (x - y < 50.0)] = 0.0
+    return Scene(
+        place.reshape(-1, 3),
+        area.ravel(),
+        lit.reshape(-1, 1) * np.array([1.0, 0.9, 0.8]),
+        R_D * (1.0 + 0.1 * np.sin(x / 5.0)).reshape(-1, 1),
+        TRANSLUCENCY_MM * (1.0 + 0.2 * np.cos(y / 20.0)).reshape(-1, 1),
+    )
+
+
+def edge_profile(x_mm: Floats, media: Media) -> Floats:
+    """Return the share of even light on x < 0 that comes out at x, by a 1-D integral."""
+    widest = 40.0 / float(media.sigma_tr_per_mm)
+    t = widest * np.linspace(0.0, 1.0, 20_001) ** 3
+    away = np.abs(x_mm)[:, None]
+    # a ring of radius r lies beyond a line at a distance x by acos(x / r) / pi; r^2 = x^2 + t^2
+    ring = 2.0 * t * np.arctan2(t, away) * dipole_sum.profile(np.hypot(away, t), media)
+    beyond = np.trapezoid(ring, t, axis=1)
+    return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
+
+
+def gathering(*, toy: bool) -> StageBenchmark:
+    """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
+    rng = np.random.default_rng(0)
+    points = [*_tolerances(48 if toy else 256, 3 if toy else 6, rng), *_edges(toy, rng)]
+    return StageBenchmark(
+        "subsurface-gather",
+        "RMS error over R_d and the brightest light that entered, %",
+        "direct sum over all sources in float64; for a shadow's edge the dipole's integral",
+        0.0,
+        tuple(points),
+        () if toy else _full_size(rng),
+        by_band=_bands(rng),
+        condition=("scene",),
+        interval_of="points",
+    )
+
+
+def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
+    scene = face(side)
+    at = rng.choice(len(scene.area), 40 if side < 100 else 100, replace=False)
+    truth = _directly(scene, at)
+    points = []
+    for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
+        tree = SourceTree.of(scene.place, scene.area)
+
+        def run(tree: SourceTree = tree, tolerance: float = tolerance) -> Floats:
+            return _gathered(scene, tree, tolerance)
+
+        timing = measure(run, repeats=1)
+        error = (run()[at] - truth) / (scene.r_d[at] * scene.entered.max())
+        points.append(
+            Point(
+                {"scene": "face", "texels": side**2, "tolerance": tolerance},
+                timing,
+                *_rms(error, rng),
+            )
+        )
+    direct = measure(lambda: _directly(scene, at[:10]), repeats=1, memory=False)
+    scale = side**2 / 10
+    points.append(
+        Point(
+            {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"},
+            Timing(
+                direct.seconds * scale, (direct.seconds * scale,) * 2, direct.cold_s, None,
+                no_memory="its seconds are extrapolated from those of 10 points",
+            ),
+            0.0, (0.0, 0.0),
+        )
+    )  # fmt: skip
+    return points
+
+
+def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
+    media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(R_D, TRANSLUCENCY_MM, strict=True)]
+    truth = np.stack([edge_profile(EDGE_MM, medium) for medium in media], axis=-1)
+    points = []
+    for step in (0.8, 0.4) if toy else (1.6, 0.8, 0.4, 0.2):
+        for known in (False, True):
+
+            def run(step: float = step, known: bool = known) -> Floats:
+                return _edge(step, known)
+
+            timing = measure(run, repeats=1)
+            knobs = {
+                "scene": "a shadow's edge",
+                "edge": "own light" if known else "sources alone",
+                "source mm": step,
+            }
+            points.append(Point(knobs, timing, *_rms(run() - truth, rng)))
+    return points
+
+
+def _bands(rng: np.random.Generator) -> dict[str, BandError]:
+    """Return the error of a shadow's edge on skin from light to dark, over its own R_d."""
+    found = {}
+    for name, band in MELANIN_BANDS.items():
+        sigma_tr = np.sqrt(
+            3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
+        )
+        skin = band.reflectance(), TRANSLUCENCY_MM / TRANSLUCENCY_MM[0] / sigma_tr
+        media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(*skin, strict=True)]
+        truth = np.stack([edge_profile(EDGE_MM, medium) for medium in media], axis=-1)
+        error, interval = _rms(_edge(USUAL_STEP_MM, True, skin=skin) - truth, rng)
+        found[name] = BandError(error, interval)
+    return found
+
+
+def _edge(
+    step_mm: float, known: bool, *, skin: tuple[Floats, Floats] = (R_D, TRANSLUCENCY_MM)
+) -> Floats:
+    """Return the profile of a shadow's edge from sources a step apart, (X, 3).
+
+    On skin of a diffuse albedo and a mean free path, mm.
+    """
+    half = step_mm * round(10.0 / step_mm)  # so that no source lies on the edge
+    grid = np.arange(-half, half, step_mm) + 0.5 * step_mm
+    x, y = np.meshgrid(grid, grid)
+    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    lit = np.repeat(place[:, :1] < 0.0, 3, axis=1).astype(np.float64)
+    at = np.stack([EDGE_MM, 0.3 * EDGE_MM, np.zeros_like(EDGE_MM)], axis=-1)
+    own = np.repeat(EDGE_MM[:, None] < 0.0, 3, axis=1).astype(np.float64) if known else None
+    tree = SourceTree.of(place, np.full(len(place), step_mm**2))
+    found = gather(tree, lit, at, *skin, entered_at=own)
+    return np.asarray(found.exitance / skin[0])
+
+
+def _gathered(scene: Scene, tree: SourceTree, tolerance: float = TOLERANCE) -> Floats:
+    return gather(
+        tree, scene.entered, scene.place, scene.r_d, scene.translucency_mm, tolerance=tolerance
+    ).exitance
+
+
+def _directly(scene: Scene, at: NDArray[np.intp]) -> Floats:
+    with threadpool_limits(1):
+        return exitance_directly(
+            scene.place, scene.area, scene.entered, scene.place[at], scene.r_d[at],
+            scene.translucency_mm[at],
+        )  # fmt: skip
+
+
+def _rms(error: Floats, rng: np.random.Generator) -> tuple[float, tuple[float, float]]:
+    """Return the root mean square in percent with its 68 % bootstrap interval over points."""
+    square = (error**2).mean(axis=-1)
+    means = square[rng.integers(0, len(square), (200, len(square)))].mean(axis=1)
+    low, high = 100.0 * np.sqrt(np.quantile(means, (0.16, 0.84)))
+    return float(100.0 * np.sqrt(square.mean())), (float(low), float(high))
+
+
+def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+    """Gather 512 x 512 texels at as many exit points, and some of them directly."""
+    scene = face(SIDE)
+    spent = []
+    for _ in range(2):
+        begin = time.process_time()
+        found = _gathered(scene, SourceTree.of(scene.place, scene.area))
+        spent.append(time.process_time() - begin)
+    at = rng.choice(len(scene.area), 80, replace=False)
+    begin = time.process_time()
+    truth = _directly(scene, at)
+    peer_s = (time.process_time() - begin) / len(at) * len(scene.area)
+    seen = truth > DIM * (scene.r_d * scene.entered.max())[at]
+    relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
+    even = gather(
+        SourceTree.of(scene.place, scene.area), np.ones_like(scene.entered), scene.place[at],
+        scene.r_d[at], scene.translucency_mm[at],
+    ).exitance  # fmt: skip
+    plane = _plane_level()
+    return (
+        Limit(f"processor seconds for {SIDE} x {SIDE} texels and exit points, tree included",
+              min(spent), SECONDS, "<=", "s"),
+        Limit("error over the local exitance, 95th percentile", float(
+              100.0 * np.quantile(relative, 0.95)), ERROR_PERCENT, "<=", "%"),
+        Limit("largest error over the brightest exitance", float(100.0 * np.max(
+              np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))),
+              ERROR_PERCENT, "<=", "%"),
+        Limit("largest relative deviation from R_d under even light", float(np.max(
+              np.abs(even / scene.r_d[at] - 1.0))), 1e-5, "<="),
+        Limit("largest deviation from R_d on an evenly lit plane, not normalized",
+              100.0 * plane, ERROR_PERCENT, "<=", "%"),
+        Limit("times less processor time than the direct sum in NumPy, extrapolated",
+              peer_s / min(spent), TIMES_FASTER, ">="),
+    )  # fmt: skip
+
+
+def _plane_level() -> float:
+    """Return how far a plane's sum without normalization is from R_d at most, relative."""
+    step, half = 0.4, 30.0
+    grid = np.arange(-half, half, step) + 0.5 * step
+    x, y = np.meshgrid(grid, grid)
+    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    tree = SourceTree.of(place, np.full(len(place), step**2))
+    offset = np.linspace(0.0, step, 9)
+    at = np.stack(np.meshgrid(offset, offset, [0.0]), axis=-1).reshape(-1, 3)
+    found = gather(tree, np.ones_like(place), at, R_D, TRANSLUCENCY_MM, normalize=False)
+    return float(np.max(np.abs(found.exitance / R_D - 1.0)))

@@ -1,0 +1,337 @@
+"""Benchmark of photon transport: what a fibre sees, and photons a second, beside their peers."""
+
+from __future__ import annotations
+
+import time
+from math import inf, log, pi, sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+Floats = NDArray[np.float64]
+
+RED = (0.04, 1.5)  # sigma_a and sigma_s' in 1/mm, issue of the fibre probe and rigs.md section 4
+G = 0.8
+ETA = 1.4
+SPEED_MEDIUM = (0.05, 10.0, 0.9, 1.4)  # sigma_a, sigma_s (1/mm), g, eta
+MCML_R_D = 0.3592  # MCML's diffuse reflectance of that medium, specular left out
+CORES = 2
+SECONDS_TO_ONE_PERCENT = 30.0
+TIMES_CHEAPER = 1000.0
+TIMES_FASTER = 4.0
+PEER_SAMPLES = 4096
+PEER_RUNS = 20
+
+
+@njit(cache=True, nogil=True)
+def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  # type: ignore[no-untyped-def]
+    """Trace photons in a half-space as MCML does, one event after another; the sum that leaves.
+
+    `rings` gets the weights that leave within a cone of that sine, by r^2; nothing is made clever.
+    """
+    np.random.seed(seed)  # noqa: NPY002, numba's own generator
+    sigma_t = sigma_a + sigma_s
+    total = 0.0
+    for _ in range(photons):
+        x, y, z, ux, uy, uz = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
+        weight = 1.0 - ((eta - 1.0) / (eta + 1.0)) ** 2
+        while weight > 0.0:
+            step = -log(1.0 - np.random.random()) / sigma_t  # noqa: NPY002
+            while uz < 0.0 and step * -uz > z:
+                gap = -z / uz
+                x += gap * ux
+                y += gap * uy
+                z = 0.0
+                step -= gap
+                sin_t = eta * sqrt(1.0 - uz * uz)
+                reflected = 1.0
+                if sin_t < 1.0:
+                    cos_i, cos_t = -uz, sqrt(1.0 - sin_t * sin_t)
+                    r_s = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
+                    r_p = (cos_i * 1.0 - eta * cos_t) / (cos_i * 1.0 + eta * cos_t)
+                    reflected = 0.5 * (r_s * r_s + r_p * r_p)
+                if np.random.random() > reflected:  # noqa: NPY002
+                    total += weight
+                    if sin_t <= sine:
+                        ring = np.searchsorted(edges2, x * x + y * y) - 1
+                        if 0 <= ring < rings.size:
+                            rings[ring] += weight
+                    weight = 0.0
+                    break
+                uz = -uz
+            if weight == 0.0:
+                break
+            x += step * ux
+            y += step * uy
+            z += step * uz
+            weight *= sigma_s / sigma_t
+            if weight < 1e-4:
+                weight = weight * 10.0 if np.random.random() < 0.1 else 0.0  # noqa: NPY002
+            u = np.random.random()  # noqa: NPY002
+            cosine = 2.0 * u - 1.0
+            if g != 0.0:
+                part = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
+                cosine = (1.0 + g * g - part * part) / (2.0 * g)
+            azimuth = 2.0 * pi * np.random.random()  # noqa: NPY002
+            sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
+            sine_t = sqrt(max(0.0, 1.0 - cosine * cosine))
+            if abs(uz) > 0.99999:
+                ux, uy, uz = sine_t * cos_a, sine_t * sin_a, cosine if uz > 0.0 else -cosine
+            else:
+                root = sqrt(1.0 - uz * uz)
+                vx = sine_t * (ux * uz * cos_a - uy * sin_a) / root + ux * cosine
+                vy = sine_t * (uy * uz * cos_a + ux * sin_a) / root + uy * cosine
+                uz = -sine_t * cos_a * root + uz * cosine
+                ux, uy = vx, vy
+    return total
+
+
+def photon_transport(*, toy: bool) -> StageBenchmark:
+    """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
+    from rigsim.fiber.profile import fibre_profile
+    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+
+    probe = load_rig("probe").probe
+    if probe is None:
+        raise ValueError("rig: the probe's rig has no probe")
+    radii = np.array(probe.radius_mm)
+    stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, ETA),))
+    points = []
+    for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
+
+        def next_event(photons: int = photons) -> Any:
+            return fibre_profile(
+                stack, radii_mm=radii, photons=photons, rng=np.random.default_rng(1), threads=CORES
+            )
+
+        timing = measure(next_event, repeats=1, memory=None)
+        run = next_event()
+        relative = 100.0 * run.stderr / run.reflectance_per_mm2
+        knobs: dict[str, str | int | float] = {"quantity": "fibres", "score": "next event"}
+        points.append(_point(knobs | {"photons": photons}, timing, relative))
+    for photons in (1000, 2000) if toy else (80_000, 320_000):
+
+        def in_the_cone(photons: int = photons) -> Floats:
+            return _in_the_cone(radii, photons)
+
+        timing = measure(in_the_cone, repeats=1, memory=None)
+        relative = in_the_cone()
+        knobs = {"quantity": "fibres", "score": "leaves in the cone"}
+        points.append(_point(knobs | {"photons": photons}, timing, relative))
+    medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
+    for engine in ("numba", "drjit"):
+
+        def all_angles(engine: Any = engine) -> Any:
+            photons = 2000 if toy else 400_000
+            return transport(medium, photons=photons, rng=np.random.default_rng(2), engine=engine)
+
+        try:
+            timing = measure(all_angles, repeats=1, memory=None)
+        except ValueError:  # no LLVM on this machine
+            continue
+        total = all_angles()
+        error = 100.0 * total.reflectance_stderr / total.reflectance
+        spread = error / sqrt(2.0 * (total.batches - 1))
+        points.append(
+            Point({"quantity": "all that leaves", "engine": engine, "photons": total.photons},
+                  timing, error, (error - spread, error + spread))
+        )  # fmt: skip
+    return StageBenchmark(
+        "photon-transport",
+        "largest relative standard error, %",
+        "the spread of its own batches",
+        0.0,
+        tuple(points),
+        () if toy else (*_one_percent(radii, stack), *_against_volpath(radii), *_rates(medium)),
+        (("volpath's values", "their tails are too heavy to converge in this time"),),
+        by_band=_bands(radii, photons=2000 if toy else 20_000),
+        condition=("quantity",),
+        interval_of="batches of photons",
+    )
+
+
+def _bands(radii: Floats, *, photons: int) -> dict[str, BandError]:
+    """Return the error of as many photons in skin that absorbs little and much."""
+    from rigsim.fiber.profile import fibre_profile
+    from rigsim.tissue.tissue_mc import Layer, LayerStack
+
+    found = {}
+    for name, band in MELANIN_BANDS.items():
+        layer = Layer(inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - G), G, ETA)
+        run = fibre_profile(
+            LayerStack((layer,)), radii_mm=radii, photons=photons,
+            rng=np.random.default_rng(1), threads=CORES,
+        )  # fmt: skip
+        point = _point({}, None, 100.0 * run.stderr / run.reflectance_per_mm2)
+        found[name] = BandError(point.error, point.error_interval)
+    return found
+
+
+def _point(knobs: dict[str, str | int | float], timing: Any, relative: Floats) -> Point:
+    worst = float(np.nan_to_num(relative, nan=100.0, posinf=100.0).max())
+    spread = worst / sqrt(2.0 * 19.0)  # of a standard error from 20 batches
+    return Point(knobs, timing, worst, (worst - spread, worst + spread))
+
+
+def _in_the_cone(radii: Floats, photons: int) -> Floats:
+    """Return relative standard errors, %, of the plain walk in rings as wide as the fibres."""
+    rings = np.zeros((20, 2 * len(radii)))
+    edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
+    for batch, row in enumerate(rings):
+        counted = np.zeros(edges.size - 1)
+        plain_walk(
+            RED[0], RED[1] / (1.0 - G), G, ETA, photons // 20, batch, 0.22, edges**2, counted
+        )
+        row[: counted.size] = counted
+    seen = rings[:, 0 : 2 * len(radii) : 2]
+    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(20.0)
+    return np.asarray(
+        100.0 * np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
+    )
+
+
+def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
+    seconds, value = [], None
+    for _ in range(repeats):
+        begin = time.process_time()
+        value = call()
+        seconds.append(time.process_time() - begin)
+    return min(seconds), value
+
+
+def _one_percent(radii: Floats, stack: Any) -> tuple[Limit, ...]:
+    from rigsim.fiber.profile import fibre_profile
+
+    seconds, run = _spent(
+        lambda: fibre_profile(
+            stack, radii_mm=radii, photons=200_000, rng=np.random.default_rng(3), batches=100
+        )
+    )
+    worst = 100.0 * float((run.stderr / run.reflectance_per_mm2).max())
+    return (
+        Limit("processor seconds on each of 2 cores to 1 % at every fibre, red",
+              seconds * worst**2 / CORES, SECONDS_TO_ONE_PERCENT, "<=", "s"),
+    )  # fmt: skip
+
+
+def _against_volpath(radii: Floats) -> tuple[Limit, ...]:
+    """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
+    from rigsim.fiber.profile import fibre_profile
+    from rigsim.render import RenderError, radiance
+    from rigsim.tissue.tissue_mc import Layer, LayerStack
+
+    scene = volpath_scene(radii)
+    try:
+        radiance(scene, kind="mono", samples=16)
+    except (RenderError, RuntimeError):  # no variant with volumes here
+        return ()
+    peer_s, runs = _spent(
+        lambda: [
+            radiance(scene, kind="mono", samples=PEER_SAMPLES, seed=seed)[0, :, 0]
+            for seed in range(PEER_RUNS)
+        ]
+    )
+    seen = np.array(runs, np.float64)
+    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(PEER_RUNS)
+    # Where light came in one run or none the error is not known: it is taken as that of one run,
+    # 100 %, which flatters the peer.
+    relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
+    stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, 1.0),))
+    ours_s, run = _spent(
+        lambda: fibre_profile(
+            stack, radii_mm=radii, photons=100_000, rng=np.random.default_rng(4), batches=100,
+            source_numerical_aperture=1.0,
+        )
+    )  # fmt: skip
+    ours = ours_s * float((100.0 * run.stderr / run.reflectance_per_mm2).max()) ** 2
+    # As if the peer's samples were shared out among the fibres in the best way.
+    peers = peer_s * float((relative**2).mean())
+    return (
+        Limit("times less processor time to 1 % than volpath, n = 1, by 1/sqrt(samples)",
+              peers / ours, TIMES_CHEAPER, ">="),
+    )  # fmt: skip
+
+
+def volpath_scene(radii: Floats) -> dict[str, Any]:
+    """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fibre.
+
+    The radiance times pi is the exitance per source power where the exit is Lambertian.
+    """
+    from rigsim.render import look_at
+
+    pitch = float(radii[1] - radii[0])
+    middle, half = float(radii.mean()), 0.5 * pitch * len(radii)
+    sigma_s = RED[1] / (1.0 - G)
+    sigma_t = RED[0] + sigma_s
+
+    def placed(x: float, y: float, z: float, at: float) -> Floats:
+        matrix = np.diag([x, y, z, 1.0])
+        matrix[2, 3] = at
+        return matrix
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 2000, "rr_depth": 50},
+        "sensor": {
+            "type": "orthographic", "near_clip": 0.01, "far_clip": 100.0,
+            "to_world": look_at([middle, 0, 5], [middle, 0, 0], [0, 1, 0])
+            @ np.diag([half, half, 1.0, 1.0]),
+            "sampler": {"type": "independent"},
+            "film": {
+                "type": "hdrfilm", "width": len(radii), "height": 1, "pixel_format": "luminance",
+                "rfilter": {"type": "box"},
+            },
+        },
+        "tissue": {
+            "type": "cube", "to_world": placed(100.0, 100.0, 100.0, -100.0),
+            "bsdf": {"type": "null"},
+            "interior": {
+                "type": "homogeneous",
+                "sigma_t": {"type": "spectrum", "value": sigma_t},
+                "albedo": {"type": "spectrum", "value": sigma_s / sigma_t},
+                "phase": {"type": "hg", "g": G},
+            },
+        },
+        "light": {
+            "type": "disk", "to_world": placed(0.1, -0.1, -0.1, 0.001),
+            "emitter": {
+                "type": "area",
+                "radiance": {"type": "spectrum", "value": 1.0 / (pi * pi * 0.1**2)},
+            },
+        },
+    }  # fmt: skip
+
+
+def _rates(medium: Any) -> tuple[Limit, ...]:
+    """Compare photons a processor second with the plain walk's; R_d with MCML's."""
+    from rigsim.tissue.tissue_mc import transport
+
+    edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
+    plain_walk(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
+    plain_s, _ = _spent(lambda: plain_walk(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3)
+    scalar_s, _ = _spent(lambda: transport(medium, photons=40_000, rng=np.random.default_rng(5)), 3)
+    photons = 2_000_000
+    try:
+        ours_s, run = _spent(
+            lambda: transport(
+                medium, photons=photons, rng=np.random.default_rng(6), engine="drjit", batches=40
+            ),
+            2,
+        )
+    except ValueError:
+        return ()
+    rate = run.photons / ours_s
+    return (
+        Limit("times the photons a processor second of a plain numba walk, Dr.Jit",
+              rate / (40_000 / plain_s), TIMES_FASTER, ">="),
+        Limit("the same beside the simulator's own scalar walk",
+              rate / (40_000 / scalar_s), TIMES_FASTER, ">="),
+        Limit("standard errors of R_d from MCML's .3592 (its last digit allowed for)",
+              max(abs(run.reflectance - MCML_R_D) - 5e-4, 0.0) / run.reflectance_stderr, 4.0, "<="),
+    )  # fmt: skip

@@ -1,0 +1,97 @@
+"""Benchmark of the dome's renderer: all lights of a view from one set of rays, and Mitsuba's."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from capture.rig import load_rig
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.resampling import tiled_rms
+from skinrig.evaluating.skin_bands import MELANIN_BANDS
+
+if TYPE_CHECKING:
+    from rigsim.scenes.dome.reference import Way
+
+PATH_SPEED_UP = 10.0
+DIRECT_SPEED_UP = 5.0
+
+
+def render(*, toy: bool) -> StageBenchmark:
+    """Time one view of the dome, light after light, in three ways.
+
+    The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
+    as even as our regular rays: with its default, independent ones it is twice as noisy.
+    """
+    from rigsim.scenes.dome.reference import compare
+
+    width, lights = (64, 2) if toy else (1300, 4)
+    points = []
+
+    def add(name: str, rays: int, way: Way) -> None:
+        timing = Timing(
+            way.seconds, (way.seconds, way.seconds), way.seconds, None,
+            no_memory="three ways take turns in one process, each with its scene held",
+        )  # fmt: skip
+        told = _error(way)
+        points.append(Point({"way": name, "rays": rays}, timing, told.error, told.error_interval))
+
+    efforts = (1, 2) if toy else (1, 3, 2)
+    fine = 4 if toy else 6
+    for subpixels in efforts:
+        found = compare(
+            width_px=width,
+            lights=1 if subpixels != efforts[-1] else lights,
+            subpixels=subpixels,
+            fine=fine,
+            rounds=2 if subpixels == efforts[-1] else 1,
+        )
+        for name in ("ours", "path", "direct"):
+            add(name, subpixels**2, getattr(found, name))
+    bands = {
+        name: _on_skin(band.preset, 64 if toy else 650, fine)
+        for name, band in MELANIN_BANDS.items()
+    }
+    finest = next(p for p in points if p.knobs == {"way": "ours", "rays": max(efforts) ** 2})
+    limits = (
+        Limit("times faster than Mitsuba's path tracer, no noisier", found.speed_up(found.path),
+              PATH_SPEED_UP, ">="),
+        Limit("times faster than Mitsuba's direct integrator, no noisier",
+              found.speed_up(found.direct), DIRECT_SPEED_UP, ">="),
+    )  # fmt: skip
+    return StageBenchmark(
+        "render-dome",
+        "RMS error over the mean, seconds a light, %",
+        f"ours with {fine**2} rays a pixel; Mitsuba's mean agrees with it but for noise. Its own "
+        "error falls at least with the root of the rays from that of the most here",
+        finest.error * max(efforts) / fine,
+        tuple(points),
+        limits,
+        left_out=(("subjects with relief and vellus hair", "Mitsuba has no such lobe"),),
+        interval_of="tiles of the pictures",
+        by_band=bands,
+    )
+
+
+def _error(way: Way) -> BandError:
+    """Return a way's error in percent, with its interval over tiles."""
+    error, tiles = 100.0 * way.error, way.squared_by_tile
+    rng = np.random.default_rng(0)
+    again = np.sqrt(rng.choice(tiles, (200, len(tiles))).mean(axis=1) / tiles.mean())
+    low, high = error * np.quantile(again, [0.16, 0.84])
+    return BandError(error, (min(float(low), error), max(float(high), error)))
+
+
+def _on_skin(preset: str, width: int, fine: int) -> BandError:
+    """Return our error with 4 rays a pixel on a face of a preset's melanin, one light, %."""
+    from rigsim.scenes.dome.reference import PlainScene, plain_face, point_rig
+
+    rig = point_rig(load_rig("dome").resized(width).subset(views=["C02"]))
+    face = plain_face(preset, size=128 if width < 128 else 512)
+    light = len(rig.lights) // 2
+    found, true = (
+        PlainScene(rig, face, subpixels=n).radiance("C02", [light])[0] for n in (2, fine)
+    )
+    shown = true.mean(axis=-1) > 0.0
+    return tiled_rms((found - true) * (100.0 / float(true[shown].mean())), shown)

@@ -1,0 +1,85 @@
+"""Benchmark of the flash rig's renderer: both polarization images, and Mitsuba's polarizers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import tiled_rms
+
+SPEED_UP = 8.0
+NOISE_RATIO = 20.0
+REFERENCE_RAYS = 144
+
+
+def render(*, toy: bool) -> StageBenchmark:
+    """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
+    from rigsim.render import Caster
+    from rigsim.render.variant import choose_variant
+    from rigsim.scenes.flash.polarizer_reference import (
+        ANALYSER_DEG,
+        closed_forms,
+        mitsuba_image,
+        polarizer_reference,
+        reference_rig,
+        sphere_mesh,
+    )
+
+    efforts = ((1, 2), (2, 4)) if toy else ((1, 4), (2, 16), (3, 64))
+    width = 48 if toy else 256
+    rig, view = reference_rig(width)
+    caster = Caster(sphere_mesh(), choice=choose_variant("mono_polarized"))
+    truth = closed_forms(rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5))
+    ours, theirs = [], []
+    for subpixels, samples in efforts:
+
+        def by_closed_forms(subpixels: int = subpixels) -> dict[str, NDArray[np.float32]]:
+            return closed_forms(rig, view, caster, subpixels=subpixels)
+
+        def by_mitsuba(samples: int = samples) -> dict[str, NDArray[np.float32]]:
+            return {
+                name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
+                for k, name in enumerate(ANALYSER_DEG)
+            }
+
+        timing = measure(by_closed_forms, memory=None)
+        told = _worse(by_closed_forms(), truth)
+        knobs: dict[str, str | int | float] = {"way": "closed form", "subpixels": subpixels}
+        ours.append(Point(knobs, timing, told.error, told.error_interval))
+        timing = measure(by_mitsuba, memory=None)
+        told = _worse(by_mitsuba(), truth)
+        knobs = {"way": "mitsuba", "samples": samples}
+        theirs.append(Point(knobs, timing, told.error, told.error_interval))
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        final = polarizer_reference(width_px=width, samples=efforts[-1][1], subpixels=1)
+        limits = (
+            Limit("times faster than Mitsuba's polarizers", final.speed_up, SPEED_UP, ">="),
+            Limit("times less noisy than Mitsuba's polarizers", final.noise_ratio, NOISE_RATIO,
+                  ">="),
+        )  # fmt: skip
+    return StageBenchmark(
+        "render-flash",
+        "RMS error of the worse image, %",
+        f"closed forms with {REFERENCE_RAYS} rays a pixel; Mitsuba's mean agrees with it but for "
+        "noise. Its own error falls at least with the root of the rays from that of the most here",
+        ours[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5,
+        (*ours, *theirs),
+        limits,
+        interval_of="tiles of the pictures",
+        no_bands="a plastic sphere, as Mitsuba can render it too",
+    )
+
+
+def _worse(
+    found: dict[str, NDArray[np.float32]], truth: dict[str, NDArray[np.float32]]
+) -> BandError:
+    """Return the larger of both images' relative errors, %, where the sphere fills pixels."""
+    told = []
+    for name, true in truth.items():
+        whole = binary_erosion(true > 0.0, iterations=2)
+        difference = (found[name].astype(np.float64) - true) * 100.0 / true[whole].mean()
+        told.append(tiled_rms(difference, whole, tile_px=8))
+    return max(told, key=lambda one: one.error)

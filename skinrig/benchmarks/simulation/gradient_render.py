@@ -1,0 +1,111 @@
+"""Benchmark of the gradient rig's pictures: all conditions from four moments, and Mitsuba's."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+
+TIMES_FASTER = 25.0
+LIT_CONDITIONS = 14
+"""Of the 16 conditions two are dark; Mitsuba is not asked to render those."""
+
+
+def render(*, toy: bool) -> StageBenchmark:
+    """Picture one state of skin under all conditions, and render its conditions one by one.
+
+    Both sides are judged against sums over the LEDs with a shadow ray to each. Seconds are
+    processor time; ours are those of the table, which serves all states of a session, and of one
+    state.
+    """
+    from rigsim.as_built.sphere import PATTERN_WEIGHTS
+    from rigsim.scenes.gradient.reference import (
+        judge,
+        picture,
+        plain_scene,
+        plain_skin,
+        rendered,
+        traced,
+    )
+
+    width = 48 if toy else 192
+    skin = plain_skin(width * 0.006 + 0.9)
+    rng = np.random.default_rng(0)
+    pixels = np.sort(rng.choice(width * width, 200 if toy else 1500, replace=False))
+    plain = plain_scene(skin, width_px=width)
+    reference, _ = traced(plain, pixels, subpixels=2 if toy else 4)
+    points: list[Point] = []
+
+    def add(
+        knobs: dict[str, str | int | float], seconds: float, error: float, memory: float | None
+    ) -> None:
+        spread = error / math.sqrt(2.0 * len(pixels))
+        timing = Timing(seconds, (seconds, seconds), seconds, memory, "resident")
+        interval = (100.0 * (error - spread), 100.0 * (error + spread))
+        points.append(Point(knobs, timing, 100.0 * error, interval))
+
+    picture(plain_scene(skin, width_px=width, table_size=17), pixels)  # compiles
+    settings = [(1, 16, 33), (1, 32, 65), (2, 32, 65)]
+    if not toy:
+        settings += [(1, 32, 129), (2, 16, 65), (2, 64, 65), (3, 32, 65)]
+    ours = {}
+    for subpixels, sectors, table in settings:
+        scene = plain_scene(
+            skin, width_px=width, subpixels=subpixels, sectors=sectors, table_size=table
+        )
+        with resident_memory.watched() as rise:
+            begin = time.process_time()
+            scene.lighting()
+            found = picture(scene, pixels)
+            spent = time.process_time() - begin
+        way = judge(found, reference, spent)
+        ours[subpixels, sectors, table] = way
+        knobs: dict[str, str | int | float] = {"way": "moments"}
+        knobs |= {"subpixels": subpixels, "sectors": sectors, "table": table}
+        add(knobs, spent, way.error, rise.mb)
+    without = judge(picture(plain_scene(skin, width_px=width, shadows=False), pixels), reference, 0)
+    theirs = {}
+    for samples in (4,) if toy else (16, 64):
+        ways = []
+        for number, pattern in enumerate(("full", "x")):
+            with resident_memory.watched() as rise:
+                image, seconds = rendered(plain, pattern, samples=samples, seed=number)
+            wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
+            ways.append(judge(image.reshape(-1)[pixels].astype(np.float64), wanted, seconds))
+        error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
+        seconds = LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
+        theirs[samples] = (seconds, error, ways)
+        add({"way": "Mitsuba", "samples": samples}, seconds, error, rise.mb)
+    best = ours[2, 32, 65]
+    samples = max(theirs)
+    peer_s, peer_error, ways = theirs[samples]
+    at_equal_error = peer_s * (peer_error / best.error) ** 2
+    off = max(abs(way.mean_ratio - 1.0) / way.mean_ratio_stderr for way in ways)
+    limits = (
+        Limit(
+            f"times less processor time than {LIT_CONDITIONS} Mitsuba renders at equal error, "
+            f"extrapolated from {samples} samples by 1 over their root",
+            at_equal_error / best.seconds, TIMES_FASTER, ">=",
+        ),
+        Limit("error, 2 samples a pixel's side, of the mean", 100.0 * best.error, 1.0, "<=", "%"),
+        Limit("Mitsuba's mean off the reference's, in its standard errors", off, 4.0, "<="),
+        Limit("error without shadows over that with", without.error / best.error, 3.0, ">="),
+    )  # fmt: skip
+    return StageBenchmark(
+        "render-gradient",
+        "RMS error over the mean, processor seconds for all conditions of a state, %",
+        "sums over LEDs with shadow rays, in some pixels",
+        0.05,
+        tuple(points),
+        () if toy else limits,
+        left_out=(
+            ("polarization in the comparison", "Mitsuba has no film before each light here"),
+            ("the lens", "Mitsuba's cameras do not diffract"),
+        ),
+        interval_of="pixels",
+        no_bands="surface reflection, which pigment does not enter, is most of what is rendered",
+    )

@@ -1,0 +1,86 @@
+"""The probe's pictures with and without what its needs speak of."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from skinrig.benchmarks.simulation.omission_cases import Omission, Pictures, changed
+
+
+def gray_tissue() -> Iterator[Omission]:
+    """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
+    from capture.rig import load_rig
+    from rigsim.fiber.probe_tissue import HomogeneousTissue
+    from rigsim.needs.effects import Noise
+    from rigsim.needs.probe import COLOR
+    from rigsim.scenes.probe.scene import ProbeScene
+    from rigsim.world.suction import HeadState
+
+    rig = load_rig("probe")
+    gray = HomogeneousTissue(0.05, 1.5)
+    bands = tuple(float(nm) for nm in range(400, 701, 10))
+    colored = dataclasses.replace(
+        gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands
+    )  # fmt: skip
+    head = HeadState("forehead", 0.0, True, 0.0, 5.0)
+    pictures, seconds = [], []
+    scene = ProbeScene(rig, gray)
+    for tissue in (colored, gray):
+        begin = time.process_time()
+        made = ProbeScene(rig, tissue)
+        profile = made.profile(head)
+        seconds.append(time.process_time() - begin)
+        if profile is None:
+            raise ValueError("gray tissue: the head touches nothing")
+        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
+        pictures.append(Pictures(light))  # of stored photons: the same for both
+    brightest = np.float32(pictures[0].light.max())
+    noise = Noise.of(scene.sensor())
+    have, lack = (Pictures(part.light / brightest) for part in pictures)
+    effect = scene.needs[COLOR]
+    yield changed(
+        "probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1])
+    )  # fmt: skip
+    yield from _probe_build(scene, head, noise)
+
+
+def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
+    """Compare the probe as built with one without cross-talk, wings, or dark current."""
+    from rigsim.needs.probe import CROSSTALK, DARK, WINGS
+    from rigsim.scenes.probe.scene import LONGEST_S, ProbeScene
+
+    profile = scene.profile(head)
+    build = scene.build
+
+    def picture(made: Any) -> tuple[Pictures, float]:
+        begin = time.process_time()
+        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
+        return Pictures(light), time.process_time() - begin
+
+    have, with_s = picture(scene)
+    unit = np.float32(have.light.max())
+    plain = {
+        CROSSTALK: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
+        WINGS: dataclasses.replace(build, wings=0.0),
+    }
+    for name, without in plain.items():
+        lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
+        yield changed(
+            "probe", "gray medium", scene.needs[name], Pictures(have.light / unit),
+            Pictures(lack.light / unit), noise, (with_s, spent),
+        )  # fmt: skip
+    sensor = scene.sensor()
+    full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
+    begin = time.process_time()
+    hot = np.asarray(scene.hot_e_per_s * LONGEST_S / full_e, np.float32)
+    middle = time.process_time()
+    none = np.zeros_like(hot)
+    spent_s = middle - begin, time.process_time() - middle
+    yield changed(
+        "probe", "gray medium", scene.needs[DARK], Pictures(hot), Pictures(none), noise, spent_s
+    )

@@ -1,0 +1,117 @@
+"""Benchmark of stretched skin: how far the equilibrium is from converged, against seconds."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+
+STATES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
+"""Stretches of a series as the caliper gives them."""
+PATCH_STATES_S = 15.0
+"""Processor seconds allowed for eight states of a patch for 384 px of 6 um."""
+FIELD_STATE_S = 60.0
+"""Processor seconds allowed for one state of the camera's whole field."""
+
+
+def _variance(state: StretchedSkin, half_mm: float) -> float:
+    """Return the variance of slopes along the jaws over the same skin in every state."""
+    grid = np.arange(-half_mm, half_mm, 0.008)
+    x, y = np.meshgrid(grid, -grid)
+    place = np.stack([x, y], -1) @ state.gradient.T
+    found = state.sample(place[..., 0], place[..., 1])
+    angle = np.radians(state.angle_deg)
+    along = np.cos(angle) * found.slope_x + np.sin(angle) * found.slope_y
+    return float(np.var(along, dtype=np.float64))
+
+
+def stretched(*, toy: bool) -> StageBenchmark:
+    """Stop the search for the equilibrium at forces of several sizes; then time whole series."""
+    size = 0.3 if toy else 1.6
+    half = 0.4 * size
+    seeds = range(2 if toy else 3)
+    skins = [make_micro_skin("forehead", seed=seed, size_mm=size) for seed in seeds]
+    points = []
+    for stretch in (0.8, 1.25):
+        truth = [
+            _variance(deform(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
+            for s in skins
+        ]
+        for tolerance in (0.1, TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, TOLERANCE, 1e-3):
+
+            def run(stretch: float = stretch, tolerance: float = tolerance) -> list[StretchedSkin]:
+                return [
+                    deform(s, stretch=stretch, angle_deg=90.0, tolerance=tolerance) for s in skins
+                ]
+
+            timing = measure(run, repeats=1, memory=not toy)
+            states = run()
+            errors = np.array([abs(_variance(s, half) / t - 1.0) for s, t in zip(
+                states, truth, strict=True)])  # fmt: skip
+            spread = float(errors.std(ddof=1) / np.sqrt(errors.size))
+            error = float(errors.mean())
+            evaluations = np.mean([s.convergence.evaluations for s in states])
+            points.append(
+                Point(
+                    {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)},
+                    timing,
+                    100.0 * error,
+                    (100.0 * (error - spread), 100.0 * (error + spread)),
+                )
+            )
+    return StageBenchmark(
+        "skin-stretch",
+        "error of the slopes' variance along the jaws, %",
+        "the same relief at forces of 1e-5 of the affine state's",
+        0.01,
+        tuple(points),
+        () if toy else _limits(),
+        condition=("stretch",),
+        interval_of="patches of skin",
+        no_bands="shape alone: no color of skin enters",
+    )
+
+
+def _limits() -> tuple[Limit, ...]:
+    limits = []
+    for site in SITES:
+        skin = make_micro_skin(site, seed=1, size_mm=2.8)
+        begin = time.process_time()
+        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in STATES}
+        spent = time.process_time() - begin
+        variance = np.array([_variance(states[r], 1.2) for r in STATES])
+        limits.append(Limit(f"processor seconds for 8 states of 2.8 mm, {site}", spent,
+                            PATCH_STATES_S, "<=", "s"))  # fmt: skip
+        flatter = float((np.diff(variance) < 0.0).sum())
+        limits.append(Limit(f"steps of r along which slopes flatten, {site}", flatter,
+                            len(STATES) - 1.0, ">="))  # fmt: skip
+        strain = max(abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
+        limits.append(Limit(f"membrane strain over that without excess length, {site}", strain,
+                            1.0, "<="))  # fmt: skip
+    field = make_micro_skin("forehead", seed=1, size_mm=size_for(12.3, 1.0, angle_deg=0.0))
+    begin = time.process_time()
+    deform(field, stretch=1.2, angle_deg=90.0)
+    limits.append(Limit("processor seconds for one state of 12.3 mm", time.process_time() - begin,
+                        FIELD_STATE_S, "<=", "s"))  # fmt: skip
+    flat = _flat(field)
+    worst = float(np.abs(deform(flat, stretch=0.8, angle_deg=0.0).height_um).max())
+    limits.append(Limit("height of a flat patch under compression", worst, 1e-6, "<=", "um"))
+    return tuple(limits)
+
+
+def _flat(skin: MicroSkin) -> MicroSkin:
+    crop = slice(0, 200)
+    maps: dict[str, NDArray[np.float32]] = {
+        name: getattr(skin, name)[crop, crop]
+        for name in ("height_um", "albedo", "alpha", "layer_um")
+    }
+    maps["height_um"] = np.zeros_like(maps["height_um"])
+    # a layer of uneven thickness bends when it is compressed, however flat its top is
+    maps["layer_um"] = np.full_like(maps["layer_um"], maps["layer_um"].mean())
+    return replace(skin, **maps)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Blend-shape meshes: glTF and OBJ readers."""

@@ -1,0 +1,296 @@
+"""Blend shapes from glTF 2.0: the morph targets of one mesh of a .gltf or .glb file.
+
+The file's JSON and buffers are read here: of what the libraries for glTF know, a mesh with targets
+needs accessors only (also sparse and quantized ones), and those they leave to the caller.
+
+Positions are taken through the transforms of the node that shows the mesh; a skinned mesh is taken
+as it is bound, as the standard has it. Texture coordinates are turned to v up. Compressed geometry
+is refused by its extension's name.
+
+References
+----------
+glTF 2.0 specification, ISO/IEC 12113:2022.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.blend_shapes.errors import BlendShapeFileError
+
+Floats = NDArray[np.float64]
+
+GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+COMPONENTS: Final[dict[int, np.dtype[Any]]] = {
+    5120: np.dtype("<i1"), 5121: np.dtype("<u1"), 5122: np.dtype("<i2"),
+    5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4"),
+}  # fmt: skip
+"""Types of numbers in buffers, by the standard's codes."""
+WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+COMPRESSED: Final = (
+    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
+)  # fmt: skip
+TRIANGLES: Final = 4
+DEEPEST: Final = 1000
+"""Nodes above a mesh beyond which a file is taken to go in circles."""
+
+
+class _Gltf:
+    """One file: its document, and accessors as arrays."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.binary: bytes | None = None
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise self.wrong(f"cannot be read: {error.strerror}") from error
+        text = self._unpacked(data) if path.suffix.lower() == ".glb" else data
+        try:
+            document = json.loads(text)
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise self.wrong(f"not JSON: {error}") from error
+        if not isinstance(document, dict):
+            raise self.wrong("got no JSON object")
+        version = document.get("asset", {}).get("version", "none")
+        if not str(version).startswith("2."):
+            raise self.wrong(f"got glTF version {version}, expected 2")
+        for name in document.get("extensionsRequired", []):
+            if name in COMPRESSED:
+                raise self.wrong(f"geometry is compressed by {name}; export it without")
+        self.document: dict[str, Any] = document
+        self.buffers: dict[int, bytes] = {}
+
+    def wrong(self, what: str) -> BlendShapeFileError:
+        return BlendShapeFileError(f"{self.path}: {what}")
+
+    def _unpacked(self, data: bytes) -> bytes:
+        if len(data) < 20 or struct.unpack_from("<I", data)[0] != GLB_MAGIC:
+            raise self.wrong("not a GLB file")
+        length = struct.unpack_from("<I", data, 8)[0]
+        if length != len(data):
+            raise self.wrong(f"got {len(data)} bytes, expected {length}: it was cut short")
+        at, text = 12, None
+        while at + 8 <= len(data):
+            size, kind = struct.unpack_from("<II", data, at)
+            chunk = data[at + 8 : at + 8 + size]
+            if len(chunk) != size:
+                raise self.wrong("a chunk is cut short")
+            if kind == GLB_JSON and text is None:
+                text = chunk
+            elif kind == GLB_BIN and self.binary is None:
+                self.binary = chunk
+            at += 8 + size
+        if text is None:
+            raise self.wrong("has no JSON chunk")
+        return text
+
+    def buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            entry = self.document["buffers"][number]
+            uri = entry.get("uri")
+            if uri is None:
+                if self.binary is None or number != 0:
+                    raise self.wrong(f"buffer {number} has no data")
+                data = self.binary
+            elif uri.startswith("data:"):
+                try:
+                    data = base64.b64decode(uri.split(",", 1)[1], validate=True)
+                except (IndexError, binascii.Error) as error:
+                    raise self.wrong(f"buffer {number}: its data URI is damaged") from error
+            else:
+                file = self.path.parent / unquote(uri)
+                if ".." in Path(unquote(uri)).parts or Path(unquote(uri)).is_absolute():
+                    raise self.wrong(f"buffer {number}: got {uri!r}, expected a file beside it")
+                try:
+                    data = file.read_bytes()
+                except OSError as error:
+                    raise self.wrong(f"buffer {number}: {uri!r} cannot be read") from error
+            if len(data) < int(entry["byteLength"]):
+                raise self.wrong(f"buffer {number} is cut short")
+            self.buffers[number] = data
+        return self.buffers[number]
+
+    def _rows(
+        self, view_number: int, offset: int, count: int, component: int, width: int
+    ) -> NDArray[Any]:
+        """Return (count, width) numbers of a view of a buffer."""
+        kind = COMPONENTS[component]
+        view = self.document["bufferViews"][view_number]
+        stride = int(view.get("byteStride", 0)) or kind.itemsize * width
+        start = int(view.get("byteOffset", 0)) + offset
+        end = start + (count - 1) * stride + kind.itemsize * width if count else start
+        data = self.buffer(int(view["buffer"]))
+        last = int(view.get("byteOffset", 0)) + int(view["byteLength"])
+        if start < 0 or stride < kind.itemsize * width or end > min(last, len(data)):
+            raise self.wrong(f"buffer view {view_number} is shorter than what is stored there")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).copy()
+
+    def accessor(self, number: int, kind: str) -> NDArray[Any]:
+        """Return an accessor's numbers, normalised ones as floats, shape (N, width)."""
+        entry = self.document["accessors"][number]
+        if entry["type"] != kind:
+            raise self.wrong(f"accessor {number}: got {entry['type']}, expected {kind}")
+        component, count, width = int(entry["componentType"]), int(entry["count"]), WIDTHS[kind]
+        if component not in COMPONENTS:
+            raise self.wrong(f"accessor {number}: got component type {component}")
+        if "bufferView" in entry:
+            offset = int(entry.get("byteOffset", 0))
+            values = self._rows(int(entry["bufferView"]), offset, count, component, width)
+        else:
+            values = np.zeros((count, width), COMPONENTS[component])
+        if "sparse" in entry:
+            sparse = entry["sparse"]
+            n, at, new = int(sparse["count"]), sparse["indices"], sparse["values"]
+            places = self._rows(int(at["bufferView"]), int(at.get("byteOffset", 0)), n,
+                                int(at["componentType"]), 1)[:, 0]  # fmt: skip
+            if n and int(places.max()) >= count:
+                raise self.wrong(f"accessor {number}: a sparse index is beyond {count - 1}")
+            values[places] = self._rows(int(new["bufferView"]), int(new.get("byteOffset", 0)), n,
+                                        component, width)  # fmt: skip
+        if entry.get("normalized") and values.dtype.kind in "iu":
+            top = float(np.iinfo(values.dtype).max)
+            return np.asarray(np.maximum(values.astype(np.float64) / top, -1.0))
+        return values
+
+
+def read(
+    path: Path, part: str | None
+) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+    """Read the mesh with morph targets of a glTF file.
+
+    Parameters
+    ----------
+    path
+        .gltf or .glb.
+    part
+        Name of the mesh, needed where several have targets.
+
+    Returns
+    -------
+    vertices, uv, faces, deltas
+        Shapes (V, 3), (V, 2), (F, 3), and (V, 3) each; metres, v up.
+
+    Raises
+    ------
+    BlendShapeFileError
+        For a file that is damaged, compressed, or has no such mesh.
+    """
+    gltf = _Gltf(path)
+    try:
+        return _read(gltf, part)
+    except BlendShapeFileError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise gltf.wrong(f"a part is missing or of a wrong kind: {error!r}") from error
+
+
+def _read(
+    gltf: _Gltf, part: str | None
+) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+    number = _chosen(gltf, part)
+    mesh = gltf.document["meshes"][number]
+    matrix = _transform(gltf, number)
+    vertices, texture, faces, moved = [], [], [], []
+    count = 0
+    for index, primitive in enumerate(mesh["primitives"]):
+        where = f"mesh {mesh.get('name', number)!r}, primitive {index}"
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            raise gltf.wrong(f"{where}: got mode {primitive['mode']}, expected triangles")
+        attributes = primitive["attributes"]
+        for name in ("POSITION", "TEXCOORD_0"):
+            if name not in attributes:
+                raise gltf.wrong(f"{where}: lacks {name}")
+        points = gltf.accessor(attributes["POSITION"], "VEC3").astype(np.float64)
+        uv = gltf.accessor(attributes["TEXCOORD_0"], "VEC2").astype(np.float64)
+        if "indices" in primitive:
+            corners = gltf.accessor(primitive["indices"], "SCALAR")[:, 0].astype(np.int64)
+        else:
+            corners = np.arange(len(points), dtype=np.int64)
+        if corners.size % 3 or (corners.size and corners.max() >= len(points)):
+            raise gltf.wrong(f"{where}: its indices make no triangles of {len(points)} vertices")
+        targets = []
+        for target in primitive.get("targets", []):
+            deltas = np.zeros_like(points)
+            if "POSITION" in target:
+                deltas = gltf.accessor(target["POSITION"], "VEC3").astype(np.float64)
+            targets.append(deltas @ matrix[:3, :3].T)
+        if any(len(values) != len(points) for values in (uv, *targets)):
+            raise gltf.wrong(f"{where}: its attributes and targets differ in length")
+        vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+        texture.append(np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1))
+        faces.append(corners.reshape(-1, 3) + count)
+        moved.append(targets)
+        count += len(points)
+    if len({len(targets) for targets in moved}) != 1:
+        raise gltf.wrong("primitives of the mesh differ in their number of targets")
+    names = mesh.get("extras", {}).get("targetNames") or [
+        f"shape_{i}" for i in range(len(moved[0]))
+    ]
+    if len(names) != len(moved[0]) or len(set(names)) != len(names):
+        raise gltf.wrong(f"got {len(names)} names of targets, expected {len(moved[0])} distinct")
+    shapes = {
+        str(name): np.concatenate([targets[i] for targets in moved]) for i, name in enumerate(names)
+    }
+    return np.concatenate(vertices), np.concatenate(texture), np.concatenate(faces), shapes
+
+
+def _chosen(gltf: _Gltf, part: str | None) -> int:
+    meshes = gltf.document.get("meshes", [])
+    names = [str(mesh.get("name", number)) for number, mesh in enumerate(meshes)]
+    if part is not None:
+        if names.count(part) != 1:
+            raise gltf.wrong(f"part: got {part!r}, expected one of {', '.join(names)}")
+        return names.index(part)
+    able = [n for n, mesh in enumerate(meshes) if any(p.get("targets") for p in mesh["primitives"])]
+    if len(able) != 1:
+        listed = ", ".join(names[n] for n in able) or "none"
+        raise gltf.wrong(
+            f"got {len(able)} meshes with morph targets ({listed}), expected one"
+            + ("; say which with part" if able else "")
+        )
+    return able[0]
+
+
+def _transform(gltf: _Gltf, mesh: int) -> Floats:
+    """Return the 4 x 4 matrix from the mesh to the scene; the identity for a mesh no node shows."""
+    nodes = gltf.document.get("nodes", [])
+    shown = [number for number, node in enumerate(nodes) if node.get("mesh") == mesh]
+    if not shown or "skin" in nodes[shown[0]]:
+        return np.eye(4)
+    parent = {
+        child: number for number, node in enumerate(nodes) for child in node.get("children", [])
+    }
+    matrix, here = _local(nodes[shown[0]]), shown[0]
+    for _ in range(DEEPEST):
+        if here not in parent:
+            return matrix
+        here = parent[here]
+        matrix = _local(nodes[here]) @ matrix
+    raise gltf.wrong("its nodes go in circles")
+
+
+def _local(node: dict[str, Any]) -> Floats:
+    if "matrix" in node:
+        return np.asarray(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
+    x, y, z, w = np.asarray(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.asarray(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
+    matrix[:3, 3] = np.asarray(node.get("translation", (0.0, 0.0, 0.0)), np.float64)
+    return matrix

@@ -1,0 +1,165 @@
+"""Blend shapes from OBJ files: one neutral mesh, and one file of the same topology per shape.
+
+Polygons are cut into fans, and vertices split where a seam of the texture gives them several
+texture coordinates. Normals, materials, groups, points, lines and smoothing are passed over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.blend_shapes.errors import BlendShapeFileError
+
+Floats = NDArray[np.float64]
+NEUTRAL = "neutral"
+"""Stem of the neutral file of a folder, in any case."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjMesh:
+    """What an OBJ file holds, as it is indexed there."""
+
+    positions: Floats
+    texture: Floats
+    corners: NDArray[np.int64]
+    """Triangles, (F, 3, 2): position and texture index of each corner."""
+
+
+def read(
+    path: Path, shapes: Mapping[str, Path] | None
+) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+    """Read a neutral OBJ and its shapes.
+
+    Parameters
+    ----------
+    path
+        A folder with neutral.obj, or the neutral file.
+    shapes
+        Files by name; None takes the other .obj files of the folder, by their stems.
+
+    Returns
+    -------
+    vertices, uv, faces, deltas
+        Shapes (V, 3), (V, 2), (F, 3), and (V, 3) each; in the file's unit.
+
+    Raises
+    ------
+    BlendShapeFileError
+        For a folder without a neutral file, a line that cannot be read, or another topology.
+    """
+    neutral_path = path if path.is_file() else _neutral_of(path)
+    neutral = parse(neutral_path)
+    if shapes is None:
+        others = sorted(p for p in neutral_path.parent.iterdir() if p.suffix.lower() == ".obj")
+        shapes = {p.stem: p for p in others if p != neutral_path}
+    pairs, split = np.unique(neutral.corners.reshape(-1, 2), axis=0, return_inverse=True)
+    faces = split.reshape(-1, 3).astype(np.int64)
+    deltas = {}
+    for name, file in shapes.items():
+        shape = parse(Path(file))
+        if len(shape.positions) != len(neutral.positions):
+            raise BlendShapeFileError(
+                f"{file}: got {len(shape.positions)} vertices, expected {len(neutral.positions)} "
+                f"as in {neutral_path.name}"
+            )
+        # exporters may leave out or renumber texture coordinates of shapes: they are not used
+        if not np.array_equal(shape.corners[..., 0], neutral.corners[..., 0]):
+            raise BlendShapeFileError(f"{file}: its faces are not those of {neutral_path.name}")
+        deltas[name] = (shape.positions - neutral.positions)[pairs[:, 0]]
+    if len(pairs) == 0:
+        raise BlendShapeFileError(f"{neutral_path}: got no faces, expected triangles or polygons")
+    if pairs[:, 1].min() < 0:
+        raise BlendShapeFileError(
+            f"{neutral_path}: got faces without texture coordinates (f v/vt), expected a texture"
+        )
+    return neutral.positions[pairs[:, 0]], neutral.texture[pairs[:, 1]], faces, deltas
+
+
+def _neutral_of(folder: Path) -> Path:
+    found = [p for p in folder.iterdir() if p.suffix.lower() == ".obj"]
+    named = [p for p in found if p.stem.lower() == NEUTRAL]
+    if len(named) != 1:
+        raise BlendShapeFileError(
+            f"{folder}: got {len(found)} .obj files, {len(named)} of them called {NEUTRAL}.obj, "
+            "expected one of that name and one for each shape"
+        )
+    return named[0]
+
+
+def parse(path: Path) -> ObjMesh:
+    """Read positions, texture coordinates and faces of an OBJ file.
+
+    Parameters
+    ----------
+    path
+        Text; lines that end with a backslash go on.
+
+    Returns
+    -------
+    ObjMesh
+        Texture indices are -1 where a face has none.
+
+    Raises
+    ------
+    BlendShapeFileError
+        With the number of the line that is wrong.
+    """
+    positions: list[tuple[float, ...]] = []
+    texture: list[tuple[float, ...]] = []
+    corners: list[tuple[tuple[int, int], ...]] = []
+    try:
+        lines = path.read_text("utf-8", errors="replace").replace("\\\n", " ").splitlines()
+    except OSError as error:
+        raise BlendShapeFileError(f"{path}: cannot be read: {error.strerror}") from error
+    for number, line in enumerate(lines, 1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        try:
+            if words[0] == "v":
+                positions.append(_floats(words[1:4], 3))
+            elif words[0] == "vt":
+                texture.append(_floats(words[1:3], 2))
+            elif words[0] == "f":
+                if len(words) < 4:
+                    raise ValueError(f"got a face of {len(words) - 1} corners, expected 3 or more")
+                fan = [_corner(word, len(positions), len(texture)) for word in words[1:]]
+                corners.extend((fan[0], fan[i], fan[i + 1]) for i in range(1, len(fan) - 1))
+        except ValueError as error:
+            raise BlendShapeFileError(f"{path}, line {number}: {error}") from error
+    return ObjMesh(
+        np.array(positions, np.float64).reshape(-1, 3),
+        np.array(texture, np.float64).reshape(-1, 2),
+        np.array(corners, np.int64).reshape(-1, 3, 2),
+    )
+
+
+def _floats(words: list[str], count: int) -> tuple[float, ...]:
+    if len(words) != count:
+        raise ValueError(f"got {len(words)} numbers, expected {count}")
+    values = tuple(float(word) for word in words)
+    if not np.isfinite(values).all():
+        raise ValueError("got NaN or infinity, expected numbers")
+    return values
+
+
+def _corner(word: str, positions: int, texture: int) -> tuple[int, int]:
+    parts = word.split("/")
+    found = []
+    for text, count, what in zip(parts, (positions, texture), ("vertex", "texture"), strict=False):
+        if what == "texture" and text == "":
+            continue
+        try:
+            given = int(text)
+        except ValueError:
+            raise ValueError(f"got corner {word!r}, expected v, v/vt or v/vt/vn") from None
+        index = given - 1 if given > 0 else count + given
+        if given == 0 or not 0 <= index < count:
+            raise ValueError(f"got {what} {text} of {count} before this line")
+        found.append(index)
+    return found[0], found[1] if len(found) > 1 else -1

@@ -1,0 +1,1 @@
+"""Options of capture: addresses, acquisition, light safety and sequences."""

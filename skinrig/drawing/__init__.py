@@ -1,0 +1,1 @@
+"""Drawing: PNG images, SVG figures and labels."""

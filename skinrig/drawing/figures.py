@@ -1,0 +1,212 @@
+"""Plots of the report as SVG text, equal bytes for equal input."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.drawing import svg
+
+COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
+
+
+def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
+    """Return a figure without a background, and its axes; sizes in inches."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    mpl.rcParams["svg.hashsalt"] = "skinrig"
+    mpl.rcParams["svg.fonttype"] = "none"
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    # transparent on the page; strokes and text take the page's color through CSS
+    figure.patch.set_alpha(0.0)
+    axes.patch.set_alpha(0.0)
+    return figure, axes
+
+
+def finished(figure: Any, alt: str) -> str:
+    """Return a figure as SVG text, with ``alt`` for those who do not see it."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    buffer = io.StringIO()
+    # savefig would draw twice, the first time for the layout, which the one drawing finds as well
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+    return svg.simplified(buffer.getvalue(), alt=alt)
+
+
+def plain_numbers(*log_axes: Any) -> None:
+    """Label decades by plain numbers, and what lies between them where decades are too few."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    for axis in log_axes:
+        low, high = axis.get_view_interval()
+        plain = FuncFormatter(lambda value, _: f"{value:g}")
+        axis.set_major_formatter(plain)
+        few = high < 30.0 * low
+        some = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+        axis.set_minor_formatter(some if few else NullFormatter())
+        axis.set_tick_params(which="minor", labelsize=7)
+
+
+def span_of(values: NDArray[np.floating]) -> str:
+    """Return the ends of what is finite, as words."""
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
+
+
+def bars(
+    title: str,
+    labels: Sequence[str],
+    series: Mapping[str, NDArray[np.floating] | Sequence[float]],
+    *,
+    unit: str,
+    limits: Mapping[str, float] | None = None,
+) -> str:
+    """Draw groups of bars, one group a label, one bar a series; NaN leaves a gap.
+
+    A series in ``limits`` has its limit drawn as a dashed line of its color.
+    """
+    figure, axes = canvas(6.2, 3.0)
+    position = np.arange(len(labels))
+    width = 0.8 / max(len(series), 1)
+    for number, (name, values) in enumerate(series.items()):
+        axes.bar(
+            position + (number - (len(series) - 1) / 2) * width,
+            np.asarray(values, float),
+            width,
+            label=name,
+            color=COLORS[number % len(COLORS)],
+        )
+        if limits and name in limits:
+            axes.axhline(limits[name], color=COLORS[number % len(COLORS)], ls="--", lw=1)
+    axes.set_xticks(position, labels, fontsize=8)
+    axes.set_ylabel(unit)
+    axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    told = "; ".join(
+        f"{name}: "
+        + ", ".join(
+            f"{' '.join(label.split())} {value:.3g}"
+            for label, value in zip(labels, np.asarray(values, float), strict=True)
+            if np.isfinite(value)
+        )
+        for name, values in series.items()
+    )
+    held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
+    return finished(figure, f"{title}, {unit}: {told}{held}")
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One series of a plot: points with standard errors, a line, or both."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    stderr: Sequence[float] | None = None
+    marks: bool = True
+    """Whether points are marked."""
+    line: bool = True
+    """Whether they are joined."""
+    color: str | None = None
+    """As matplotlib knows it; None: by the order of the series."""
+
+
+def curves(
+    title: str, x_name: str, y_name: str, series: Sequence[Curve], *, log_y: bool = False
+) -> str:
+    """Draw series over a common axis, with bars of one standard error; NaN leaves a gap.
+
+    On a logarithmic axis what is not above zero leaves a gap too.
+    """
+    figure, axes = canvas(5.2, 3.4)
+    for number, curve in enumerate(series):
+        color = curve.color or COLORS[number % len(COLORS)]
+        style = ("o" if curve.marks else "") + ("-" if curve.line else "")
+        x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+        if log_y:
+            y = np.where(y > 0.0, y, np.nan)
+        if curve.stderr is None:
+            axes.plot(x, y, style or "o", color=color, ms=4, lw=1.2, label=curve.name)
+            continue
+        bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
+        down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis has no room for zero
+        axes.errorbar(
+            x, y, yerr=np.stack([down, bars]), fmt=style or "o", color=color, ms=4, lw=1.2,
+            elinewidth=1, label=curve.name,
+        )  # fmt: skip
+    if log_y:
+        axes.set_yscale("log")
+        plain_numbers(axes.yaxis)
+    axes.set_xlabel(x_name)
+    axes.set_ylabel(y_name)
+    axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    told = "; ".join(
+        f"{curve.name} {span_of(np.asarray(curve.y, float))} over "
+        f"{span_of(np.asarray(curve.x, float))}"
+        for curve in series
+    )
+    return finished(figure, f"{title}: {y_name} against {x_name}; {told}")
+
+
+def sensitivity(
+    title: str,
+    c_m: NDArray[np.floating],
+    c_hd: NDArray[np.floating],
+    percent: NDArray[np.floating],
+) -> str:
+    """Draw the least relative standard error over melanin and hemoglobin, in percent.
+
+    Parameters
+    ----------
+    title
+        Which chromophore.
+    c_m, c_hd
+        (N,) and (M,) volume fractions.
+    percent
+        (N, M) Cramer-Rao bound on the relative standard error; contours at 1, 3, 10, 30
+        and 100 %.
+    """
+    figure, axes = canvas(4.2, 3.2)
+    shown = np.clip(np.nan_to_num(percent, nan=1e4, posinf=1e4), 0.1, 1e3).T
+    mesh = axes.pcolormesh(
+        np.cbrt(c_m),
+        np.cbrt(c_hd),
+        np.log10(shown),
+        cmap="viridis_r",
+        shading="nearest",
+        rasterized=True,
+        vmin=-0.5,
+        vmax=2.5,
+    )
+    if shown.min() < 100 < shown.max():
+        contour = axes.contour(
+            np.cbrt(c_m), np.cbrt(c_hd), shown, [1, 3, 10, 30, 100], colors="w", linewidths=0.7
+        )
+        axes.clabel(contour, fmt="%g %%", fontsize=7)
+    ticks = np.array([0.001, 0.01, 0.05, 0.15, 0.3, 0.5])
+    axes.set_xticks(np.cbrt(ticks), [f"{t:g}" for t in ticks], fontsize=7)
+    axes.set_yticks(np.cbrt(ticks[:-1]), [f"{t:g}" for t in ticks[:-1]], fontsize=7)
+    axes.set_xlim(np.cbrt(c_m[0]), np.cbrt(c_m[-1]))
+    axes.set_ylim(np.cbrt(c_hd[0]), np.cbrt(c_hd[-1]))
+    axes.set_xlabel("melanin fraction C_m")
+    axes.set_ylabel("hemoglobin fraction C_hd")
+    axes.set_title(title, fontsize=10)
+    figure.colorbar(mesh, ax=axes, label="log10 of percent")
+    row, column = np.unravel_index(int(np.argmin(shown)), shown.shape)
+    alt = (
+        f"{title}: least relative standard error {shown[row, column]:.2g} % at melanin "
+        f"{c_m[column]:.2g}, hemoglobin {c_hd[row]:.2g}; below 10 % on "
+        f"{100 * float(np.mean(shown < 10)):.0f} %, above 100 % on "
+        f"{100 * float(np.mean(shown > 100)):.0f} % of the plane"
+    )
+    return finished(figure, alt)

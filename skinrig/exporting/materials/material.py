@@ -1,0 +1,299 @@
+"""An appearance on its mesh, in the quantities that material formats have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import dipole, fresnel, skin_reflectance
+from model.skin import SkinAppearance
+from skinrig.errors import UsageError
+from skinrig.exporting.images import CAMERA, SRGB, Image
+from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
+from skinrig.exporting.materials.tangents import FramedMesh
+from skinrig.exporting.materials.udim import TiledMesh
+from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
+from skinrig.exporting.sealing import ExportError
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+COLOR_NOTE: Final = (
+    "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
+    "nothing else; no color calibration is in it"
+)
+NOTES: Final[dict[str, str]] = {
+    "base_color": "R_d (1 - F_diffuse): what light from inside adds below a dielectric whose "
+    "reflection formats take off by themselves; equal to the measured model for even light",
+    "specular_roughness": "square root of GGX's alpha, the lobe nearest to the measured mixture",
+    "specular_weight": "factor of the reflection of a smooth dielectric of specular_ior",
+    "specular_misfit": "what the single lobe leaves of the measured mixture, relative RMS",
+    "subsurface_radius": "mean free path at which light in the medium that OpenPBR finds for "
+    "the color decays as it does in the measured one, by exact transport",
+    "translucency": "1/sigma_tr as measured or assumed",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """What formats are written from.
+
+    Attributes
+    ----------
+    mesh
+        In mm, rig frame, with tangents.
+    shapes
+        Blend shapes: movement of `mesh`'s vertices by weight 1, mm, (V, 3) by name.
+    base_color, base_color_stderr
+        (H, W, 3), linear; see `COLOR_NOTE`. Not clipped. None: no standard error is known.
+    normals, normals_rig
+        (H, W, 3), unit: in the mesh's tangent frames, +Y up; and in the rig frame.
+    axes
+        (H, W, 3, 3), tangent, bitangent and normal under each texel.
+    covered
+        (H, W), texels of the mesh.
+    valid
+        (H, W), texels where all was measured; others are filled from around.
+    surface
+        Roughness, weight, misfit.
+    translucency_mm, translucency_stderr_mm
+        1/sigma_tr, (H, W, 3), mm.
+    deficit
+        1 - alpha' of the measured medium, (H, W, 3); that of R_d 0.001 to 0.999 beyond.
+    eta
+        Refractive index.
+    assumed
+        What was not measured.
+    source
+        "measured" or "simulated".
+    tiles
+        UDIM tiles of the mesh; the maps are of the first.
+    """
+
+    mesh: FramedMesh
+    shapes: dict[str, Floats]
+    base_color: Floats
+    base_color_stderr: Floats | None
+    normals: Floats
+    normals_rig: Floats
+    axes: NDArray[np.float64]
+    covered: Bools
+    valid: Bools
+    surface: surface_fit.SurfaceFit
+    translucency_mm: Floats
+    translucency_stderr_mm: Floats | None
+    deficit: NDArray[np.float64]
+    eta: float
+    assumed: tuple[str, ...]
+    source: str
+    tiles: tuple[int, ...] = (FIRST_TILE,)
+
+    @staticmethod
+    def of(appearance: SkinAppearance, mesh_file: Path | None = None) -> Material:
+        """Return the material of a dome's or a fitted appearance.
+
+        Parameters
+        ----------
+        appearance
+            With position, normals, r_d, lobes and mesh.
+        mesh_file
+            Another mesh with the same texture coordinates on tile 1001, perhaps with more on other
+            tiles; .npz, .obj, .ply, .gltf or .glb.
+
+        Raises
+        ------
+        model.skin_reflectance.SkinReflectanceError, skinrig.rendering.geometry.GeometryError,
+        rigsim.geometry.mesh.MeshError, ExportError
+            Naming the map or file that is missing or does not fit.
+        """
+        from skinrig.rendering.geometry import FittedSurface, own_mesh
+
+        model = skin_reflectance.assemble(appearance)
+        own = own_mesh(appearance)
+        mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)
+        surface = FittedSurface.of(model, mesh.first(), rest=own)
+        framed = FramedMesh.of(mesh)
+        # frames of the whole mesh: at a border of tiles a renderer has no others
+        on_maps = framed.only(mesh.tile == FIRST_TILE)
+        axes, covered = on_maps.texel_frames(surface.atlas.size)
+        turned = tangents.to_tangent(surface.normals, axes, covered)
+        inside = 1.0 - fresnel.diffuse_external(model.eta)
+        r_d = np.nan_to_num(model.r_d)
+        stderr = model.r_d_stderr
+        depth = model.translucency_mm
+        usual = np.median(depth[model.valid], axis=0) if model.valid.any() else np.ones(3)
+        known = np.isfinite(depth) & (depth > 0.0)
+        return Material(
+            mesh=framed,
+            shapes={n: d[framed.source].astype(np.float32) for n, d in mesh.shapes.items()},
+            base_color=(inside * r_d).astype(np.float32),
+            base_color_stderr=None if stderr is None else (inside * stderr).astype(np.float32),
+            normals=tangents.filled(turned, model.valid & covered),
+            normals_rig=np.asarray(surface.normals, np.float32),
+            axes=axes,
+            covered=covered,
+            valid=model.valid & covered,
+            surface=surface_fit.fit(model.lobes, np.nan_to_num(model.weights), eta=model.eta),
+            translucency_mm=np.where(known, depth, usual).astype(np.float32),
+            translucency_stderr_mm=model.translucency_stderr_mm,
+            deficit=deficit_of(r_d, model.eta),
+            eta=model.eta,
+            assumed=model.assumed,
+            source=appearance.source,
+            tiles=mesh.tiles,
+        )
+
+    @property
+    def radius_mm(self) -> Floats:
+        """Mean free path, (H, W, 3), mm; see :mod:`skinrig.exporting.materials.subsurface_radius`."""
+        found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
+        return found.astype(np.float32)
+
+    def left_out_of_mesh(self, delivery: Delivery) -> list[tuple[str, str]]:
+        """Return what the mesh leaves out, and why: holes of a scan, maps of other tiles.
+
+        Raises
+        ------
+        skinrig.errors.UsageError
+            For several tiles where files have no numbers.
+        """
+        if self.tiles[1:] and delivery.udim == "none":
+            numbers = ", ".join(map(str, self.tiles))
+            raise UsageError(
+                f"--udim: got none, but the mesh reaches over tiles {numbers}, expected dot or "
+                "underscore"
+            )
+        holes = self.mesh.holes()
+        told = [
+            (f"the surface at {holes} holes", "the scan has none there; --mesh takes a whole one")
+        ]
+        return (told if holes else []) + [
+            (f"maps of tile {tile}", f"maps are of tile {FIRST_TILE}: medians and flat normals")
+            for tile in self.tiles[1:]
+        ]
+
+    def usual_radius_mm(self) -> list[float]:
+        """Return the median of `radius_mm` over the valid texels, red, green, blue."""
+        shown = self.radius_mm[self.valid] if self.valid.any() else self.radius_mm
+        return [float(r) for r in np.median(shown.reshape(-1, 3), axis=0)]
+
+    @property
+    def specular_weight(self) -> Floats:
+        """The surface's weight, held in [0, 1] as formats demand, (H, W)."""
+        return np.clip(self.surface.weight, 0.0, 1.0)
+
+    def sigma_tr(self) -> dict[str, Any]:
+        """Return medians over valid texels, as JSON values for formats without subsurface light."""
+        shown = self.translucency_mm[self.valid] if self.valid.any() else self.translucency_mm
+        depth = np.median(shown.reshape(-1, 3), axis=0)
+        return {
+            "sigma_tr_per_mm": [float(1.0 / d) for d in depth],
+            "translucency_mm": [float(d) for d in depth],
+            "mean_free_path_mm": self.usual_radius_mm(),
+            "channels": "red, green, blue; median over the valid texels",
+            "assumed": list(self.assumed),
+        }
+
+    def all_assumed(self, appearance: SkinAppearance) -> list[str]:
+        """Return what was assumed by the maps and by the model, each once."""
+        told = appearance.parameters.get("assumed", [])
+        before = [str(text) for text in told] if isinstance(told, list | tuple) else []
+        return list(dict.fromkeys([*before, *self.assumed]))
+
+    def figures(self) -> dict[str, Any]:
+        """Return how well the material stands for the model, as JSON values."""
+        on = self.valid if self.valid.any() else np.ones_like(self.valid)
+        weight, color = self.surface.weight[on], self.base_color[on]
+        return {
+            "texels": int(on.sum()),
+            "specular_misfit_median": float(np.median(self.surface.misfit[on])),
+            "specular_weight_above_1_share": float(np.mean(weight > 1.0)),
+            "base_color_outside_0_1_share": float(np.mean((color < 0.0) | (color > 1.0))),
+            "normals_behind_surface_share": float(np.mean(self.normals[on][:, 2] <= 1.1e-3)),
+        }
+
+    def image(self, name: str, delivery: Delivery) -> Image:
+        """Return one of the material's textures.
+
+        Parameters
+        ----------
+        name
+            "base_color", "normal", "specular_roughness", "specular_weight",
+            "subsurface_radius" (mm), "translucency" (mm), "specular_misfit", "mask".
+        delivery
+            Direction of the normals' green.
+        """
+        if name == "normal":
+            y = NORMAL_Y[delivery.normal_y]
+            flipped = self.normals * np.array([1.0, y, 1.0], np.float32)
+            green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
+            what = f"tangent space of the mesh's vertex frames, {green}, x and y and z in -1 to 1"
+            return Image(
+                name=name, values=flipped, unit="1", what=what, low=-1.0, high=1.0,
+                valid=self.valid, filler=(0.0, 0.0, 1.0),
+            )  # fmt: skip
+        simple: dict[str, tuple[Floats, str, str, float, float]] = {
+            "base_color": (self.base_color, "1", SRGB, 0.0, 1.0),
+            "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),
+            "specular_weight": (self.specular_weight, "1", "data", 0.0, 1.0),
+            "specular_misfit": (self.surface.misfit, "1", "data", 0.0, 1.0),
+            "subsurface_radius": (self.radius_mm, "mm", "data", 0.0, 4.0),
+            "translucency": (self.translucency_mm, "mm", "data", 0.0, 16.0),
+            "mask": (self.valid.astype(np.float32), "1", "data", 0.0, 1.0),
+        }
+        if name not in simple:
+            raise ExportError(f"texture: got {name!r}, expected one of {', '.join(simple)}")
+        values, unit, space, low, high = simple[name]
+        what = NOTES.get(name, "1 where all was measured")
+        if name == "base_color":
+            what = f"{what}; {COLOR_NOTE}"
+        return Image(
+            name=name, values=values, unit=unit, space=space, what=what, low=low, high=high,
+            valid=None if name == "mask" else self.valid,
+            filler=(0.0,) if name == "mask" else None,
+        )  # fmt: skip
+
+    def error_images(self) -> list[Image]:
+        """Return standard errors of what has them, and the mask."""
+        out = [self.image("mask", Delivery())]
+        for name, values, unit in (
+            ("base_color", self.base_color_stderr, "1"),
+            ("translucency", self.translucency_stderr_mm, "mm"),
+        ):
+            if values is not None:
+                what = f"standard error of {name}, 68 %"
+                out.append(
+                    Image(
+                        name=f"{name}_stderr",
+                        values=np.nan_to_num(values),
+                        unit=unit,
+                        space=CAMERA if name == "base_color" else "data",
+                        what=what,
+                        valid=self.valid,
+                    )
+                )
+        return out
+
+
+def deficit_of(r_d: NDArray[np.floating[Any]], eta: float) -> NDArray[np.float64]:
+    """Return 1 - alpha' of the medium of an albedo, looked up between 1 000 exact values.
+
+    Parameters
+    ----------
+    r_d
+        Any shape; held within 0.001 to 0.999.
+    eta
+        Refractive index over that of air.
+
+    Examples
+    --------
+    >>> deficit_of(np.array([0.436, 7.0]), 1.3).round(3).tolist()
+    [0.041, 0.0]
+    """
+    nodes = np.linspace(0.001, 0.999, 999)
+    root = np.sqrt(dipole.invert_to_deficit(nodes, eta))  # smooth at an albedo of 1, too
+    return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)

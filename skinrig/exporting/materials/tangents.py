@@ -1,0 +1,254 @@
+"""Frames of a mesh that normal maps are given in, as renderers rebuild them.
+
+A tangent-space normal means something only in the frame it was baked in. Frames here follow the
+rules most programs share: at each vertex the direction of growing u, averaged over the triangles
+by their angle and laid into the plane across the vertex normal; the third axis is the cross product
+times the chart's handedness; frames are interpolated over triangles and not made orthogonal again.
+
+References
+----------
+Mikkelsen 2008, Simulation of Wrinkled Surfaces Revisited, section 2.3 and appendix (MikkTSpace).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.geometry.mesh import Mesh
+from skinrig.exporting.materials.udim import TiledMesh
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LEAST = 1e-12
+LEAST_VOLUME = 1e-6
+"""Of a frame: below it the texture is folded, and no normal is told."""
+LEAST_Z = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramedMesh:
+    """A mesh with a tangent at each vertex.
+
+    Attributes
+    ----------
+    vertices_mm : ndarray of float32, shape (V, 3)
+    normals : ndarray of float32, shape (V, 3)
+    uv : ndarray of float32, shape (V, 2)
+        (0, 0) is bottom left.
+    tangents : ndarray of float32, shape (V, 4)
+        Unit vector along growing u, and the sign of the third axis: bitangent, along growing v, is
+        sign * cross(normal, tangent).
+    faces : ndarray of int32, shape (F, 3)
+    source : ndarray of int64, shape (V,)
+        The vertex of the mesh it was made of: mirrored charts have vertices of their own.
+    """
+
+    vertices_mm: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    tangents: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    source: NDArray[np.int64]
+
+    @staticmethod
+    def of(mesh: Mesh | TiledMesh) -> FramedMesh:
+        """Return a mesh with its tangents.
+
+        Examples
+        --------
+        >>> from rigsim.geometry.mesh import build_mesh
+        >>> flat = build_mesh([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]],
+        ...                   [[0, 0], [1, 0], [0, 1]])
+        >>> FramedMesh.of(flat).tangents[0].tolist()
+        [1.0, 0.0, 0.0, 1.0]
+        """
+        points = mesh.vertices_mm.astype(np.float64)
+        uv = mesh.uv.astype(np.float64)
+        along_u, turn = _face_tangents(points[mesh.faces], uv[mesh.faces])
+        sign = np.where(turn >= 0.0, 1, -1)
+        # a vertex that mirrored and plain charts share stands for two
+        corner_keys = 2 * mesh.faces.astype(np.int64) + (sign < 0)[:, None]
+        keys, faces = np.unique(corner_keys.reshape(-1), return_inverse=True)
+        source, signs = keys // 2, np.where(keys % 2 == 1, -1.0, 1.0)
+        faces = faces.reshape(-1, 3)
+        normals = mesh.normals[source].astype(np.float64)
+        total = np.zeros((len(keys), 3))
+        for corner in range(3):
+            vertex = faces[:, corner]
+            normal = normals[vertex]
+            here = points[mesh.faces[:, corner]]
+            first = _across(points[mesh.faces[:, (corner + 1) % 3]] - here, normal)
+            last = _across(points[mesh.faces[:, (corner + 2) % 3]] - here, normal)
+            angle = np.arccos(np.clip(np.sum(first * last, axis=1), -1.0, 1.0))
+            known = np.abs(turn) > 0.0
+            np.add.at(total, vertex, (angle * known)[:, None] * _across(along_u, normal))
+        tangent = _unit(total)
+        lost = np.linalg.norm(tangent, axis=1) < 0.5
+        tangent[lost] = _any_across(normals[lost])
+        return FramedMesh(
+            mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source],
+            np.column_stack([tangent, signs]).astype(np.float32), faces.astype(np.int32), source,
+        )  # fmt: skip
+
+    def only(self, faces: Bools) -> FramedMesh:
+        """Return the mesh with some of its faces, (F,), all vertices and their frames."""
+        return replace(self, faces=self.faces[faces])
+
+    def holes(self) -> int:
+        """Return how many rims connected surfaces have beside one each, seams of charts apart.
+
+        Examples
+        --------
+        >>> from rigsim.geometry.mesh import build_mesh
+        >>> square = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
+        >>> flat = build_mesh(square, [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]])
+        >>> FramedMesh.of(flat).holes()
+        0
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        _, welded = np.unique(self.vertices_mm, axis=0, return_inverse=True)
+        faces = welded.reshape(-1)[self.faces]
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        found, count = np.unique(edges, axis=0, return_counts=True)
+        rim = found[count == 1]
+        side = int(welded.max()) + 1
+
+        def parts(pairs: NDArray[np.intp]) -> int:
+            joined = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), (side, side))
+            labels = connected_components(joined, directed=False)[1]
+            return len(np.unique(labels[rim[:, 0]]))
+
+        return parts(rim) - parts(found)
+
+    def texel_frames(self, size: int) -> tuple[Floats, Bools]:
+        """Return the interpolated axes under each texel.
+
+        Parameters
+        ----------
+        size
+            Texels a side.
+
+        Returns
+        -------
+        axes : ndarray, shape (size, size, 3, 3)
+            Rows are tangent, bitangent and normal, in the mesh's frame; row 0 is v = 1.
+        covered : ndarray of bool, shape (size, size)
+        """
+        from reconstruction.surface.texture_fill import rasterize
+
+        texels = rasterize(self.uv[self.faces].astype(np.float64), size)
+        covered = texels.covered
+        corners = self.faces[texels.face[covered]]
+        share = texels.weight[covered].astype(np.float64)
+        weights = np.column_stack([1.0 - share.sum(axis=1), share])
+        tangent = self.tangents.astype(np.float64)
+        normal = self.normals.astype(np.float64)
+        bitangent = tangent[:, 3:] * np.cross(normal, tangent[:, :3])
+        axes = np.broadcast_to(np.eye(3), (size, size, 3, 3)).copy()
+        for row, values in enumerate((tangent[:, :3], bitangent, normal)):
+            mixed = np.einsum("nk,nkc->nc", weights, values[corners])
+            axes[covered, row] = _unit(mixed) if row == 2 else mixed
+        return axes, covered
+
+
+def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.float32]:
+    """Return normals in their texels' frames.
+
+    Parameters
+    ----------
+    normals
+        Unit vectors in the frame of the axes, (H, W, 3).
+    axes, covered
+        See :meth:`FramedMesh.texel_frames`.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, 3)
+        Unit vectors whose decoding is :func:`from_tangent`; (0, 0, 1) where nothing is covered.
+        The third component is above 0 as a map must have it: normals that face away from the
+        surface are laid onto its horizon.
+    """
+    given = np.asarray(normals)
+    good = covered & np.isfinite(given).all(axis=-1)
+    out = np.zeros(given.shape, np.float32)
+    out[..., 2] = 1.0
+    world = given[good].astype(np.float64)
+    tangent, bitangent, normal = (axes[..., row, :][good] for row in range(3))
+    # n is along n' A with the axes as rows of A: the adjugate, as renderers interpolate A
+    volume = np.sum(np.cross(tangent, bitangent) * normal, axis=-1)
+    found = np.empty_like(world)
+    found[:, 0] = np.sum(np.cross(bitangent, normal) * world, axis=-1)
+    found[:, 1] = np.sum(np.cross(normal, tangent) * world, axis=-1)
+    found[:, 2] = np.sum(np.cross(tangent, bitangent) * world, axis=-1)
+    found = _unit(found * np.sign(volume)[:, None])
+    found[:, 2] = np.maximum(found[:, 2], LEAST_Z)
+    found[np.abs(volume) < LEAST_VOLUME] = (0.0, 0.0, 1.0)
+    out[good] = _unit(found)
+    return out
+
+
+def filled(tangent_normals: ArrayLike, valid: Bools) -> NDArray[np.float32]:
+    """Return tangent-space normals with what was not measured filled from around, (H, W, 3).
+
+    In its texel's frame relief goes on beyond an edge. Filled in the frame of the rig instead, the
+    normal of one part of a face would be laid onto the horizon of another.
+
+    Parameters
+    ----------
+    tangent_normals
+        Unit vectors, (H, W, 3).
+    valid
+        Texels that keep theirs, (H, W).
+
+    Examples
+    --------
+    >>> tilted = np.full((8, 8, 3), (0.6, 0.0, 0.8)) * np.eye(8, dtype=bool)[..., None]
+    >>> filled(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
+    [0.6000000238418579, 0.0, 0.800000011920929]
+    """
+    from reconstruction.surface.texture_fill import push_pull
+
+    given = np.asarray(tangent_normals, np.float32)
+    if not valid.any():
+        return np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), given.shape).copy()
+    spread = push_pull(given, valid.astype(np.float32)).values.astype(np.float64)
+    spread[..., 2] = np.maximum(spread[..., 2], LEAST_Z)
+    return np.where(valid[..., None], given, _unit(spread)).astype(np.float32)
+
+
+def from_tangent(tangent_normals: ArrayLike, axes: Floats) -> NDArray[np.float64]:
+    """Return unit normals in the frame of the axes, as a renderer decodes a map, (H, W, 3)."""
+    return _unit(np.einsum("hwk,hwkc->hwc", np.asarray(tangent_normals, np.float64), axes))
+
+
+def _face_tangents(points: Floats, uv: Floats) -> tuple[Floats, Floats]:
+    """Return each triangle's unit direction of growing u, and twice its signed area in uv."""
+    a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+    (au, av), (bu, bv) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+    area = au * bv - av * bu
+    sign = np.where(area < 0.0, -1.0, 1.0)
+    along = (bv[:, None] * a - av[:, None] * b) * sign[:, None]
+    return _unit(along), area
+
+
+def _across(vectors: Floats, normals: Floats) -> Floats:
+    """Return unit vectors laid into the plane across normals; 0 for those along them."""
+    return _unit(vectors - np.sum(vectors * normals, axis=1, keepdims=True) * normals)
+
+
+def _any_across(normals: Floats) -> Floats:
+    """Return some unit vector across each normal."""
+    axis = np.zeros_like(normals)
+    axis[np.arange(len(normals)), np.argmin(np.abs(normals), axis=1)] = 1.0
+    return _across(axis, normals)
+
+
+def _unit(vectors: Floats) -> Floats:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > LEAST, vectors / np.maximum(length, LEAST), 0.0)

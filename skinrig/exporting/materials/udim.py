@@ -1,0 +1,182 @@
+"""Meshes whose texture coordinates reach over several UDIM tiles.
+
+Maps are of one tile, 1001: u and v from 0 to 1. A head may have its back, or its teeth, on others.
+Its faces keep their coordinates; what lies on the first tile gets the maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
+from skinrig.exporting.options import FIRST_TILE
+from skinrig.exporting.sealing import ExportError
+
+ROW: Final = 10
+"""Tiles side by side before the next row begins."""
+ROUNDING: Final = 1e-5
+"""Of coordinates on a tile's border."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiledMesh:
+    """A mesh over any tiles.
+
+    Attributes
+    ----------
+    vertices_mm, faces, uv, normals, shapes
+        As of :class:`rigsim.geometry.mesh.Mesh`, texture coordinates of any tile.
+    tile
+        UDIM tile of each face, (F,).
+    """
+
+    vertices_mm: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    uv: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    tile: NDArray[np.intp]
+    shapes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(mesh: Mesh) -> TiledMesh:
+        """Return a mesh of the first tile."""
+        tile = np.full(len(mesh.faces), FIRST_TILE, np.intp)
+        return TiledMesh(
+            mesh.vertices_mm, mesh.faces, mesh.uv, mesh.normals, tile, dict(mesh.shapes)
+        )
+
+    @property
+    def tiles(self) -> tuple[int, ...]:
+        """Tiles that the mesh reaches over, the first one first, and there in any case."""
+        return (FIRST_TILE, *sorted(set(self.tile.tolist()) - {FIRST_TILE}))
+
+    def first(self) -> Mesh:
+        """Return the faces of the first tile.
+
+        Raises
+        ------
+        ExportError
+            When it has none there.
+        """
+        faces = self.faces[self.tile == FIRST_TILE]
+        if not len(faces):
+            raise ExportError(
+                f"--mesh: lies on tiles {', '.join(map(str, self.tiles[1:]))}, expected faces on "
+                f"{FIRST_TILE}, which the maps are of"
+            )
+        used, flat = np.unique(faces, return_inverse=True)
+        return build_mesh(
+            self.vertices_mm[used], flat.reshape(-1, 3), np.clip(self.uv[used], 0.0, 1.0),
+            self.normals[used], shapes={n: moved[used] for n, moved in self.shapes.items()},
+        )  # fmt: skip
+
+
+def tiles_of(uv: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Return the UDIM tile of each face.
+
+    Parameters
+    ----------
+    uv
+        (V, 2); u from 0 to 10, v from 0.
+    faces
+        (F, 3).
+
+    Raises
+    ------
+    ExportError
+        For a face across a border of tiles, or coordinates that no tile has.
+
+    Examples
+    --------
+    >>> corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [2.0, 0.0], [1.0, 2.0]])
+    >>> tiles_of(corners, np.array([[0, 1, 2], [1, 3, 2]])).tolist()
+    [1001, 1002]
+    """
+    corners = np.asarray(uv, np.float64)[faces]
+    cell = np.floor(corners.mean(axis=1))
+    inside = (corners >= cell[:, None] - ROUNDING) & (corners <= cell[:, None] + 1.0 + ROUNDING)
+    across = np.flatnonzero(~inside.all(axis=(1, 2)))
+    if len(across):
+        low, high = corners[across[0]].min(axis=0), corners[across[0]].max(axis=0)
+        raise ExportError(
+            f"--mesh: face {across[0]} reaches from {low.round(3).tolist()} to "
+            f"{high.round(3).tolist()} of the texture, expected each face on one UDIM tile; cut "
+            "its texture along the tiles' borders"
+        )
+    if len(cell) and (cell.min() < 0.0 or cell[:, 0].max() >= ROW):
+        raise ExportError(
+            f"--mesh: texture coordinates {corners.min():.3g} to {corners.max():.3g}, expected u "
+            f"from 0 to {ROW} and v from 0, as UDIM tiles are numbered"
+        )
+    return np.asarray(FIRST_TILE + cell[:, 0] + ROW * cell[:, 1], np.intp)
+
+
+def read(path: Path) -> TiledMesh:
+    """Read a mesh in mm, or a .gltf or .glb in m, with texture coordinates over any tiles.
+
+    Raises
+    ------
+    rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.errors.BlendShapeError
+        The file is missing, damaged, or no mesh that maps can be laid on.
+    ExportError
+        See `tiles_of`.
+    """
+    vertices, faces, uv, shapes = _contents(path)
+    if uv.min() >= -ROUNDING and uv.max() <= 1.0 + ROUNDING:
+        inside = np.clip(uv, 0.0, 1.0)
+        return TiledMesh.of(build_mesh(vertices, faces, inside, shapes=shapes))
+    # of a scaled copy of the texture: all else is checked as of any mesh
+    lowest, span = float(uv.min()), max(float(np.ptp(uv)), 1.0)
+    checked = build_mesh(vertices, faces, (uv - lowest) / (2.0 * span), shapes=shapes)
+    return TiledMesh(
+        checked.vertices_mm, checked.faces, np.asarray(uv, np.float32),
+        vertex_normals(checked.vertices_mm, checked.faces), tiles_of(uv, checked.faces),
+        dict(checked.shapes),
+    )  # fmt: skip
+
+
+Contents = tuple[
+    NDArray[np.floating], NDArray[np.integer], NDArray[np.floating],
+    dict[str, NDArray[np.floating]],
+]  # fmt: skip
+
+
+def _contents(path: Path) -> Contents:
+    """Return vertices, faces, texture coordinates and blend shapes as a file has them."""
+    from skinrig.blend_shapes import meshes as blend_shapes
+    from skinrig.rendering.geometry import read_mesh
+
+    if path.is_dir() or path.suffix.lower() in (".gltf", ".glb"):
+        read = blend_shapes.load(path)
+        return read.vertices_mm, read.faces, read.uv, dict(read.shapes)
+    try:
+        mesh = read_mesh(path)
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        # texture coordinates over more than one tile are the one thing that is allowed here
+        if "uv: got" not in str(error):
+            raise
+        return _several_tiles(path)
+    return mesh.vertices_mm, mesh.faces, mesh.uv, dict(mesh.shapes)
+
+
+def _several_tiles(path: Path) -> Contents:
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            shapes = {}
+            if {"shape_names", "shape_deltas_mm"} <= set(arrays.files):
+                names = [str(name) for name in arrays["shape_names"]]
+                shapes = dict(zip(names, arrays["shape_deltas_mm"], strict=True))
+            return arrays["vertices_mm"], arrays["faces"], arrays["uv"], shapes
+    import trimesh
+
+    loaded = trimesh.load(path, process=False, force="mesh")
+    uv = np.asarray(loaded.visual.uv, np.float64)
+    return np.asarray(loaded.vertices), np.asarray(loaded.faces), uv, {}

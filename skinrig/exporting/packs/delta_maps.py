@@ -1,0 +1,188 @@
+"""The pack of maps that digital humans are driven by: neutral maps, and what expressions change.
+
+Laid out as engines' face materials want it: a base color with up to three animated color maps
+(cm1 to cm3), a normal map with up to three animated wrinkle maps (wm1 to wm3), masks of their
+zones, and cavity, scatter and micro normal maps. Animated maps are deltas: colors of 512 x 512,
+normals of 1024 x 1024. How deltas are coded is ours, since no engine publishes a coding;
+``delta_maps.json`` says it, and the EXR files hold the numbers themselves.
+
+Colors come from the hemoglobin rig, whose maps lie on the flash camera's picture. They lie on a
+face's texture only where another appearance and landmarks of both tell how one lies on the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import wrinkles
+from model.skin import SkinAppearance
+from model.texture_resampling import resampled
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
+from skinrig.exporting.images import Image, ImageFolder
+from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.packs import color_deltas, detail_maps
+from skinrig.exporting.provenance import ORIENTATION, provenance
+from skinrig.exporting.sealing import ExportError, write_json
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+DOCUMENT: Final = "delta_maps.json"
+SCHEMA: Final = "skinrig.export.delta-maps/1"
+NORMAL_SIZE: Final = 1024
+COLOR_CODING: Final = "linear: shown = base + weight * delta; PNG: delta = 2 code / 65535 - 1"
+NORMAL_CODING: Final = (
+    "slopes n_x/n_z and n_y/n_z, green with the sign of normal_y: shown = slopes of normal + "
+    "weight * delta; PNG: delta = 2 code / 65535 - 1; slopes beyond 1 are clipped in PNG alone"
+)
+
+
+def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+    """Write the pack of a dynamic appearance.
+
+    Parameters
+    ----------
+    appearance
+        That `skinrig fit facial-color` or `skinrig fit wrinkles`, or both, made.
+    folder
+        Existing, empty.
+    delivery
+        States by `only` (the first three otherwise), green of normals, names of tiles; `onto` and
+        `landmarks` put colors on a texture.
+
+    Returns
+    -------
+    list of (str, str)
+        What was left out, and why.
+
+    Raises
+    ------
+    ExportError
+        For a folder that holds neither part, or states that it lacks.
+    """
+    parts = dynamic_appearance.parts_of(appearance)
+    if not {FACIAL_COLOR, WRINKLES, MICROSTRUCTURE} & set(parts):
+        raise ExportError(
+            f"metahuman: got {', '.join(parts) or 'maps that nothing was fitted to'}, expected "
+            "facial_color, wrinkles or microstructure; `skinrig fit facial-color`, `skinrig fit "
+            "wrinkles` and `skinrig fit microstructure` make them"
+        )
+    out = ImageFolder(folder, delivery)
+    left_out: list[tuple[str, str]] = []
+    told: dict[str, Any] = {}
+    known: set[str] = set()
+    if FACIAL_COLOR in parts:
+        told["color"], states = color_deltas.write(appearance, out, delivery, left_out)
+        known |= set(states)
+    else:
+        left_out.append(("base color, cm1 to cm3", "the folder holds no facial_color: run "
+                         "`skinrig fit facial-color`"))  # fmt: skip
+    if WRINKLES in parts:
+        told["wrinkles"], rows = _write_wrinkles(appearance, parts, out, delivery, left_out)
+        known |= set(rows)
+    else:
+        left_out.append(("normal, wm1 to wm3, masks, cavity", "the folder holds no wrinkles: run "
+                         "`skinrig fit wrinkles`"))  # fmt: skip
+    if MICROSTRUCTURE in parts:
+        details, rest = detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out, delivery)
+        told |= details
+        left_out += rest
+    else:
+        left_out.append(("micro normals", "the folder holds no microstructure: run "
+                         "`skinrig fit microstructure`"))  # fmt: skip
+    details, rest = detail_maps.scatter(delivery, out)
+    told |= details
+    left_out += rest
+    unknown = [name for name in delivery.only if name not in known]
+    if unknown:
+        raise ExportError(
+            f"--only: got {unknown[0]!r}, expected of {', '.join(sorted(known)) or 'no state'}"
+        )
+    green = "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)"
+    write_json(
+        folder / DOCUMENT,
+        {
+            **provenance(appearance),
+            "schema": SCHEMA,
+            "orientation": ORIENTATION,
+            "normal_y": green,
+            "color_coding": COLOR_CODING,
+            "normal_coding": NORMAL_CODING,
+            **told,
+            "files": dict(sorted(out.records.items())),
+            "left_out": [list(row) for row in left_out],
+        },
+    )
+    return left_out
+
+
+# wrinkles -------------------------------------------------------------------------------------
+
+
+def _write_wrinkles(
+    appearance: SkinAppearance, parts: Mapping[str, Any], out: ImageFolder, delivery: Delivery,
+    left_out: list[tuple[str, str]],
+) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
+    model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
+    rows = sorted({str(row) for layer in model.layers for row in layer.table.rows})  # type: ignore[union-attr]
+    fitted = [str(n) for n in parts[WRINKLES].get("expressions", [])]
+    have = [name for name in fitted if name in rows] + [n for n in rows if n not in fitted]
+    chosen = color_deltas.chosen(have, delivery, "wrinkles", left_out)
+    names = {f"wm{k}": row for k, row in enumerate(chosen, start=1)}
+    y = NORMAL_Y[delivery.normal_y]
+    known = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
+    slopes, valid = color_deltas.sized(np.asarray(model.base, np.float64), known, NORMAL_SIZE)
+    sign = np.array([1.0, y])
+    _write_normal("normal", slopes, y, valid, out, "neutral normals")
+    clipped = {}
+    for name, row in names.items():
+        shown = model.evaluate({row: 1.0})
+        moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
+        delta, _ = color_deltas.sized(moved, shown.valid, NORMAL_SIZE)
+        layers = np.concatenate([delta * sign, np.zeros((*delta.shape[:2], 1))], axis=-1)
+        image = Image(
+            name=f"{name}_delta", values=layers, unit="1", low=-1.0, high=1.0, valid=valid,
+            what=f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0",
+        )  # fmt: skip
+        out.exr(image)
+        out.png(image)
+        clipped[name] = float(np.mean(np.abs(delta[valid]) > 1.0)) if valid.any() else 0.0
+        _write_normal(f"{name}_normal", slopes + delta, y, valid, out, f"normals of {row}")
+    masks = {}
+    for number, layer in enumerate(model.layers):
+        zones = list(getattr(layer.table, "zones", ()))
+        for zone, mask in enumerate(layer.masks):
+            name = f"wrinkle_mask_{number}_{zone}"
+            sized = resampled(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
+            told = zones[zone] if zone < len(zones) else str(zone)
+            out.png(Image(name=name, values=sized, unit="1", low=0.0, high=1.0,
+                          what=f"zone {told}"))  # fmt: skip
+            masks[name] = told
+    hollows, rest = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
+    left_out += rest
+    if delivery.with_errors:
+        out.exr(Image(name="normal_mask", values=valid.astype(float), unit="1"))
+    return {
+        "size": NORMAL_SIZE, "layout": "the dome's texture", "maps": names, "masks": masks,
+        "measured_size": list(model.base.shape[:2]), "clipped_share": clipped,
+        "valid_share": float(valid.mean()), **hollows,
+    }, have  # fmt: skip
+
+
+def _write_normal(
+    name: str, slopes: Floats, y: float, valid: Bools, out: ImageFolder, what: str
+) -> None:
+    normals = wrinkles.decode(slopes) * np.array([1.0, y, 1.0])
+    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
+    out.png(
+        Image(name=name, values=normals, unit="1", low=-1.0, high=1.0, valid=valid,
+              what=f"{what}, tangent space over the smooth shape, {green}")
+    )  # fmt: skip

@@ -1,0 +1,214 @@
+"""Pictures of one light each with their light list, as programs for photometric stereo read.
+
+One camera's pictures as linear 16-bit TIFF on one common scale, and ``lights.lp``: a count, then
+a file name and a unit vector towards the light in each line; x right, y up, z to the camera.
+"""
+
+from __future__ import annotations
+
+from datetime import date, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.session import Session
+from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
+from skinrig.exporting.sessions.handing import allowed
+
+NAME: Final = "lp"
+LIST, POSITIONS, DOCUMENT = "lights.lp", "positions_mm.txt", "lights.json"
+SCHEMA: Final = "skinrig.export.lights/1"
+TOP: Final = 65535
+"""Code of saturated pixels; unsaturated ones stay below."""
+BRIGHT_SHARE: Final = 1e-4
+"""Share of a picture's values that may lie above the scale: single sparkles do not set it."""
+_UP = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
+
+
+def export_light_list(
+    session_path: str | Path,
+    out: str | Path,
+    *,
+    use: str,
+    camera: str | None = None,
+    calibration: str | Path | None = None,
+    today: date | None = None,
+    now: datetime | None = None,
+) -> Exported:
+    """Write one camera's pictures of a session with their light list; all of it, or nothing.
+
+    Parameters
+    ----------
+    session_path
+        SESSION/ of a dome, or of pictures that were imported with a list.
+    out
+        New folder.
+    use
+        What the copy is for; must lie within the consent's scope, on a day before it ends.
+    camera
+        Name of the view; None: the one that looks most along -z.
+    calibration
+        CALIBRATION/ whose lights and cameras are used; None: they stand as the rig was drawn.
+    today, now
+        Day on which consent is judged, and time in the manifest; None: the present.
+
+    Returns
+    -------
+    Exported
+        Lights that are dead, or whose place is not known, are left out and named.
+
+    Raises
+    ------
+    ConsentError
+        Where the subject has not agreed to the use, or not any more.
+    ExportError
+        For a session without single lights, a camera that it lacks, or a folder that exists.
+    ValueError
+        Where the session is damaged, or the calibration is not of its rig.
+    """
+    target = fresh(out)
+    session = allowed(session_path, use, today=today)
+    if not any(step.kind == "olat" for step in session.plan.steps):
+        kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
+        raise ExportError(
+            f"{session_path}: shows {kinds}, expected one light a picture: a session of the dome, "
+            "or of `skinrig import lp`"
+        )
+    return sealed(target, lambda part: _write(session, part, camera, calibration), now)
+
+
+def _write(
+    session: Session, folder: Path, camera: str | None, calibration: str | Path | None
+) -> list[tuple[str, str]]:
+    import tifffile
+
+    from reconstruction.pipeline.dome.calibrated import calibrated
+    from reconstruction.pipeline.dome.images import DomeImages
+    from reconstruction.pipeline.evidence import Evidence
+
+    evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
+    images = DomeImages(session)
+    dome = calibrated(evidence, images)
+    view = _view(images.views, dome.cameras, camera)
+    pose = dome.cameras[view]
+    good = [k for k in range(len(images.lights)) if dome.table.valid[k]]
+    left_out = [
+        (name, "the light is dead, or its place is not known")
+        for k, name in enumerate(images.lights)
+        if k not in good
+    ]
+    if len(good) < 3:
+        raise ExportError(f"{session.path}: has {len(good)} usable lights, expected at least 3")
+    places = in_camera_frame(dome.table.position_mm[good], pose.rotation)
+    toward = places / np.linalg.norm(places, axis=1, keepdims=True)
+    names = [f"{images.lights[k]}.tif" for k in good]
+
+    def picture(light: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        if "light_list" in session.manifest.extra:
+            return _imported(session, images.views[view], images.lights[light])
+        found = dome.image(view, _capture(images, light))
+        return found.rgb, found.valid
+
+    # twice through the pictures instead of all of them in memory
+    top = max(_top(*picture(k)) for k in good)
+    scale = (TOP - 1) / top if top > 0.0 else 1.0
+    clipped: dict[str, float] = {}
+    for k, name in zip(good, names, strict=True):
+        codes, clipped[name] = _coded(*picture(k), scale)
+        tifffile.imwrite(
+            folder / name, codes, photometric="minisblack" if codes.ndim == 2 else "rgb",
+            compression=None, metadata=None, software=False,
+        )  # fmt: skip
+    rows = [f"{n} {x:.9f} {y:.9f} {z:.9f}" for n, (x, y, z) in zip(names, toward, strict=True)]
+    (folder / LIST).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
+    near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
+    (folder / POSITIONS).write_text(near, encoding="ascii")
+    write_json(
+        folder / DOCUMENT,
+        {
+            "schema": SCHEMA,
+            "frame": "x right, y up, z towards the camera; directions from the rig's origin",
+            "encoding": f"linear camera values: fraction of full scale, per second of light where "
+            f"the exposure is known, = code / {scale:.9g}; {TOP} is saturated",
+            "code_per_rate": scale,
+            "clipped_share": clipped,
+            "camera": images.views[view],
+            "mm_per_px": dome.pixel_mm,
+            "near_lights": f"{POSITIONS}: mm around the rig's origin; `skinrig import lp DIR "
+            f"--lights DIR/{POSITIONS} --mm-per-px {dome.pixel_mm:.6g}`",
+            "source": session.source,
+            "inputs": evidence.hashes,
+            "assumed": list(evidence.assumed),
+            "consent": [session.manifest.to_json()["subject"]],
+            "left_out": [list(row) for row in left_out],
+        },
+    )
+    return left_out
+
+
+def in_camera_frame(
+    position_mm: NDArray[np.floating[Any]], rotation: NDArray[np.floating[Any]]
+) -> NDArray[np.float64]:
+    """Return places as light lists have them: x right, y up, z towards the camera.
+
+    Parameters
+    ----------
+    position_mm
+        (N, 3), rig frame.
+    rotation
+        (3, 3), rows are the camera's axes: right, down, forward.
+
+    Examples
+    --------
+    >>> ahead = np.array([[0.0, -10.0, 700.0]])
+    >>> in_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
+    [[0.0, -10.0, 700.0]]
+    """
+    return np.asarray((position_mm @ np.asarray(rotation).T) * _UP)
+
+
+def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
+    if wanted is None:
+        return int(np.argmin([camera.rotation[2, 2] for camera in cameras]))
+    if wanted not in names:
+        raise ExportError(f"--camera: got {wanted!r}, expected one of {', '.join(names)}")
+    return names.index(wanted)
+
+
+def _capture(images: Any, light: int) -> int:
+    return int(images.captures.index((images.lights[light], -1)))
+
+
+def _imported(
+    session: Session, view: str, light: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return a picture that came with a light list, which need not say its exposure."""
+    from capture import raw
+
+    record = next(one for one in session.frames("olat", light=light) if one.camera == view)
+    frame = session.read(record)
+    time = float(record.settings.get("exposure_s", 0.0)) * float(record.settings.get("iso", 100.0))
+    per_time = np.float32(1.0 / time if time > 0.0 else 1.0)
+    if frame.pattern == "MONO":
+        (black,) = frame.black
+        values = (frame.cfa.astype(np.float32) - black) / np.float32(frame.white - black)
+        return values * per_time, frame.cfa < frame.white
+    image = raw.linear_rgb(frame, demosaic="superpixel")
+    return image.rgb * per_time, image.valid
+
+
+def _top(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
+    shown = values[valid]
+    return float(np.quantile(shown, 1.0 - BRIGHT_SHARE)) if shown.size else 0.0
+
+
+def _coded(
+    values: NDArray[np.float32], valid: NDArray[np.bool_], scale: float
+) -> tuple[NDArray[np.uint16], float]:
+    codes = np.rint(np.nan_to_num(values.astype(np.float64)) * scale)
+    beyond = codes > TOP - 1
+    beyond = (beyond if codes.ndim == 2 else beyond.any(axis=-1)) | ~valid
+    codes[beyond] = TOP
+    return np.clip(codes, 0, TOP).astype(np.uint16), float(beyond.mean())

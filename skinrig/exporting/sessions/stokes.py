@@ -1,0 +1,236 @@
+"""Polarized pictures of the gradient sphere as Stokes images, one for each state and pattern.
+
+Each pattern is shown with the analyser along the light's polarization, and across it. Their sum is
+all light, S0; their difference is S1, along the analyser's axis: light that the surface reflected.
+S2 and S3 need an analyser at 45 degrees and a retarder, which the rig does not have. The sensor is
+monochrome: its one band bears the mean wavelength of the LEDs' light behind it.
+
+References
+----------
+Fichet, Pacanowski, Wilkie 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3).
+Ma et al. 2007, Rapid Acquisition of Specular and Diffuse Normal Maps, EGSR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import date, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.session import Session
+from skinrig.exporting.images import write_channels
+from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
+from skinrig.exporting.sessions.handing import allowed
+from skinrig.exporting.sessions.spectral import LAYOUT, channel
+
+Float32 = NDArray[np.float32]
+
+NAME: Final = "stokes"
+DOCUMENT: Final = "stokes.json"
+SCHEMA: Final = "skinrig.export.stokes/1"
+PARALLEL, CROSSED = "parallel", "crossed"
+S0, S1 = "S0", "S1"
+
+
+def export_stokes(
+    session_path: str | Path,
+    out: str | Path,
+    *,
+    use: str,
+    only: Sequence[str] = (),
+    with_errors: bool = False,
+    calibration: str | Path | None = None,
+    today: date | None = None,
+    now: datetime | None = None,
+) -> Exported:
+    """Write a gradient-sphere session's pictures as Stokes images; all of them, or nothing.
+
+    Parameters
+    ----------
+    session_path
+        SESSION/ of the gradient sphere.
+    out
+        New folder.
+    use
+        What the copy is for; must lie within the consent's scope, on a day before it ends.
+    only
+        States such as "a000_n0"; empty: all.
+    with_errors
+        Whether standard errors are written beside each image, and the mask of each state.
+    calibration
+        CALIBRATION/ whose sensor tells how noisy frames are; None: as they say of themselves.
+    today, now
+        Day on which consent is judged, and time in the manifest; None: the present.
+
+    Returns
+    -------
+    Exported
+        Patterns that were not taken with both polarizations are left out and named.
+
+    Raises
+    ------
+    ConsentError
+        Where the subject has not agreed to the use, or not any more.
+    ExportError
+        For a session of another rig, a state that it lacks, or a folder that exists.
+    ValueError
+        Where the session is damaged.
+    """
+    target = fresh(out)
+    session = allowed(session_path, use, today=today)
+    if not session.frames("gradient"):
+        kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
+        raise ExportError(
+            f"{session_path}: shows {kinds}, expected patterns of the gradient sphere; of the "
+            "flash rig take `skinrig export APPEARANCE --to spectral`"
+        )
+    return sealed(
+        target, lambda part: _write(session, part, tuple(only), with_errors, calibration), now
+    )
+
+
+def components(parallel: Float32, crossed: Float32) -> dict[str, Float32]:
+    """Return S0 and S1 of pictures behind an analyser along an axis, and across it.
+
+    Parameters
+    ----------
+    parallel, crossed
+        Of one shape, any unit. Through an analyser half of the light that is not polarized passes.
+
+    Examples
+    --------
+    >>> found = components(np.array([0.5, 0.25]), np.array([0.5, 0.0]))
+    >>> found["S0"].tolist(), found["S1"].tolist()
+    ([1.0, 0.25], [0.0, 0.25])
+    """
+    return {S0: parallel + crossed, S1: parallel - crossed}
+
+
+def _write(
+    session: Session, folder: Path, only: tuple[str, ...], with_errors: bool,
+    calibration: str | Path | None,
+) -> list[tuple[str, str]]:  # fmt: skip
+    from reconstruction.pipeline.evidence import Evidence
+    from reconstruction.pipeline.gradient.images import GradientImages
+    from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
+
+    evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
+    shots = session.frames("gradient")
+    images = GradientImages(session, noise=_noise(evidence, shots[0].camera))
+    names = [state.name for state in images.states]
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        raise ExportError(f"--only: got {unknown[0]!r}, expected of {', '.join(names)}")
+    axis = session.rig.view(shots[0].camera).analyser_axis_deg
+    if axis is None:
+        raise ExportError(
+            f"{session.path}: the rig does not say how its analyser lies; give the view "
+            "analyser_axis_deg"
+        )
+    band = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
+    what = (
+        "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
+        f"the axis less across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
+        "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
+    )
+    header = {
+        "spectralLayoutVersion": LAYOUT, "emissiveUnits": "1",
+        "polarisationHandedness": "right", "comments": what,
+    }  # fmt: skip
+    files: dict[str, Any] = {}
+    left_out: list[tuple[str, str]] = []
+    for state in images.states:
+        if only and state.name not in only:
+            continue
+        patterns = images.of(state)
+        for pattern in sorted({pattern for pattern, _ in patterns.values}):
+            pair = {(pattern, turned) for turned in (PARALLEL, CROSSED)}
+            if not pair <= set(patterns.values):
+                left_out.append((f"{state.name} {pattern}", "was taken with one polarization only"))
+                continue
+            stem = file_stem(state.name, pattern)
+            found = components(
+                patterns.values[pattern, PARALLEL], patterns.values[pattern, CROSSED]
+            )
+            write_channels(folder / f"{stem}.exr", dict(zip(band, found.values(), strict=True)),
+                           header)  # fmt: skip
+            variance = patterns.variance[pattern, PARALLEL] + patterns.variance[pattern, CROSSED]
+            files[f"{stem}.exr"] = {
+                "state": state.name, "pattern": pattern,
+                **_figures(found, np.sqrt(variance), patterns.valid),
+            }  # fmt: skip
+            if with_errors:
+                told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
+                write_channels(folder / f"{stem}.stderr.exr", {"Y": np.sqrt(variance)}, told)
+        if with_errors:
+            mask = patterns.valid.astype(np.float32)
+            write_channels(folder / f"stokes_{state.name}.valid.exr", {"Y": mask}, {"unit": "1"})
+    if not files:
+        raise ExportError(
+            f"{session.path}: no pattern was taken both along and across the analyser's axis, "
+            "expected `skinrig plan gradient` with both polarizations"
+        )
+    write_json(
+        folder / DOCUMENT,
+        {
+            "schema": SCHEMA,
+            "what": what,
+            "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
+            "channels": band,
+            "reference_axis_deg": axis,
+            "image_frame": "against the picture's x axis S1 is "
+            f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
+            "orientation": "as the camera sees it, row 0 is the top",
+            "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
+            "source": session.source,
+            "inputs": evidence.hashes,
+            "assumed": list(evidence.assumed),
+            "consent": [session.manifest.to_json()["subject"]],
+            "files": files,
+            "left_out": [list(row) for row in left_out],
+        },
+    )
+    return left_out
+
+
+def _noise(evidence: Any, camera: str) -> Any:
+    from capture.calibration.sensor import SensorCalibration
+    from reconstruction.pipeline.dome.images import SensorNoise
+
+    serial = evidence.session.rig.view(camera).serial
+    found = evidence.load("sensor", [serial], "the frames are as noisy as they say of themselves")
+    if found is None:
+        return None
+    known = SensorCalibration.from_calibration(found, serial)
+    return SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
+
+
+def file_stem(state: str, pattern: str) -> str:
+    """Return a Stokes image's name without suffix.
+
+    Examples
+    --------
+    >>> file_stem("a000_n0", "-x")
+    'stokes_a000_n0_minus_x'
+    """
+    return f"stokes_{state}_{pattern.replace('-', 'minus_')}"
+
+
+def _figures(
+    found: Mapping[str, Float32], stderr: Float32, valid: NDArray[np.bool_]
+) -> dict[str, float]:
+    """Return what is worth knowing of an image before it is opened, as JSON values."""
+    if not valid.any():
+        return {"valid_share": 0.0}
+    total, along = found[S0][valid].astype(np.float64), found[S1][valid].astype(np.float64)
+    return {
+        "valid_share": float(valid.mean()),
+        "degree_of_polarization": float(along.sum() / total.sum()) if total.sum() > 0.0 else 0.0,
+        # noise alone makes a difference exceed its sum, or fall below 0
+        "beyond_s0_by_3_stderr_share": float(np.mean(np.abs(along) - total > 3.0 * stderr[valid])),
+    }

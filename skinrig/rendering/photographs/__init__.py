@@ -1,0 +1,1 @@
+"""Renderings compared with held-out photographs."""

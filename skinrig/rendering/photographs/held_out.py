@@ -1,0 +1,205 @@
+"""Photographs of a dome session that no fit has seen, each with its camera and light."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capture.session import Session
+from model.skin import SkinAppearance
+from reconstruction.pipeline.dome.calibrated import Dome, calibrated, seen_from
+from reconstruction.pipeline.dome.images import DomeImages
+from reconstruction.pipeline.dome.registration import register
+from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.hold_out import HoldOut
+from reconstruction.scan.repair import TriangleMesh
+from reconstruction.surface.estimates import LEAST_LIGHTS
+from skinrig.rendering.camera import Camera, binned
+from skinrig.rendering.geometry import own_mesh
+from skinrig.rendering.lights import Light
+from skinrig.rendering.photographs.errors import Photograph
+
+
+class PhotographsError(ValueError):
+    """A session without photographs to compare with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One photograph's names and why it is not in the fit."""
+
+    view: str
+    light: str
+    held_out: str
+    """ "light", "view", "light and view", or "session"."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photographs:
+    """The photographs that a fitted model can be judged by.
+
+    Attributes
+    ----------
+    shots
+        All of them, the lights of a view together.
+    assumed
+        What was taken for granted, one line each.
+    """
+
+    shots: tuple[Shot, ...]
+    assumed: tuple[str, ...]
+    _dome: Dome
+    """In the frame of the maps."""
+    _session: Session
+    _white_mm: tuple[float, ...]
+    """Distance of each light of the dome at which white is taken."""
+
+    @staticmethod
+    def of(
+        session: str | Path, appearance: SkinAppearance, *, calibration: str | Path | None = None
+    ) -> Photographs:
+        """Find the frames of a session that an appearance was not fitted to.
+
+        Parameters
+        ----------
+        session
+            SESSION/ folder of the dome: the one that was fitted, of which lights or views were
+            held out, or another one of the same face.
+        appearance
+            What was fitted.
+        calibration
+            CALIBRATION/ folder; None: cameras and lights stand as drawn.
+
+        Raises
+        ------
+        PhotographsError
+            The session was fitted to whole, or is none of the dome.
+        EvidenceError, CalibrationError
+            It lacks frames, or a calibration is damaged or of another rig.
+        """
+        opened = Session.open(session)
+        if not any(step.kind == "olat" for step in opened.plan.steps):
+            raise PhotographsError(
+                f"{opened.path}: has no photographs under one light each; give one of the "
+                "dome with a face"
+            )
+        evidence = Evidence.of(opened, calibration, state="neutral", on_date=None)
+        dome = calibrated(evidence, DomeImages(opened))
+        same = appearance.inputs.get("session") == opened.content_hash
+        held = _held_out(appearance) if same else HoldOut()
+        if same and not held:
+            raise PhotographsError(
+                f"{opened.path}: the model was fitted to all of its photographs; fit again "
+                "with `skinrig reconstruct --hold-out lights=NAMES,views=NAMES`, or compare with "
+                "another session of the same face"
+            )
+        good = {n for n, v in zip(dome.lights.names, dome.lights.valid, strict=True) if v}
+        shots = [
+            Shot(view, light, _why(held, light, view) if same else "session")
+            for view in dome.images.views
+            for light in dome.images.lights
+            if light in good and (not same or held.holds(light, view))
+        ]
+        if not shots:
+            raise PhotographsError(f"{opened.path}: none of its lights is calibrated")
+        assumed = list(evidence.assumed)
+        away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
+        if not same:
+            dome, told = _where_the_head_is(dome, appearance)
+            assumed.append(told)
+        motion = appearance.parameters.get("motion", {})
+        if isinstance(motion, dict) and motion.get("still") is False:
+            moved = float(motion.get("displacement_mm_max", 0.0))
+            assumed.append(f"the head held still; it moved by up to {moved:.1f} mm")
+        return Photographs(tuple(shots), tuple(assumed), dome, opened, away)
+
+    @property
+    def subject(self) -> str:
+        """Pseudonym of the face."""
+        return self._session.subject.pseudonym
+
+    def photograph(self, shot: Shot) -> Photograph:
+        """Return a photograph in the unit of `skinrig.rendering.photographs.errors`."""
+        images = self._dome.images
+        capture = images.captures.index((shot.light, -1))
+        image = self._dome.image(images.views.index(shot.view), capture)
+        white = self._white(shot.light)
+        return Photograph(
+            image.rgb.astype(np.float64) / white,
+            image.variance.astype(np.float64) / white**2,
+            image.valid,
+        )
+
+    def camera(self, shot: Shot) -> Camera:
+        """Return the calibrated camera of a photograph, on its pixels."""
+        pose = self._dome.cameras[self._dome.images.views.index(shot.view)]
+        return dataclasses.replace(binned(pose, 2), serial=shot.view)
+
+    def light(self, shot: Shot) -> Light:
+        """Return the calibrated light of a photograph, of intensity 1 in all channels."""
+        radius = self._session.rig.light(shot.light).radius_mm
+        lamp = Light.of_table(self._dome.table, shot.light, radius_mm=radius)
+        row = self._dome.table.names.index(shot.light)
+        return dataclasses.replace(
+            lamp, intensity=(1.0, 1.0, 1.0), reference_mm=self._white_mm[row]
+        )
+
+    def chosen(self, count: int | None) -> tuple[Shot, ...]:
+        """Return so many of the shots, even over views and lights; None: all."""
+        return _evenly(self.shots, count)
+
+    def _white(self, light: str) -> np.ndarray:
+        """Return what white at the rig's origin shows in the images' unit, shape (3,)."""
+        row = self._dome.table.names.index(light)
+        return np.asarray(self._dome.table.intensity[row] / self._white_mm[row] ** 2, np.float64)
+
+
+def _where_the_head_is(dome: Dome, appearance: SkinAppearance) -> tuple[Dome, str]:
+    """Return the dome about the head as it sat when it was fitted, and words for it.
+
+    Only where the head is comes from the photographs, from their shading, and nothing of its skin.
+    """
+    mesh = own_mesh(appearance)
+    welded, index = np.unique(mesh.vertices_mm.round(4), axis=0, return_inverse=True)
+    lights = int(np.count_nonzero(dome.lights.valid))
+    if lights < LEAST_LIGHTS:
+        return dome, (
+            "the head sits where it sat in the session that was fitted: "
+            f"{lights} lights are too few to find it, {LEAST_LIGHTS} would do"
+        )
+    fit = register(dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces]))
+    turn_deg = np.degrees(np.arccos(np.clip((np.trace(fit.rotation) - 1) / 2, -1, 1)))
+    before = (fit.center_mm - fit.translation_mm) @ fit.rotation
+    moved_mm = np.linalg.norm(fit.center_mm - before)
+    off_mm, off_deg = np.linalg.norm(fit.stderr[3:]), np.degrees(np.linalg.norm(fit.stderr[:3]))
+    return seen_from(dome, fit.rotation, fit.translation_mm), (
+        f"the head sits {moved_mm:.2f} +- {off_mm:.2f} mm and {turn_deg:.2f} +- {off_deg:.2f} "
+        "degrees from where it sat in the session that was fitted, by the shading of these "
+        "photographs"
+    )
+
+
+def _held_out(appearance: SkinAppearance) -> HoldOut:
+    record = appearance.parameters.get("held_out", {})
+    if not isinstance(record, dict):
+        return HoldOut()
+    return HoldOut(*(tuple(str(n) for n in record.get(name, ())) for name in ("lights", "views")))
+
+
+def _why(held: HoldOut, light: str, view: str) -> str:
+    kinds = [kind for kind, out in (("light", light in held.lights), ("view", view in held.views))
+             if out]  # fmt: skip
+    return " and ".join(kinds)
+
+
+def _evenly(shots: Sequence[Shot], count: int | None) -> tuple[Shot, ...]:
+    if count is None or count >= len(shots):
+        return tuple(shots)
+    if count < 1:
+        raise PhotographsError(f"photographs: got {count}, expected at least 1")
+    places = np.floor((np.arange(count) + 0.5) * len(shots) / count).astype(int)
+    return tuple(shots[k] for k in places)

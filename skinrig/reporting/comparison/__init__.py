@@ -1,0 +1,1 @@
+"""Comparison pages: runs, maps, images and checks side by side."""

@@ -1,0 +1,161 @@
+"""What two runs were made with, as far as it differs: settings, calibrations, times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from capture.calibration import store as calibrations
+from capture.calibration.record import CalibrationError
+from skinrig.benchmarks import figures as bench_figures
+from skinrig.benchmarks.document import SCHEMA
+from skinrig.reporting import folders as report_folders
+from skinrig.reporting import page, provenance
+from skinrig.reporting.comparison.runs import Pair, Run
+
+MOST_DRIFTS = 3
+"""Quantities told of each kind of calibration."""
+
+
+def settings(a: Run, b: Run, pair: Pair) -> str:
+    """Return what the two were made with, as far as it differs."""
+    sides = []
+    for side in (pair.a, pair.b):
+        told = {f"parameter {k}": v for k, v in provenance.flattened(side.parameters).items()}
+        told |= {f"input {k}": provenance.short(v) for k, v in side.inputs.items()}
+        told |= {f"version of {k}": v for k, v in side.versions.items()}
+        told |= {"source": side.source, "seed": str(side.seed)}
+        told |= {f"left out: {what}": why for what, why in side.left_out}
+        sides.append(told)
+    rows = _unequal(*sides)
+    stages = [row for row in rows if row[0].startswith("parameter stages.")]
+    rest = [row for row in rows if not row[0].startswith("parameter stages.")]
+    body = "<h3>What differs in the making</h3>"
+    if not rows:
+        return body + page.note("Parameters, inputs, versions and seeds are the same.")
+    if rest:
+        body += page.table(("what", a.label, b.label), rest, caption="Settings that are not equal")
+    if stages:
+        names = ", ".join(row[0].removeprefix("parameter stages.") for row in stages)
+        body += page.note(f"Stages whose code, settings or inputs differ: {names}.")
+    return body
+
+
+def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    return [
+        (key, a.get(key, "–"), b.get(key, "–"))
+        for key in sorted({*a, *b})
+        if a.get(key) != b.get(key)
+    ]
+
+
+def benchmarks(a: Run, b: Run) -> str:
+    """Return seconds and errors of settings that both measured, and a plot a stage."""
+    documents = [_bench_of(run) for run in (a, b)]
+    if documents[0] is None or documents[1] is None:
+        return ""
+    rows, plots = [], ""
+    for name, stage in documents[0]["stages"].items():
+        other = documents[1]["stages"].get(name)
+        if other is None or stage.get("size") != other.get("size"):
+            continue
+        rows += _settings_of_stage(name, stage, other)
+        if stage["points"] and other["points"]:
+            plots += bench_figures.compared_fronts(name, (a.label, stage), (b.label, other))
+    if not rows:
+        return ""
+    machines = _unequal(
+        *(provenance.flattened(document.get("machine", {})) for document in documents if document)
+    )
+    body = f"<h2>Error against run time</h2><div class='plots'>{plots}</div>"
+    if machines:
+        body += page.table(
+            ("machine", a.label, b.label), machines,
+            caption="Measured on different machines: seconds compare those, too",
+        )  # fmt: skip
+    return body + page.table(
+        ("stage", "setting", "seconds A", "seconds B", "B over A", "error A", "error B",
+         "error B over A", "68 % intervals apart"),
+        rows, caption="Settings that both measured, at the same size",
+    )  # fmt: skip
+
+
+def _bench_of(run: Run) -> dict[str, Any] | None:
+    for path in run.found.documents:
+        document = report_folders.read_json(path)
+        if document["schema"] == SCHEMA:
+            return document
+    return None
+
+
+def _settings_of_stage(
+    name: str, stage: Mapping[str, Any], other: Mapping[str, Any]
+) -> list[tuple[object, ...]]:
+    known = {str(point["knobs"]): point for point in other["points"]}
+    rows: list[tuple[object, ...]] = []
+    for point in stage["points"]:
+        match = known.get(str(point["knobs"]))
+        if match is None:
+            continue
+        (low, high), (low_b, high_b) = point["error_interval"], match["error_interval"]
+        apart = high < low_b or high_b < low
+        ratio = match["error"] / point["error"] if point["error"] else float("nan")
+        rows.append(
+            (name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],
+             match["seconds"], match["seconds"] / point["seconds"], point["error"],
+             match["error"], ratio, "yes" if apart else "no")
+        )  # fmt: skip
+    return rows
+
+
+def seconds(a: Run, b: Run) -> str:
+    """Return the seconds that documents of both, such as a demo's, tell by step."""
+    sides = [dict(_steps(run)) for run in (a, b)]
+    common = [step for step in sides[0] if step in sides[1]]
+    if not common:
+        return ""
+    rows: list[tuple[object, ...]] = [
+        (step, sides[0][step], sides[1][step], sides[1][step] - sides[0][step]) for step in common
+    ]
+    total = [sum(side[step] for step in common) for side in sides]
+    rows.append(("all of these", total[0], total[1], total[1] - total[0]))
+    return "<h2>Seconds</h2>" + page.table(
+        ("step", a.label, b.label, "difference"), rows,
+        caption="Wall-clock seconds of steps that both tell; other work of the machine is in them",
+    )  # fmt: skip
+
+
+def _steps(run: Run) -> Iterator[tuple[str, float]]:
+    for path in run.found.documents:
+        for entry in report_folders.read_json(path).get("tables", ()):
+            if list(entry["head"]) == ["step", "seconds"]:
+                yield from ((str(step), float(seconds)) for step, seconds in entry["rows"])
+
+
+def moved_calibrations(a: Run, b: Run) -> str:
+    """Return what moved most between calibrations of the same folder and kind."""
+    folders: dict[str, Path] = {path.name: path for path in b.found.calibrations}
+    rows: list[tuple[object, ...]] = []
+    for folder in a.found.calibrations:
+        if folder.name not in folders:
+            continue
+        for path in sorted(folder.glob("*.json")):
+            try:
+                old = calibrations.load(folder, path.stem)
+                new = calibrations.load(folders[folder.name], path.stem)
+                moved = [one for one in calibrations.drift(old, new) if one.change != 0.0]
+            except (CalibrationError, ValueError) as error:
+                rows.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
+                continue
+            rows += [
+                (f"{folder.name}, {path.stem}", one.serial, one.name, one.old, one.new,
+                 float("nan") if one.sigmas is None else one.sigmas, f"{len(moved)} moved")
+                for one in moved[:MOST_DRIFTS]
+            ]  # fmt: skip
+    if not rows:
+        return ""
+    return "<h2>Calibrations that moved</h2>" + page.table(
+        ("calibration", "device", "quantity", "A", "B", "in combined standard errors", "remark"),
+        rows, caption="The farthest of each kind",
+    )  # fmt: skip

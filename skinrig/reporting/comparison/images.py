@@ -1,0 +1,247 @@
+"""Folders of pictures of two runs beside each other: renderings and analyses.
+
+Pictures are compared by the values of their OpenEXR files, where both have one, since those are in
+proportion to light; else by the codes of their PNG files, whose brightness each run may have chosen
+for itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import page, provenance
+from skinrig.reporting.comparison.runs import Run
+from skinrig.reporting.sections import images as pictures_section
+
+Floats = NDArray[np.float64]
+
+MOST_DRAWN = 4
+"""Pictures of a folder that are drawn: those that differ most."""
+UNTOLD = ("seconds", "out", "files", "schema", "consent")
+"""Entries of a record that two equal renderings may differ in, or that stand elsewhere."""
+CODES = 255.0
+PERCENTILE = 98.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureDifference:
+    """One picture of two runs.
+
+    Attributes
+    ----------
+    name
+        Of the files, without suffix.
+    kind
+        "linear" or "8-bit codes".
+    a, b
+        Values, (H, W, C); codes over 255.
+    """
+
+    name: str
+    kind: str
+    a: Floats
+    b: Floats
+
+    @property
+    def difference(self) -> Floats:
+        """B less A, mean over the channels, (H, W)."""
+        return np.asarray((self.b - self.a).mean(axis=-1))
+
+    @property
+    def relative_rms(self) -> float:
+        """Root mean square of B less A over that of A; NaN where A is black, or lit up to inf."""
+        return _ratio(_rms(self.b - self.a), _rms(self.a))
+
+    @property
+    def mean_ratio(self) -> float:
+        """Mean of B over that of A; NaN where A is black."""
+        return _ratio(float(self.b.mean()), float(self.a.mean()))
+
+    @property
+    def largest(self) -> float:
+        """Largest absolute difference of a channel."""
+        return float(np.abs(self.b - self.a).max(initial=0.0))
+
+    @property
+    def equal(self) -> bool:
+        """Whether not a value differs."""
+        return bool(np.array_equal(self.a, self.b))
+
+
+def pairs(a: Run, b: Run) -> list[tuple[str, Path, Path]]:
+    """Return the folders that belong together: by name, or the only ones."""
+    one, other = ({path.name: path for path in run.found.pictures} for run in (a, b))
+    if len(one) == len(other) == 1:
+        (name_a, path_a), (name_b, path_b) = *one.items(), *other.items()
+        return [(name_a if name_a == name_b else f"{name_a} and {name_b}", path_a, path_b)]
+    return [(name, path, other[name]) for name, path in one.items() if name in other]
+
+
+def compared(a: Path, b: Path) -> tuple[list[PictureDifference], list[tuple[str, str]]]:
+    """Return the pictures of two folders, and those that cannot be subtracted with the reason.
+
+    Parameters
+    ----------
+    a, b
+        Folders that `skinrig render` or `skinrig analyse` wrote.
+    """
+    found, refused = [], []
+    names = [{p.stem for p in folder.glob("*.*") if p.suffix in (".exr", ".png")}
+             for folder in (a, b)]  # fmt: skip
+    for name in sorted(names[0] | names[1]):
+        if name not in names[0] or name not in names[1]:
+            refused.append((name, f"only in {'A' if name in names[0] else 'B'}"))
+            continue
+        linear = all((folder / f"{name}.exr").is_file() for folder in (a, b))
+        plain = all((folder / f"{name}.png").is_file() for folder in (a, b))
+        if not linear and not plain:
+            refused.append((name, "one is OpenEXR, the other PNG"))
+            continue
+        read = _linear if linear else _codes
+        suffix = "exr" if linear else "png"
+        try:
+            one, other = (read(folder / f"{name}.{suffix}") for folder in (a, b))
+        except (OSError, ValueError) as error:
+            refused.append((name, f"cannot be read: {error}"))
+            continue
+        if one.shape != other.shape:
+            refused.append((name, f"sizes {_size(one)} and {_size(other)}"))
+            continue
+        if not (np.isfinite(one).all() and np.isfinite(other).all()):
+            refused.append((name, "holds values that are not finite"))
+            continue
+        found.append(PictureDifference(name, "linear" if linear else "8-bit codes", one, other))
+    return found, refused
+
+
+def sentence(a: Run, b: Run) -> str:
+    """Return how many pictures differ, empty without any that both have."""
+    both = [one for _, path_a, path_b in pairs(a, b) for one in compared(path_a, path_b)[0]]
+    if not both:
+        return ""
+    differ = sum(not one.equal for one in both)
+    return f"{differ} of {len(both)} pictures of both differ."
+
+
+def section(a: Run, b: Run) -> str:
+    """Return the pictures of two runs with their differences, and what their records differ in."""
+    body = ""
+    for name, path_a, path_b in pairs(a, b):
+        found, refused = compared(path_a, path_b)
+        body += f"<h2>Pictures: {page.escape(name)}</h2>"
+        if found:
+            order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
+            body += page.table(
+                ("picture", "values", "RMS of B − A over A, %", "mean B over A", "largest |B − A|",
+                 "equal"),
+                [
+                    (one.name, one.kind, 100 * one.relative_rms, one.mean_ratio, one.largest,
+                     "yes" if one.equal else "no")
+                    for one in order
+                ],
+                caption="Linear values in the unit of the renderings; codes over 255, which follow "
+                "the brightness that each picture was shown with",
+            )  # fmt: skip
+            drawn = [one for one in order if not one.equal]
+            for one in drawn[:MOST_DRAWN]:
+                body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"
+                body += "".join(_drawn(a, b, one)) + "</div>"
+            if drawn[MOST_DRAWN:]:
+                rest = ", ".join(one.name for one in drawn[MOST_DRAWN:])
+                body += page.note(f"Not drawn, since they differ less: {rest}.")
+        if refused:
+            body += page.table(("picture", "why"), refused, caption="Pictures not subtracted")
+        body += _records(a, b, path_a, path_b)
+    return body
+
+
+def alone(a: Run, b: Run) -> list[tuple[str, str]]:
+    """Return folders of pictures that only one run has: name and the run's label."""
+    one, other = ({path.name for path in run.found.pictures} for run in (a, b))
+    if len(one) == len(other) == 1:
+        return []
+    return [(n, a.label) for n in sorted(one - other)] + [
+        (n, b.label) for n in sorted(other - one)
+    ]  # fmt: skip
+
+
+def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
+    """Draw A | B | B − A: linear ones at one brightness for both."""
+    bright = float(np.percentile(np.concatenate([one.a, one.b]), PERCENTILE)) or 1.0
+    for label, values in ((a.label, one.a), (b.label, one.b)):
+        shown = np.broadcast_to(values, (*values.shape[:2], 3))
+        if one.kind == "linear":
+            shown = np.clip(shown / bright, 0.0, 1.0)
+            yield map_pictures.color_picture(label, shown, width=200, of=one.name)
+        else:
+            small = map_pictures.shrink(np.rint(CODES * shown).astype(np.uint8), 200)
+            yield map_pictures.plain_picture(
+                label, np.ascontiguousarray(small), alt=f"{one.name}, {label}"
+            )
+    every = np.ones(one.difference.shape, bool)
+    reach = map_pictures.reach_of(one.difference, every, PERCENTILE) or one.largest or 1.0
+    yield map_pictures.scalar_picture(
+        "B − A, mean of the channels", one.difference, low=-reach, high=reach, scale="RdBu_r",
+        width=200, of=one.name,
+    )  # fmt: skip
+
+
+def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> str:
+    sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
+    rows = [
+        (key, sides[0].get(key, "–"), sides[1].get(key, "–"))
+        for key in sorted({*sides[0], *sides[1]})
+        if sides[0].get(key) != sides[1].get(key)
+    ]
+    if not rows:
+        return page.note("What was asked for, and all that the records say, is the same.")
+    return page.table(
+        ("entry", a.label, b.label), rows, caption="What the records differ in, without run times"
+    )
+
+
+def _document(folder: Path) -> Mapping[str, Any]:
+    path = pictures_section.folder_document(folder)
+    told = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
+    return {key: value for key, value in told.items() if key not in UNTOLD}
+
+
+def _linear(path: Path) -> Floats:
+    return _layers(store.read_exr(path))
+
+
+def _codes(path: Path) -> Floats:
+    import cv2
+
+    read = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if read is None:
+        raise ValueError("is no picture")
+    top = float(np.iinfo(read.dtype).max)
+    layers = _layers(read)
+    return layers[..., [2, 1, 0]] / top if layers.shape[-1] >= 3 else layers / top
+
+
+def _layers(values: NDArray[Any]) -> Floats:
+    image = np.asarray(values, np.float64)
+    return image if image.ndim == 3 else image[..., None]
+
+
+def _size(image: Floats) -> str:
+    return " x ".join(str(n) for n in image.shape)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def _ratio(value: float, over: float) -> float:
+    return value / over if over > 0.0 else float("nan")

@@ -1,0 +1,114 @@
+"""Errors of whatever kind of appearance against its truth, as rows that two runs share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.skin import SkinAppearance
+from skinrig.evaluating import flash, microrelief, subsurface
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.evaluating.surface_bands import errors_by_band
+from skinrig.written_units import unit_sign
+
+
+@dataclass(frozen=True, slots=True)
+class TruthError:
+    """One error against the truth.
+
+    Attributes
+    ----------
+    quantity, skin
+        What is in error, and on which skin: a band, a state, or "all".
+    unit
+        Of the error.
+    error
+        Median, or what the quantity names.
+    interval
+        68 % bootstrap interval; NaN where none is known.
+    coverage
+        Share of truths inside the 68 % intervals; NaN where it is not told.
+    """
+
+    quantity: str
+    skin: str
+    unit: str
+    error: float
+    interval: tuple[float, float] = (float("nan"), float("nan"))
+    coverage: float = float("nan")
+
+
+def of(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    """Return the errors of an appearance by quantity and skin.
+
+    Parameters
+    ----------
+    appearance
+        Of a flash camera, a dome, a gradient sphere or a fibre probe.
+    truth
+        Of the same session.
+    """
+    rows: list[TruthError] = []
+    if "position" in appearance.maps:
+        rows += _surface(appearance, truth)
+    elif microrelief.states_of(appearance):
+        rows += _microrelief(appearance, truth)
+    elif "melanin" in truth.maps:
+        rows += _chromophores(appearance, truth)
+    if subsurface.true_profiles(truth):
+        rows += _subsurface(appearance, truth)
+    return rows
+
+
+def _chromophores(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    found = flash.compare(appearance, truth, rng=np.random.default_rng(0))
+    return [
+        TruthError(
+            f"{row.name}, median relative error against the {row.against} truth",
+            row.band_name, "%", 100 * row.median_relative,
+            (100 * row.interval[0], 100 * row.interval[1]), row.coverage.share,
+        )
+        for row in found
+    ]  # fmt: skip
+
+
+def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    found = surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+    rows = [
+        TruthError(
+            f"{row.name}, median error", "all", unit_sign(row.unit),
+            row.median, row.interval, row.coverage.share,
+        )
+        for row in found
+    ]  # fmt: skip
+    for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
+        rows.append(TruthError(f"{name}, median error", f"{band} skin", unit, middle))
+    return rows
+
+
+def _microrelief(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    rows = []
+    for one in microrelief.compare(appearance, truth, rng=np.random.default_rng(0)):
+        rows.append(
+            TruthError("normals, median error", one.state, "°", one.median_deg, one.interval_deg,
+                       one.coverage)
+        )  # fmt: skip
+        if np.isfinite(one.height_um):
+            rows.append(
+                TruthError("height, rms error of relief", one.state, "%",
+                           100 * one.height_relative, coverage=one.height_coverage)
+            )  # fmt: skip
+    return rows
+
+
+def _subsurface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    rows = []
+    fits = subsurface.compare_fits(appearance, truth)
+    for kind in dict.fromkeys(row.kind for row in fits):
+        for one in subsurface.by_method([row for row in fits if row.kind == kind]):
+            rows.append(
+                TruthError(f"sigma_tr by {one.method}, median relative error", f"{kind} tissue",
+                           "%", 100 * one.median, coverage=one.coverage)
+            )  # fmt: skip
+    return rows

@@ -1,0 +1,199 @@
+"""Pictures of maps for the report: what each shows is also told in numbers, as its alt text."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.drawing import png
+from skinrig.reporting.page import escape, number
+from skinrig.written_units import written
+
+LEVELS = 128
+"""Colors of a map's picture: it tells a value to 1/128 of its scale."""
+
+
+def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
+    """Take every n-th pixel so that the image is at most ``width`` wide.
+
+    Pixels are left out, not averaged, so that noise is shown as large as it is.
+    """
+    step = max(1, -(-image.shape[1] // width))
+    return image[step // 2 :: step, step // 2 :: step]
+
+
+def scalar_picture(
+    title: str,
+    values: NDArray[np.floating],
+    *,
+    low: float,
+    high: float,
+    scale: str = "viridis",
+    valid: NDArray[np.bool_] | None = None,
+    unit: str = "",
+    width: int = 280,
+    of: str = "",
+) -> str:
+    """Return a figure of a map with its color scale.
+
+    Parameters
+    ----------
+    title
+        Stands below the picture.
+    values
+        (H, W).
+    low, high
+        Ends of the color scale, in ``unit``.
+    scale
+        A key of `skinrig.drawing.png.SCALES`.
+    valid
+        (H, W); other pixels are gray.
+    unit
+        Of values.
+    width
+        Pixels across; larger maps are thinned out.
+    of
+        What the picture is of, for the alt text: the title alone rarely tells.
+    """
+    small = shrink(values, width).astype(float)
+    mask = None if valid is None else shrink(valid, width).astype(bool)
+    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=LEVELS)
+    named = f"{of}, {title}" if of else title
+    scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
+    alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
+    of_unit = f"<span>{escape(unit)}</span>" if unit else ""
+    return (
+        f'<figure><img alt="{escape(alt)}" width="{small.shape[1]}" height="{small.shape[0]}" '
+        f'src="{png.address(data)}"><figcaption>{escape(title)}</figcaption>'
+        f'<div class="scale" aria-hidden="true"><span>{number(low)}</span>'
+        f'<span class="bar {png.SCALES[scale]}"></span>'
+        f"<span>{number(high)}</span>{of_unit}</div></figure>"
+    )
+
+
+def _told(values: NDArray[np.float64], mask: NDArray[np.bool_] | None, unit: str) -> str:
+    """Return a map's median, its middle 90 %, and how much of it has no value."""
+    shown = np.isfinite(values) if mask is None else mask & np.isfinite(values)
+    if not shown.any():
+        return "no pixel has a value"
+    low, median, high = np.percentile(values[shown], [5, 50, 95])
+    within = f"90 % of pixels within {number(low)} to {number(high)}"
+    text = f"median {written(number(median), unit)}, {within}"
+    missing = 1.0 - shown.mean()
+    return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
+
+
+def color_picture(
+    title: str, linear: NDArray[np.floating], *, width: int = 320, of: str = ""
+) -> str:
+    """Return a figure of a linear sRGB image, (H, W, 3)."""
+    small = shrink(np.asarray(linear), width).astype(float)
+    finite = np.isfinite(small).all(axis=2)
+    seen = ""
+    if finite.any():
+        middle = np.median(small[finite], axis=0)
+        seen = f": median linear red, green, blue {', '.join(number(float(v)) for v in middle)}"
+    return plain_picture(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
+
+
+def plain_picture(title: str, image: NDArray[np.uint8], *, alt: str = "") -> str:
+    """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
+    return _stored(title, png.encode(image), alt or title, image.shape[:2])
+
+
+def normal_picture(
+    title: str,
+    normals: NDArray[np.floating],
+    *,
+    valid: NDArray[np.bool_],
+    width: int = 280,
+    of: str = "normals",
+) -> str:
+    """Return a figure of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
+    small = shrink(normals, width).astype(float)
+    mask = shrink(valid, width).astype(bool)
+    image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
+    image[~mask] = png.GRAY
+    alt = f"{of}, {title}: x, y, z as red, green, blue"
+    if mask.any():
+        length = np.linalg.norm(small[mask], axis=-1)
+        tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
+        alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
+    missing = 1.0 - mask.mean()
+    alt += f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
+    return _stored(title, png.encode(image), alt, image.shape[:2])
+
+
+def stored_picture(title: str, data: bytes, *, alt: str = "") -> str:
+    """Return a figure of a PNG file's bytes, as they are."""
+    return _stored(title, data, alt or title, None)
+
+
+def _stored(title: str, data: bytes, alt: str, shape: tuple[int, ...] | None) -> str:
+    size = "" if shape is None else f' width="{shape[1]}" height="{shape[0]}"'
+    return (
+        f'<figure><img alt="{escape(alt)}"{size} src="{png.address(data)}">'
+        f"<figcaption>{escape(title)}</figcaption></figure>"
+    )
+
+
+def reach_of(values: NDArray[np.floating], shown: NDArray[np.bool_], percentile: float) -> float:
+    """Return how far a color scale must reach for that percentage of shown |values|."""
+    inside = np.abs(values[shown & np.isfinite(values)])
+    return float(np.percentile(inside, percentile)) if inside.size else 1.0
+
+
+def map_panel(
+    name: str,
+    unit: str,
+    *,
+    estimate: NDArray[np.floating],
+    standard_error: NDArray[np.floating] | None = None,
+    truth: NDArray[np.floating] | None = None,
+    valid: NDArray[np.bool_] | None = None,
+    width: int = 280,
+) -> str:
+    """Return truth | estimate | error | standard error of a map, truth and estimate to one scale.
+
+    Parameters
+    ----------
+    name, unit
+        Of the map, for headings and scales.
+    estimate, standard_error, truth
+        (H, W); what is None is left out of the row.
+    valid
+        (H, W); other pixels are gray.
+    width
+        Pixels across; larger maps are thinned out.
+    """
+    mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
+    of_scale = [estimate[mask & np.isfinite(estimate)]]
+    if truth is not None:
+        of_scale.append(truth[mask & np.isfinite(truth)])
+    joined = np.concatenate(of_scale)
+    low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
+    parts = []
+
+    def add(
+        title: str,
+        values: NDArray[np.floating],
+        ends: tuple[float, float],
+        scale: str = "viridis",
+    ) -> None:
+        parts.append(
+            scalar_picture(
+                title, values, low=ends[0], high=ends[1], scale=scale, valid=mask, unit=unit,
+                width=width, of=name,
+            )
+        )  # fmt: skip
+
+    if truth is not None:
+        add("truth", truth, (low, high))
+    add("estimate", estimate, (low, high))
+    if truth is not None:
+        error = estimate - truth
+        reach = reach_of(error, mask, 98)
+        add("estimate − truth", error, (-reach, reach), "RdBu_r")
+    if standard_error is not None:
+        add("standard error", standard_error, (0.0, reach_of(standard_error, mask, 98)), "magma")
+    return f'<h3>{escape(name)}</h3><div class="maps">{"".join(parts)}</div>'

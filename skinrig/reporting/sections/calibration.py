@@ -1,0 +1,244 @@
+"""The report's section on calibrations: how good they are, and whether they were in force."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration import store
+from capture.calibration.record import Calibration, CalibrationError
+from model.skin import SkinAppearance
+from skinrig.reporting import page
+from skinrig.reporting.sections.session import SessionFacts
+
+LONGEST = 12
+"""Numbers of a quantity up to which a table lists it."""
+MOST_VALUES = 60
+"""Rows beyond which values stay in their file."""
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One number by which a calibration is judged, for each device that has it."""
+
+    quantity: str
+    words: str
+    unit: str
+    of: Callable[[Floats], float] = lambda values: float(np.max(np.abs(values)))
+    factor: float = 1.0
+    worst: Callable[[Sequence[float]], float] = max
+
+
+FIGURES: Mapping[str, tuple[Figure, ...]] = {
+    "sensor": (
+        Figure("read_noise_e", "read noise", "e-"),
+        Figure("linearity_deviation", "deviation from a straight line", "%", factor=100.0),
+        Figure("prnu", "pixels' response differs by", "%", factor=100.0),
+        Figure("flat_residual", "left by the flat field", "%", factor=100.0),
+        Figure("chi2_per_dof", "chi² per degree of freedom of the photon transfer", ""),
+    ),
+    "color": (
+        Figure("delta_e_mean", "Delta E 2000, patches held out, mean", ""),
+        Figure("delta_e_max", "Delta E 2000, patches held out, largest", ""),
+    ),
+    "polarization": (
+        Figure("extinction_r", "extinction ratio, red", "", worst=min),
+        Figure("extinction_g", "extinction ratio, green", "", worst=min),
+        Figure("extinction_b", "extinction ratio, blue", "", worst=min),
+        Figure("leakage", "a mirror's light crossed over parallel", ""),
+        Figure("light_jitter", "light from pop to pop", "%", factor=100.0),
+    ),
+    "white": (Figure("residual", "left by the smooth white reference", "%", factor=100.0),),
+    "geometry": (Figure("reprojection_px", "reprojection", "px"),),
+    "lights": (
+        Figure("intensity", "light", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
+    ),
+    "fibre": (
+        Figure("gain", "gain of a fibre", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
+        Figure("spot_edge_px", "edge of a fibre's spot", "px"),
+    ),
+}
+"""Figures of each kind; what a calibration lacks is left out."""
+
+
+def section(
+    folders: Sequence[Path],
+    appearances: Mapping[str, SkinAppearance],
+    sessions: Mapping[str, SessionFacts],
+    checks: list[page.Check],
+) -> str:
+    """Return quality, age at capture and values of calibrations.
+
+    Parameters
+    ----------
+    folders
+        CALIBRATION/ folders.
+    appearances
+        By name: whose inputs tell which calibration made them.
+    sessions
+        By name: whose days tell how old a calibration was.
+    checks
+        Gets, for each folder that something here was made with, how long it would still have held.
+
+    Notes
+    -----
+    Ages are told at the day of capture, not of today: that is what the maps depend on, and a
+    report of the same input is the same on any day.
+    """
+    if not folders:
+        return ""
+    ages: list[tuple[object, ...]] = []
+    figures: list[tuple[object, ...]] = []
+    values = ""
+    for folder in folders:
+        left: list[float] = []
+        for path in sorted(folder.glob("*.json")):
+            try:
+                found = store.load(folder, path.stem)
+            except (CalibrationError, ValueError) as error:
+                ages.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
+                left.append(float("nan"))
+                continue
+            days, row = _age(folder.name, path, found, appearances, sessions)
+            ages.append(row)
+            left += days
+            figures += _figures(folder.name, found)
+            values += _values(folder.name, found)
+        if left:
+            checks.append(
+                page.Check(
+                    f"{folder.name}: days that it would still have held at capture, least",
+                    float(np.min(left)), 0.0, ">=", "d",
+                )
+            )  # fmt: skip
+    body = "<h2>Calibration: quality and age</h2>" + page.table(
+        ("calibration", "made", "valid until", "used for", "captured", "age then, days", "verdict"),
+        ages,
+        caption="Age at the day of capture against validity; used for: maps here that name this "
+        "very file among their inputs",
+    )  # fmt: skip
+    body += page.table(
+        ("calibration", "figure", "unit", "devices", "median", "worst", "worst device",
+         "largest standard error"),
+        figures,
+        caption="Quality; standard errors are of the figure itself where the calibration has them",
+    )  # fmt: skip
+    return body + values
+
+
+def _age(
+    folder: str,
+    path: Path,
+    found: Calibration,
+    appearances: Mapping[str, SkinAppearance],
+    sessions: Mapping[str, SessionFacts],
+) -> tuple[list[float], tuple[object, ...]]:
+    """Return the days that were left at each capture, and the table's row."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    users = sorted(
+        name for name, one in appearances.items() if digest in _plain(one.inputs.values())
+    )
+    captured = sorted(
+        {
+            sessions[str(session)].day
+            for name in users
+            if (session := appearances[name].parameters.get("session")) in sessions
+        }
+    )
+    days = [_left(found, day) for day in captured]
+    if not captured:
+        verdict = "no session here tells when it was used"
+    elif min(days) < 0:
+        verdict = "not in force at capture"
+    else:
+        verdict = f"in force, {min(days)} days left"
+    ages = [(day - found.created).days for day in captured]
+    return [float(d) for d in days], (
+        f"{folder}, {found.kind}", found.created.isoformat(), found.valid_until.isoformat(),
+        ", ".join(users) or "nothing here", ", ".join(day.isoformat() for day in captured),
+        ", ".join(map(str, ages)), f"{verdict}; {found.source}",
+    )  # fmt: skip
+
+
+def _plain(digests: object) -> set[str]:
+    return {str(one).removeprefix("sha256:") for one in digests}  # type: ignore[attr-defined]
+
+
+def _left(found: Calibration, day: date) -> int:
+    """Return days until validity ends; negative, too, before it began."""
+    before = (day - found.created).days
+    return before if before < 0 else (found.valid_until - day).days
+
+
+def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = []
+    for figure in FIGURES.get(found.kind, ()):
+        told = {
+            serial: figure.factor * figure.of(np.asarray(names[figure.quantity].value, float))
+            for serial, names in sorted(found.values.items())
+            if figure.quantity in names
+            and np.isfinite(np.asarray(names[figure.quantity].value, float)).all()
+        }
+        if not told or (found.kind == "white" and not any(told.values())):
+            continue  # a white reference that nothing smoothed leaves nothing
+        errors = [
+            figure.factor * float(np.max(stderr))
+            for names in found.values.values()
+            if figure.quantity in names
+            and (stderr := names[figure.quantity].stderr) is not None
+            and np.isfinite(stderr).all()
+        ]
+        worst = figure.worst(list(told.values()))
+        device = next(serial for serial, value in told.items() if value == worst)
+        rows.append(
+            (
+                f"{folder}, {found.kind}", figure.words, figure.unit, len(told),
+                float(np.median(list(told.values()))), worst, device,
+                max(errors) if errors else "",
+            )
+        )  # fmt: skip
+    flagged = [
+        serial
+        for serial, names in sorted(found.values.items())
+        if "valid" in names and not np.asarray(names["valid"].value, bool).all()
+    ]
+    counted = sum("valid" in names for names in found.values.values())
+    if counted:
+        rows.append(
+            (
+                f"{folder}, {found.kind}", "devices found not valid", "", counted,
+                float(len(flagged)), float(len(flagged)), ", ".join(flagged[:6]), "",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _values(folder: str, found: Calibration) -> str:
+    rows = [
+        (serial, name, _numbers(quantity.value), _numbers(quantity.stderr))
+        for serial, names in sorted(found.values.items())
+        for name, quantity in sorted(names.items())
+        if np.size(quantity.value) <= LONGEST
+    ]
+    body = page.facts(dict(sorted(found.notes.items())), caption="What its makers noted")
+    if len(rows) > MOST_VALUES:
+        body += page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
+    else:
+        body += page.table(
+            ("device", "quantity", "value", "standard error"), rows,
+            caption=f"Values of {folder}, {found.kind}, made {found.created}",
+        )  # fmt: skip
+    return page.folded(f"{folder}, {found.kind}: notes and values", body)
+
+
+def _numbers(values: object) -> str:
+    if values is None:
+        return ""
+    return ", ".join(f"{v:.4g}" for v in np.asarray(values, float).ravel())

@@ -1,0 +1,198 @@
+"""The report's section on chromophores: errors by melanin band, and where they can be told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from skinrig.drawing import figures
+from skinrig.evaluating import flash
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import map_names, page
+
+NOISE_OF_IDENTIFIABILITY = 0.005
+"""Relative noise of each channel that the identifiability plots are drawn for."""
+SMALL_PX = 200
+"""Largest width of maps that stand alone."""
+ROUNDING = 1e-6
+"""Fractions below this are zero but for rounding."""
+
+
+def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+    """Return each map of a single channel beside its truth, to one scale."""
+    body, alone = "", ""
+    for key, skin_map in sorted(appearance.maps.items()):
+        if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR):
+            continue
+        true_map = truth.maps.get(key) if truth is not None else None
+        if true_map is None and skin_map.stderr is None:
+            alone += _alone(key, skin_map)
+            continue
+        body += map_pictures.map_panel(
+            map_names.heading(key),
+            page.short_unit(skin_map.unit),
+            estimate=skin_map.values,
+            standard_error=skin_map.stderr,
+            truth=None if true_map is None else true_map.values,
+            valid=_shown(skin_map, true_map),
+        )
+    if alone:
+        body += f"<h3>Maps without standard errors</h3><div class='maps small'>{alone}</div>"
+    return body
+
+
+def _alone(key: str, skin_map: SkinMap) -> str:
+    """Return the picture of a map that there is nothing to set beside."""
+    mask = _shown(skin_map, None)
+    inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
+    low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
+    if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
+        low, high = 0.0, 1.0
+    return map_pictures.scalar_picture(
+        map_names.heading(key), skin_map.values, low=low, high=high, valid=mask,
+        unit=page.short_unit(skin_map.unit), width=SMALL_PX,
+    )  # fmt: skip
+
+
+def _shown(estimate: SkinMap, truth: SkinMap | None) -> NDArray[np.bool_] | None:
+    masks = [m.valid for m in (estimate, truth) if m is not None and m.valid is not None]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def errors(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
+) -> str:
+    """Return the errors of melanin and hemoglobin against their truth, by melanin band.
+
+    Parameters
+    ----------
+    name
+        For headings.
+    appearance, truth
+        Maps of the same size.
+    checks
+        A judgement of each map is added to it.
+    """
+    rows = flash.compare(appearance, truth, rng=np.random.default_rng(0))
+    blurred = [row for row in rows if row.against == "blurred"]
+    for row in blurred:
+        if row.band is None:
+            own = [r for r in blurred if r.name == row.name and r.band is not None]
+            worst, worst_got = _worst(own)
+            checks.append(
+                page.Check(
+                    f"{name}: {row.name}, median error",
+                    100 * row.median_relative, 100 * flash.limit(row), "<=", "%",
+                    f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
+                    masked=row.masked, coverage=row.coverage.share, worst=worst,
+                    worst_got=worst_got,
+                )
+            )  # fmt: skip
+    body = "<h3>Errors by melanin band</h3>" + page.table(
+        ("map", "truth", "band", "pixels", "masked, %", "median |error|, %", "68 % interval",
+         "bias, %", "68 % coverage, %", "by noise alone, %", "median standard error, %",
+         "bound, %"),
+        [
+            (
+                row.name, row.against, row.band_name, row.pixels, 100 * row.masked,
+                100 * row.median_relative,
+                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+                100 * row.bias, 100 * row.coverage.share, 100 * row.noise_coverage,
+                100 * row.median_stderr, 100 * row.median_bound,
+            )
+            for row in rows
+        ],
+        caption="Relative errors against what the subject is made of (sharp) and against what "
+        "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
+    )  # fmt: skip
+    limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
+    return body + _bars([row for row in blurred if row.band is not None], limits)
+
+
+def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
+    """Return the melanin band of the largest error and its lower end, where there are several."""
+    told = [row for row in banded if np.isfinite(row.median_relative)]
+    if len(told) < 2:
+        return "", float("nan")
+    worst = max(told, key=lambda row: row.median_relative)
+    low, high = (100 * end for end in worst.interval)
+    text = f"{worst.band_name}: {100 * worst.median_relative:.3g} % ({low:.3g} – {high:.3g} %)"
+    return text, low
+
+
+def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> str:
+    labels = list(dict.fromkeys(row.band_name for row in banded))
+    if not labels:
+        return ""
+    found = {(row.name, row.band_name): 100 * row.median_relative for row in banded}
+    series = {
+        key: [found.get((key, label), float("nan")) for label in labels]
+        for key in dict.fromkeys(row.name for row in banded)
+    }
+    plot = figures.bars(
+        "median error by melanin band; dashed: limit of all bands together", labels, series,
+        unit="%", limits=limits,
+    )  # fmt: skip
+    return f'<div class="plots">{plot}</div>'
+
+
+def identifiability(appearances: Iterable[SkinAppearance]) -> str:
+    """Draw where the Cramer-Rao bound says that a chromophore can be seen at all.
+
+    Parameters
+    ----------
+    appearances
+        Each color table that chromophores of one were looked up in is drawn once.
+    """
+    tables = {
+        (str(built["camera"]), str(built["illuminant"]))
+        for appearance in appearances
+        if "melanin" in appearance.maps
+        and isinstance(built := appearance.parameters.get("color_table"), dict)
+    }
+    body = ""
+    for camera, illuminant in sorted(tables):
+        body += f"<h3>{page.escape(camera)}, {page.escape(illuminant)}</h3>"
+        body += _of_table(camera, illuminant)
+    if not body:
+        return ""
+    told = page.note(
+        "Least relative standard error that any unbiased estimator could have, for "
+        f"{100 * NOISE_OF_IDENTIFIABILITY:g} % of noise in each channel and the model's error."
+    )
+    return f"<h2>Where chromophores can be told</h2>{told}{body}"
+
+
+def _of_table(camera: str, illuminant: str) -> str:
+    from model import color_table
+    from model.tissue_optics.layers import ANISOTROPY_SKIN
+    from reconstruction import chromophores
+    from reconstruction.chromophores import model_error
+
+    table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
+    plots = []
+    choices: tuple[tuple[Literal["known"] | None, str], ...] = (
+        (None, "shading free"),
+        ("known", "shading known"),
+    )
+    for shading, words in choices:
+        found = chromophores.identifiability(
+            table,
+            shading=shading,
+            variance=lambda rgb: np.square(NOISE_OF_IDENTIFIABILITY * rgb),
+            model_error=model_error.load(),
+            size=48,
+        )
+        for name, relative in (
+            ("melanin", found.stderr_melanin),
+            ("hemoglobin", found.stderr_hemoglobin),
+        ):
+            plots.append(
+                figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
+            )
+    return f'<div class="plots">{"".join(plots)}</div>'

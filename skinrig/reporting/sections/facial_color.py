@@ -1,0 +1,271 @@
+"""The report's section on the blood of a moving face: its states, their repeats and errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.facial_color import HemoglobinRig
+from model.skin import SkinAppearance, SkinMap
+from skinrig.applying.expression import colors, hemoglobin_rig
+from skinrig.drawing import figures
+from skinrig.evaluating import facial_color as evaluation
+from skinrig.evaluating.flash import BANDS
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import page
+from skinrig.reporting.map_names import melanin_band
+
+SHOWN = 4
+"""States drawn; the tables list all."""
+WIDTH_PX = 240
+LEAST_PIXELS = 20
+"""Of a melanin band that is told."""
+
+
+def section(
+    name: str,
+    appearance: SkinAppearance,
+    part: Mapping[str, Any],
+    truths: Mapping[str, SkinAppearance],
+    checks: list[page.Check],
+) -> str:
+    """Return the states of a face's blood, how they repeat, and how far off they are.
+
+    Parameters
+    ----------
+    name
+        For headings.
+    appearance
+        Folder of `skinrig.appearances.dynamic`.
+    part
+        What it records of the blood's fit.
+    truths
+        True blood of each state, as far as it is there.
+    checks
+        Judgements are added to it.
+    """
+    rig = hemoglobin_rig(appearance)
+    body = (
+        "<h3>Hemoglobin rig</h3><p class='note'>Each state is a scale and a bias of the neutral "
+        f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination.</p>"
+    )
+    body += _blends(appearance, rig)
+    rows = []
+    for state, maps in rig.states.items():
+        placed = [row for row in part["alignment"] if row["state"] == state]
+        rms, largest = part["storage_error"][state]
+        change = appearance.maps.get(f"change_{state}")
+        rows.append(
+            (
+                state, _mean(change), float(np.median(maps.scale[maps.valid])),
+                100 * rms, 100 * largest,
+                placed[0]["median_error_px"] if placed else "",
+                placed[0]["by"] if placed else "",
+            )
+        )  # fmt: skip
+    body += page.table(
+        ("state", "mean change of blood, points", "median scale",
+         "lost by storing small, rms, points", "largest, points", "error of place, px",
+         "placed by"),
+        rows,
+        caption="States; points are percent of the dermis' volume, the mean change is over all "
+        "pixels whose change was found",
+    )  # fmt: skip
+    body += _repeats(part.get("repeatability"))
+    if truths:
+        states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
+        banded = errors_by_band(rig, truths)
+        body += _errors(name, states, changes, banded, checks)
+    for state in list(rig.states)[:SHOWN]:
+        measured = appearance.maps.get(f"hemoglobin_{state}")
+        true = evaluation.true_blood(truths[state]) if state in truths else None
+        if measured is None:
+            continue
+        blend = rig.evaluate({state: 1.0})
+        seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
+        body += map_pictures.map_panel(
+            f"blood of {state}, by the rig", "volume fraction",
+            estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
+            standard_error=np.where(blend.valid, blend.stderr, 0.0),
+            truth=None if true is None else true.values, valid=seen,
+        )  # fmt: skip
+    return body
+
+
+def _repeats(told: Mapping[str, Any] | None) -> str:
+    """Return how far states repeat, and whether melanin drifts."""
+    if not told:
+        return ""
+    drifts = {row["region"]: row for row in told["melanin_drift"]}
+    rows = []
+    for row in told["hemoglobin"]:
+        drift = drifts.get(row["region"])
+        slope = "" if drift is None else (
+            f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})"
+        )  # fmt: skip
+        rows.append(
+            (
+                row["region"], 100 * row["within"], 100 * row["between"],
+                float("nan") if row["correlation"] is None else row["correlation"],
+                "yes" if row["scatters"] else "no", slope,
+                "" if drift is None else f"{drift['p_value']:.2g}",
+            )
+        )  # fmt: skip
+    return page.table(
+        ("region", "between repeats, points", "between states, points", "intraclass correlation",
+         "more than noise", "melanin's drift a minute, points", "p"),
+        rows,
+        caption="Repeats: standard deviations of blood",
+    )  # fmt: skip
+
+
+def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:
+    """Draw the face's color in each state and in the first two together."""
+    melanin = appearance.maps.get("melanin")
+    if melanin is None:
+        return ""
+    names = list(rig.states)
+    asked: dict[str, dict[str, float]] = {"neutral": {"neutral": 1.0}}
+    asked |= {state: {state: 1.0} for state in names[:SHOWN]}
+    if len(names) > 1:
+        asked[f"{names[0]} + {names[1]}"] = {names[0]: 1.0, names[1]: 1.0, "neutral": -1.0}
+    pictures = ""
+    for title, weights in asked.items():
+        blend = rig.evaluate(weights)
+        seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
+        color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
+        pictures += map_pictures.color_picture(title, color, width=WIDTH_PX)
+    return (
+        f"<div class='maps'>{pictures}</div><p class='note'>Diffuse color without shading, linear "
+        "sRGB under D65.</p>"
+    )
+
+
+def _errors(
+    name: str,
+    states: list[evaluation.StateError],
+    changes: list[evaluation.ChangeError],
+    banded: list[tuple[object, ...]],
+    checks: list[page.Check],
+) -> str:
+    if not states:
+        return ""
+    by_rig = [row for row in states if row.way == evaluation.WAYS[1]]
+    for row in by_rig:
+        worst = _worst(row.state, banded)
+        checks.append(
+            page.Check(
+                f"{name}: blood of {row.state} by the rig, median error",
+                100 * row.median_relative, 100 * evaluation.LEVEL_LIMIT, "<=", "%",
+                coverage=row.coverage, worst=worst,
+            )
+        )  # fmt: skip
+    body = "<h3>Blood of each state: error by way</h3>" + page.table(
+        ("state", "way", "median |error|, %", "68 % interval", "rms, points", "bias, %",
+         "68 % coverage, %", "pixels"),
+        [
+            (row.state, row.way, 100 * row.median_relative,
+             f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}", 100 * row.rms,
+             100 * row.bias, 100 * row.coverage, row.pixels)
+            for row in states
+        ],
+        caption="Against the true blood of each state, by way of getting it; pixels that every "
+        "way tells",
+    )  # fmt: skip
+    body += page.table(
+        ("state", "true change, points", "found, points", "rms of the map, points",
+         "68 % coverage, %"),
+        [
+            (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
+            for row in changes
+        ],
+        caption="Change of blood from the neutral state, one melanin for all states; over those of "
+        "these pixels whose change was found",
+    )  # fmt: skip
+    if banded:
+        body += page.table(
+            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"), banded,
+            caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
+            "the rig tells, also where the state itself was not measured",
+        )  # fmt: skip
+    labels = list(dict.fromkeys(row.state for row in states))
+    series = {
+        way: [
+            next((100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
+                 float("nan"))
+            for label in labels
+        ]
+        for way in evaluation.WAYS
+    }  # fmt: skip
+    plot = figures.bars("median error of a state's blood", labels, series, unit="%")
+    return body + f"<div class='plots'>{plot}</div>"
+
+
+def errors_by_band(
+    rig: HemoglobinRig, truths: Mapping[str, SkinAppearance]
+) -> list[tuple[object, ...]]:
+    """Return the errors of each state's blood by the rig, by band of true melanin.
+
+    Parameters
+    ----------
+    rig
+        Its states.
+    truths
+        Of each state; a state whose truth has no "melanin", at rest, is left out.
+
+    Returns
+    -------
+    list of tuple
+        State, band, pixels, median size of the relative error in percent, bias in percent, share
+        of truths within one standard error in percent.
+    """
+    rows: list[tuple[object, ...]] = []
+    for state in rig.states:
+        true = evaluation.true_blood(truths[state]) if state in truths else None
+        of_truth = truths[state].maps if state in truths else {}
+        melanin = of_truth.get("melanin_at_rest", of_truth.get("melanin"))
+        if true is None or melanin is None:
+            continue
+        blend = rig.evaluate({state: 1.0})
+        if melanin.values.shape != blend.hemoglobin.shape:
+            continue
+        good = blend.valid & (true.values > 0)
+        if true.valid is not None:
+            good = good & true.valid
+        for low, high in BANDS:
+            inside = good & (melanin.values >= low) & (melanin.values < high)
+            if np.count_nonzero(inside) < LEAST_PIXELS:
+                continue
+            found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
+            relative = (found - real) / real
+            held = np.abs(found - real) <= blend.stderr[inside]
+            rows.append(
+                (state, melanin_band(low, high), int(inside.sum()),
+                 100 * float(np.median(np.abs(relative))), 100 * float(np.median(relative)),
+                 100 * float(np.mean(held)))
+            )  # fmt: skip
+    return rows
+
+
+def _worst(state: str, banded: list[tuple[object, ...]]) -> str:
+    """Return the band of a state's largest error, where there are several."""
+    own = [(float(str(row[3])), str(row[1])) for row in banded if row[0] == state]
+    if len(own) < 2:
+        return ""
+    error, band = max(own)
+    return f"{band}: {error:.3g} %"
+
+
+def _mean(skin_map: SkinMap | None) -> float:
+    if skin_map is None:
+        return float("nan")
+    good = _valid(skin_map)
+    return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

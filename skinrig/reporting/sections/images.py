@@ -1,0 +1,137 @@
+"""The report's section on rendered models and analyses: their pictures, and what they were told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import page
+
+DOCUMENTS = ("render.json", "analysis.json")
+"""Files that tell a folder of pictures."""
+SCHEMAS = ("skinrig.render/", "skinrig.analyse")
+LARGEST_BYTES = 600_000
+"""Larger pictures stay in their folder: a report is to be sent by mail."""
+FULL = "full model"
+
+
+def folder_document(folder: Path) -> Path | None:
+    """Return the document of a folder of renderings or of an analysis, or None."""
+    for name in DOCUMENTS:
+        path = folder / name
+        if path.is_file():
+            return path
+    return None
+
+
+def section(folder: Path, checks: list[page.Check]) -> str:
+    """Return what lies in a folder that `skinrig render` or `skinrig analyse` wrote.
+
+    Parameters
+    ----------
+    folder
+        With its document beside the pictures.
+    checks
+        The report's; a comparison with photographs adds its limit.
+    """
+    path = folder_document(folder)
+    if path is None:
+        return ""
+    document = json.loads(path.read_text(encoding="utf-8"))
+    if not str(document.get("schema", "")).startswith(SCHEMAS):
+        return ""
+    body = f"<h2>{page.escape(_heading(document))}: {page.escape(folder.name)}</h2>"
+    if FULL in document:
+        body += _comparison(folder.name, document, checks)
+    elif "view" in document:
+        body += page.facts(
+            {
+                "view": document["view"].get("name", ""),
+                "lights": ", ".join(document.get("lights", {})),
+                "light inside the skin": document.get("subsurface", ""),
+                "lobes": document.get("lobes", ""),
+                "unit": document.get("unit", ""),
+            },
+            caption="What was asked for",
+        )
+    for one in document.get("datasets", ()):
+        body += _data_set(one)
+    body += _pictures(folder)
+    if document.get("assumed"):
+        body += "<h3>Assumed</h3>" + page.table(
+            ("assumption",), [[t] for t in document["assumed"]],
+            caption="Taken for granted, not measured",
+        )  # fmt: skip
+    return body
+
+
+def _heading(document: Mapping[str, Any]) -> str:
+    if FULL in document:
+        return "Renderings beside photographs"
+    return "Rendering" if "view" in document else "Analysis"
+
+
+def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]) -> str:
+    full = document[FULL]
+    checks.append(
+        page.Check(
+            f"{name}: luminance of held-out photographs, median error on lit pixels",
+            100 * full["median"], 100 * document["limit"], "<=", "%",
+            f"noise alone makes {100 * full['noise']:.2f} %",
+        )
+    )  # fmt: skip
+    kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
+    rows = {FULL: full, **kinds, **document["ablation"]}
+    body = page.table(
+        ("model", "photographs", "median error, %", "68 % below, %", "95 % below, %", "bias, %",
+         "all skin, %", "SSIM"),
+        [
+            (
+                label, row["pairs"],
+                *(100 * row[key] for key in ("median", "p68", "p95", "bias", "total_error")),
+                row["ssim"],
+            )
+            for label, row in rows.items()
+        ],
+        caption="Luminance of photographs that no fit has seen; parts of the model left out",
+    )  # fmt: skip
+    bands = [
+        (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
+    ]
+    return body + page.table(
+        ("skin", "pixels", "median error, %"), bands,
+        caption="The full model by skin color, from the individual typology angle",
+    )  # fmt: skip
+
+
+def _data_set(one: Mapping[str, Any]) -> str:
+    ranks: Sequence[float] = one.get("ranks", ())
+    if not ranks:
+        return ""
+    head = [name for name in ("error", "normalized", "held_out_error") if name in one]
+    rows = [
+        (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
+        for k, rank in enumerate(ranks)
+    ]
+    name = one.get("name", "")
+    return page.table(
+        ("lobes", *(n.replace("_", " ") for n in head)),
+        rows,
+        caption=f"Errors by number of lobes: {name}",
+    )
+
+
+def _pictures(folder: Path) -> str:
+    figures = []
+    kept = []
+    for path in sorted(folder.glob("*.png")):
+        data = path.read_bytes()
+        if len(data) > LARGEST_BYTES:
+            kept.append(path.name)
+            continue
+        figures.append(map_pictures.stored_picture(path.stem.replace("-", " "), data))
+    note = page.note(f"Too large for here: {', '.join(kept)}.") if kept else ""
+    return f"<div class='maps'>{''.join(figures)}</div>" + note

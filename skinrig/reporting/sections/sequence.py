@@ -1,0 +1,92 @@
+"""The report's section on a sequence in time: blood at places against phase, and how fast it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from model.skin import SkinAppearance
+from reconstruction.pipeline.flash.sequence import CURVES_FILE
+from skinrig.drawing import figures
+from skinrig.reporting import page
+
+COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
+
+
+def is_sequence(appearance: SkinAppearance) -> bool:
+    """Return whether an appearance holds curves of a sequence."""
+    return CURVES_FILE in appearance.files
+
+
+def section(appearance: SkinAppearance) -> str:
+    """Return the curves of all places, their levels and time constants, and what is covered."""
+    told = json.loads(appearance.files[CURVES_FILE])
+    cycle_s = told.get("cycle_s")
+    body = f"<h3>Blood in time: {page.escape(told['state'])}</h3>"
+    if cycle_s is not None:
+        phases = told["phases"]
+        body += (
+            f"<p class='note'>{phases['captures']} images meet {phases['distinct']} phases of a "
+            f"cycle of {cycle_s:g} s, {phases['interval_s']:g} s apart, one every "
+            f"{told['shot_period_s']:g} s; ordered by the flash's true time.</p>"
+        )
+    body += _curves(told, cycle_s)
+    body += _table(told)
+    return body
+
+
+def _curves(told: Mapping[str, Any], cycle_s: float | None) -> str:
+    key, axis = ("phase_s", "phase, s") if cycle_s is not None else ("time_s", "time, s")
+    when = np.array([_number(frame[key]) for frame in told["frames"]])
+    order = np.argsort(when)
+    curves = []
+    for number, (place, one) in enumerate(told["curves"].items()):
+        values = 100.0 * np.array([_number(v) for v in one["hemoglobin"]])
+        errors = 100.0 * np.array([_number(v) for v in one["stderr"]])
+        curves.append(
+            figures.Curve(place, when[order].tolist(), values[order].tolist(),
+                          errors[order].tolist(), line=cycle_s is None,
+                          color=COLORS[number % len(COLORS)])
+        )  # fmt: skip
+    plot = figures.curves(
+        f"blood in {told['state']}", axis, "blood, % of the dermis' volume", curves
+    )
+    return f"<div class='plots'>{plot}</div>"
+
+
+def _table(told: Mapping[str, Any]) -> str:
+    rows = []
+    transitions, repeats = told.get("transition", {}), told.get("reproducibility", {})
+    for place, fit in told["fits"].items():
+        seen = transitions.get(place)
+        repeat = repeats.get(place)
+        rows.append(
+            (
+                place, 100 * _number(fit["start"]), 100 * _number(fit["end"]), fit["text"],
+                "" if seen is None else _words(seen),
+                float("nan") if repeat is None else 100 * _number(repeat["sd"]),
+            )
+        )  # fmt: skip
+    body = page.table(
+        ("place", "level at the start, %", "at the end, %", "time constant", "transition seen",
+         "between cycles, points"),
+        rows,
+        caption="Levels and time constants by place; points are percent of the dermis' volume",
+    )  # fmt: skip
+    together = page.escape(told["fit_of_all"]["text"])
+    return body + f"<p class='note'>Time constant, all places together: {together}.</p>"
+
+
+def _words(transition: Mapping[str, Any]) -> str:
+    if not transition["decided"]:
+        return "cannot be told"
+    power = transition.get("power")
+    certain = "" if power is None else f" (would be seen with a chance of {100 * power:.0f} %)"
+    return "yes" if transition["seen"] else f"no{certain}"
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)

@@ -1,0 +1,276 @@
+"""The report's section on a surface: maps seen from the front beside their truth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig.appearances.front_view import WIDTH_PX, FrontView
+from skinrig.evaluating import reflection
+from skinrig.evaluating import surface as evaluation
+from skinrig.evaluating.surface_bands import Banded, errors_by_band
+from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import page
+from skinrig.reporting.map_names import heading, words
+from skinrig.written_units import unit_sign
+
+SMALL_PX = 110
+"""Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
+GRAY = 0.5
+RELATIVE = ("r_d",)
+"""Maps whose standard errors are shown in percent of the estimate."""
+FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
+
+
+def section(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
+) -> str:
+    """Return the maps of an appearance on a mesh, beside their truth where there is one.
+
+    Parameters
+    ----------
+    name
+        For headings.
+    appearance
+        With a map "position".
+    truth
+        Of the same subject, on an atlas of its own; None: standard errors only.
+    checks
+        Judgements are added to it.
+    """
+    body = ""
+    place = appearance.maps["position"]
+    rows, columns = np.nonzero(_valid(place))
+    points = place.values[rows, columns].astype(np.float64)
+    if not len(points):
+        return "<p class='note'>No texel of these maps is valid.</p>"
+    box = points.min(axis=0), points.max(axis=0)
+    view = FrontView.of(points, box)
+    true_view, known = None, np.zeros(0, np.intp)
+    if truth is not None:
+        pairs = evaluation.match(appearance, truth)
+        true_place = truth.maps["position"]
+        usable = _valid(true_place)
+        if "mask" in truth.maps:
+            usable = usable & (truth.maps["mask"].values > 0.5)
+        known = np.flatnonzero(usable)
+        true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
+    best = next((key for key in FIRST[1:] if key in appearance.maps), "")
+    large = {"r_d", best}
+    shown_truths: set[str] = set()
+    minor = ""
+    for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
+        if key == "position" or key.startswith("_"):
+            continue
+        values = skin_map.values[rows, columns]
+        good = _valid(skin_map)[rows, columns]
+        width = WIDTH_PX if key in large else SMALL_PX
+        figures = []
+        true_name = "normals" if key in evaluation.NORMAL_MAPS else key
+        known_truth = truth is not None and true_name in truth.maps
+        if truth is not None and true_view is not None and known_truth:
+            if true_name not in shown_truths:  # of all estimates of normals there is one truth
+                flat = truth.maps[true_name].values
+                flat = flat.reshape(-1, *flat.shape[2:])[known]
+                figures.append(_shown("truth", key, *true_view.picture(flat), width=width))
+                shown_truths.add(true_name)
+        figures.append(_shown("estimate", key, *view.picture(values, valid=good), width=width))
+        if truth is not None and known_truth:
+            figures.append(_error(key, appearance, truth, pairs, box, width=width))
+        if skin_map.stderr is not None:
+            figures.append(_spread(key, skin_map, rows, columns, view, good, width=width))
+        if key in FIRST:
+            size = "maps" if key in large else "maps small"
+            body += (
+                f"<h3>{page.escape(heading(key))}</h3><div class='{size}'>{''.join(figures)}</div>"
+            )
+        else:
+            minor += "".join(figures)
+    if minor:
+        body += f"<h3>Lobes, samples and residuals</h3><div class='maps small'>{minor}</div>"
+    if truth is not None:
+        body += _errors(name, appearance, truth, checks)
+        body += _reflection(name, appearance, truth, checks)
+    return body
+
+
+def _rank(key: str) -> tuple[int, str]:
+    """Order maps: what people look for first, then by name."""
+    return (FIRST.index(key) if key in FIRST else len(FIRST), key)
+
+
+def _shown(
+    title: str, key: str, image: NDArray[np.float64], valid: NDArray[np.bool_], *, width: int
+) -> str:
+    if image.ndim == 2:
+        inside = image[valid & np.isfinite(image)]
+        low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
+        return map_pictures.scalar_picture(
+            _title(title, key), image, low=low, high=high, valid=valid, of=key, width=width
+        )
+    if "normals" in key:
+        return map_pictures.normal_picture(title, image, valid=valid, of=key, width=width)
+    return map_pictures.color_picture(
+        title, np.where(valid[..., None], image, GRAY**2.2), of=f"{key}, linear sRGB"
+    )
+
+
+def _title(title: str, key: str) -> str:
+    """Return what stands below a picture: of maps that share a heading, which one it is."""
+    return title if key in FIRST else f"{words(key)}, {title}"
+
+
+def _error(
+    key: str,
+    appearance: SkinAppearance,
+    truth: SkinAppearance,
+    pairs: evaluation.Match,
+    box: tuple[NDArray[np.floating], NDArray[np.floating]],
+    *,
+    width: int,
+) -> str:
+    error = evaluation.errors_at(key, appearance, truth, pairs)
+    points = appearance.maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
+    good = np.isfinite(error)
+    image, valid = FrontView.of(points, box).picture(np.nan_to_num(error), valid=good)
+    reach = map_pictures.reach_of(error, good, 95)
+    if key in evaluation.NORMAL_MAPS:
+        return map_pictures.scalar_picture(
+            "error", image, low=0.0, high=reach, scale="magma", valid=valid, unit="°", of=key,
+            width=width,
+        )  # fmt: skip
+    return map_pictures.scalar_picture(
+        "estimate − truth", image, low=-reach, high=reach, scale="RdBu_r", valid=valid, unit="%",
+        of=key, width=width,
+    )  # fmt: skip
+
+
+def _spread(
+    key: str,
+    skin_map: SkinMap,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    view: FrontView,
+    good: NDArray[np.bool_],
+    *,
+    width: int,
+) -> str:
+    if skin_map.stderr is None:
+        return ""
+    stderr = skin_map.stderr[rows, columns].astype(np.float64)
+    unit = page.short_unit(skin_map.unit)
+    if key in RELATIVE:  # as errors are told, beside which it stands
+        size = np.abs(skin_map.values[rows, columns].astype(np.float64))
+        good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
+        stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
+    if stderr.ndim == 2:
+        stderr = stderr.mean(axis=-1)
+    if key in evaluation.NORMAL_MAPS:
+        stderr, unit = np.degrees(stderr), "°"
+    image, valid = view.picture(stderr, valid=good)
+    reach = map_pictures.reach_of(image, valid, 98)
+    return map_pictures.scalar_picture(
+        _title("standard error", key), image, low=0.0, high=reach, scale="magma", valid=valid,
+        unit=unit, of=key, width=width,
+    )  # fmt: skip
+
+
+def _errors(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
+) -> str:
+    found = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+    banded = errors_by_band(appearance, truth)
+    registration = appearance.parameters.get("registration")
+    pixel_mm = registration.get("pixel_mm", 0.0) if isinstance(registration, dict) else 0.0
+    coarse = float(pixel_mm) > evaluation.JUDGED_PIXEL_MM
+    for row in found:
+        if row.name == "half_vector_normals":
+            continue  # the published baseline, shown beside ours and held to nothing
+        if row.unit == "deg" and coarse:
+            continue
+        what, got, bound = row.judged
+        unit = unit_sign(row.unit)
+        where, worst_got = _worst(row.name, banded)
+        checks.append(
+            page.Check(
+                f"{name}: {words(row.name)}, {what}", got, bound, "<=", unit,
+                masked=row.masked, coverage=row.coverage.share, worst=where, worst_got=worst_got,
+            )
+        )  # fmt: skip
+    note = ""
+    if coarse:
+        note = (
+            f"<p class='note'>A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
+            f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
+            f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
+            "</p>"
+        )
+    return "<h3>Errors on the surface</h3>" + note + page.table(
+        ("map", "unit", "points", "masked, %", "mean |error|", "median", "68 % interval",
+         "95th percentile", "bias", "68 % coverage, %", "median standard error"),
+        [
+            (
+                words(row.name), unit_sign(row.unit), row.points,
+                100 * row.masked, row.mean, row.median,
+                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}", row.high, row.bias,
+                100 * row.coverage.share, row.median_stderr,
+            )
+            for row in found
+        ],
+        caption="Texel by texel against the nearest true point; angles in degrees",
+    ) + page.table(
+        ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
+        [(words(row[0]), *row[1:]) for row in banded],
+        caption="By skin color: the individual typology angle of the true reflectance "
+        "(Chardon et al. 1991)",
+    )  # fmt: skip
+
+
+def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
+    """Return the skin color of the largest error and that error, where there are several."""
+    own = [row for row in banded if row[0] == name.split()[0]]
+    if len(own) < 2:
+        return "", float("nan")
+    worst = max(own, key=lambda row: row[5])
+    return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}", worst[5]
+
+
+def _reflection(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
+) -> str:
+    """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
+    held_out = reflection.compare(appearance, truth, rng=np.random.default_rng(0))
+    if held_out is None:
+        return ""
+    checks.append(
+        page.Check(
+            f"{name}: reflection in held-out directions, median error",
+            100 * held_out.median,
+            100 * reflection.HELD_OUT_LIMIT,
+            "<=",
+            "%",
+            f"{held_out.points} points × {held_out.directions} directions",
+        )
+    )
+    low, high = held_out.interval
+    body = "<h3>Reflection in directions that no light of the capture had</h3>" + page.table(
+        ("points", "directions", "median error, %", "68 % interval", "in highlights, %"),
+        [(held_out.points, held_out.directions, 100 * held_out.median,
+          f"{100 * low:.3g} – {100 * high:.3g}", 100 * held_out.highlights)],
+        caption="Against the true reflection at points of the surface",
+    )  # fmt: skip
+    figures = []
+    for site, true_image, image in reflection.spheres(appearance, truth):
+        bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
+        figures.append(map_pictures.color_picture(f"{site}: truth", true_image / bright))
+        if image is not None:
+            figures.append(map_pictures.color_picture(f"{site}: estimate", image / bright))
+    if figures:
+        body += f"<h3>Reflection on spheres</h3><div class='maps'>{''.join(figures)}</div>"
+    return body
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -1,0 +1,174 @@
+"""Textures and tables of Jimenez 2010: chromophores, the hemoglobin rig, the color of skin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import color_table, spectra
+from model.facial_color import HemoglobinRig
+from model.facial_color.rig import GLOBAL_GAINS, NEUTRAL
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.viewer.assets import camera_color
+from skinrig.viewer.assets.camera_color import CameraColor
+from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.map_filling import filled, halved
+from skinrig.viewer.scene import Assets, SceneSource, Texture
+
+if TYPE_CHECKING:
+    from rigsim.subject import Subject
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TABLE_SIZE: Final = 128
+"""Nodes along each axis of the color table."""
+RIG_SIZE: Final = 256
+"""Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
+RADIUS_OF_SIZE: Final = 24.0 / 512.0
+"""Radius of the local statistics' disc, as a part of the map's side."""
+FINE: Final = 8
+"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
+ALBEDO: Final = "r_d"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceColor:
+    """Chromophores of a face on its texture, and its hemoglobin rig.
+
+    Attributes
+    ----------
+    melanin, hemoglobin : ndarray of float64, shape (N, N)
+        Volume fractions in the neutral state, known everywhere.
+    states : mapping of str to ndarray of float64, shape (h, w, 2)
+        Scale and bias by state, "neutral" first.
+    global_states
+        Those of the whole body.
+    facts
+        How they came to lie on the texture; JSON values.
+    left_out
+        What could not be placed.
+    """
+
+    melanin: Floats
+    hemoglobin: Floats
+    states: Mapping[str, Floats]
+    global_states: tuple[str, ...]
+    facts: Mapping[str, Any]
+    left_out: tuple[tuple[str, str], ...] = ()
+
+
+def assets(source: SceneSource) -> Assets:
+    """Return chromophores, color table, hemoglobin rig and, where it was measured, the albedo."""
+    albedo = _albedo(source)
+    found = _face(source, measured=albedo is not None)
+    table = color_table.build(
+        spectra.LINEAR_SRGB, "D65", size=TABLE_SIZE, anisotropy=ANISOTROPY_SKIN
+    )
+    roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
+    textures = {
+        "chromophores": Texture(roots.astype(np.float32), fine=_fine(roots.shape[0])),
+        "facial_states": Texture(np.stack(list(found.states.values())).astype(np.float32), "u8"),
+    }
+    names = list(found.states)
+    facts: dict[str, Any] = {
+        "color_table": {"c_m_max": C_M_MAX, "c_hd_max": C_HD_MAX, "size": TABLE_SIZE},
+        "facial_color": {
+            "states": names,
+            "gains": {n: g for n, g in GLOBAL_GAINS.items() if n in names},
+            "global_states": list(found.global_states),
+            **found.facts,
+        },
+    }
+    left_out = list(found.left_out)
+    if albedo is not None:
+        textures["albedo_map"], seen = albedo
+        facts["albedo_color"] = seen.told
+        if not seen.known:
+            left_out.append(("colors of this face", seen.told))
+        left_out.append(
+            (
+                "chromophores of this face",
+                "the dome measures color alone: states change it by the ratio of simulated blood",
+            )
+        )
+    return {
+        "textures": textures,
+        # 11 bits are finer than linear interpolation between the nodes, and pack twice as small
+        "tables": {"skin_color": table.rgb.astype(np.float16).astype(np.float32)},
+        "facts": facts,
+        "params": {"weights": dict.fromkeys([*names[1:], *source.mesh.shapes], 0.0)},
+        "left_out": tuple(left_out),
+    }
+
+
+def _fine(size: int) -> int:
+    """Return how coarsely the finest octave is kept: texels below 0.2 mm hold noise."""
+    return FINE if size >= 2048 else 1
+
+
+def _face(source: SceneSource, *, measured: bool) -> FaceColor:
+    """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
+    subject = source.subject
+    if subject is None:
+        raise ValueError("source: got no subject, expected one to stand for what was not measured")
+    dynamic = source.appearances.get("dynamic")
+    if dynamic is not None and FACIAL_COLOR in parts_of(dynamic):
+        from skinrig.viewer.assets.placed_color import placed
+
+        return placed(source, subject)
+    if measured or source.skin is None:
+        return simulated(subject, FineSkin(subject, subject.size))
+    return simulated(subject, source.skin)
+
+
+def simulated(person: Subject, skin: FineSkin) -> FaceColor:
+    """Return the chromophores of a simulated person, with a rig of all of its states."""
+    from rigsim.subject.perfusion import STATES
+
+    rig = HemoglobinRig.from_maps(
+        person.hemoglobin(),
+        {name: person.hemoglobin(name) for name in STATES if name != NEUTRAL},
+        radius_px=RADIUS_OF_SIZE * person.size,
+        valid=person.atlas.covered,
+        stored_size=min(RIG_SIZE, person.size),
+    )
+    return FaceColor(
+        melanin=skin.melanin(),
+        hemoglobin=skin.hemoglobin(),
+        states=stored_states(rig),
+        global_states=rig.global_states,
+        facts={"source": "simulated"},
+    )
+
+
+def stored_states(rig: HemoglobinRig) -> dict[str, Floats]:
+    """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
+    layers = {}
+    for name in (NEUTRAL, *rig.states):
+        valid = rig.neutral_mean_valid if name == NEUTRAL else rig.states[name].valid
+        pair = [filled(maps[name], valid) for maps in (rig.scale, rig.bias)]
+        layers[name] = np.stack(pair, axis=-1)
+    return layers
+
+
+def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
+    """Return the measured albedo, (N, N, 3), of the dome's or a fitted model's folder."""
+    for kind in ("model", "dome"):
+        appearance = source.appearances.get(kind)
+        if appearance is None or ALBEDO not in appearance.maps:
+            continue
+        found = appearance.maps[ALBEDO]
+        valid: Mask = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
+        if found.valid is not None:
+            valid = valid & found.valid
+        values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
+        seen = camera_color.of(source)
+        shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)
+        return Texture(shown.astype(np.float32), "u8"), seen
+    return None

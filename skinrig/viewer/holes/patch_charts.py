@@ -1,0 +1,223 @@
+"""Places in the texture for what closes a mesh's holes, and values there for maps that have none.
+
+The charts of a scan meet the rim of a hole from several sides, so that a patch cannot continue
+them: it gets a disc of its own where the texture is empty. Maps that are drawn by the point of the
+surface cover it by themselves; those that were measured are painted on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from skinrig.viewer.holes import closing as hole_closing
+from skinrig.viewer.holes.closing import Patch
+from skinrig.viewer.scene import Texture, ViewerScene
+
+if TYPE_CHECKING:
+    from rigsim.geometry.mesh import Mesh
+
+Floats = NDArray[np.float64]
+
+CELLS: Final = 512
+"""Side of the grid on which empty places are sought."""
+MARGIN: Final = 4.0 / 256.0
+"""Between a disc and anything else: four texels of a map of 256, so that filters stay clean."""
+LEAST_SCALE: Final = 0.25
+"""Of the scale of the texture around: coarser than this a patch finds no place."""
+MEASURED: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
+"""Textures that are not drawn by the point of the surface."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """A disc of the texture that holds a patch.
+
+    Attributes
+    ----------
+    patch
+        What it holds.
+    center : ndarray of float64, shape (2,)
+        Texture coordinates.
+    radius : float
+    rim_uv : ndarray of float64, shape (n, 2)
+        Where the patch's rim lies in the charts around.
+    """
+
+    patch: Patch
+    center: Floats
+    radius: float
+    rim_uv: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedMesh:
+    """A mesh whose small holes are closed.
+
+    Attributes
+    ----------
+    mesh
+        With the patches; vertices of the mesh before come first.
+    charts
+        Of the patches.
+    left_open_mm
+        Lengths of loops that found no place in the texture.
+    """
+
+    mesh: Mesh
+    charts: tuple[Chart, ...]
+    left_open_mm: tuple[float, ...]
+
+    def painted(self, scene: ViewerScene) -> ViewerScene:
+        """Return a scene whose measured textures continue into the patches."""
+        if not self.charts:
+            return scene
+        textures: Mapping[str, Texture] = {
+            name: self.painted_texture(one) if name in MEASURED else one
+            for name, one in scene.textures.items()
+        }
+        return dataclasses.replace(scene, textures=textures)
+
+    def painted_texture(self, texture: Texture) -> Texture:
+        """Return a texture with the values of the rims continued into the patches."""
+        values = texture.values.reshape(-1, *texture.values.shape[-3:]).copy()
+        for layer in values:
+            for chart in self.charts:
+                _paint(layer, chart)
+        return dataclasses.replace(texture, values=values.reshape(texture.values.shape))
+
+    def told(self) -> tuple[tuple[str, str], ...]:
+        """Return what the page says of it."""
+        rows = []
+        if self.charts:
+            lengths = [chart.patch.length_mm for chart in self.charts]
+            rows.append(
+                (
+                    "surface in holes of the scan",
+                    f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
+                    f"{min(lengths):.0f} to {max(lengths):.0f} mm around "
+                    "could not be measured: smooth patches close them, colored from their rims",
+                )
+            )
+        if self.left_open_mm:
+            rows.append(
+                (
+                    "holes that stay open",
+                    f"the texture has no room for {len(self.left_open_mm)} of up to "
+                    f"{max(self.left_open_mm):.0f} mm around",
+                )
+            )
+        return tuple(rows)
+
+
+def closed(mesh: Mesh) -> ClosedMesh:
+    """Return a scanned mesh with its small holes closed.
+
+    Parameters
+    ----------
+    mesh
+        Without blend shapes.
+    """
+    from rigsim.geometry.atlas import unwrap
+    from rigsim.geometry.mesh import build_mesh
+
+    patches = hole_closing.patches(mesh.vertices_mm, mesh.faces)
+    if not patches or mesh.shapes:
+        return ClosedMesh(mesh, (), ())
+    taken = unwrap(mesh, CELLS).covered
+    scale = _uv_per_mm(mesh)
+    vertices, faces, uv = [mesh.vertices_mm], [mesh.faces], [mesh.uv]
+    count = len(mesh.vertices_mm)
+    charts: list[Chart] = []
+    open_mm: list[float] = []
+    for patch in patches:
+        whole = np.concatenate([mesh.vertices_mm[patch.rim], patch.inner_mm])
+        place = _placed(taken, scale * np.sqrt(_area(whole, patch.faces) / np.pi))
+        if place is None:
+            open_mm.append(patch.length_mm)
+            continue
+        center, radius = place
+        _take(taken, center, radius)
+        charts.append(Chart(patch, center, radius, mesh.uv[patch.rim].astype(np.float64)))
+        vertices.append(whole.astype(np.float32))
+        faces.append((patch.faces + count).astype(np.int32))
+        uv.append((center + radius * patch.disc).astype(np.float32))
+        count += len(whole)
+    joined = build_mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv))
+    return ClosedMesh(joined, tuple(charts), tuple(open_mm))
+
+
+def _area(points: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
+    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def _uv_per_mm(mesh: Mesh) -> float:
+    """Return the texture's scale by whole areas."""
+    flat = np.concatenate([mesh.uv, np.zeros((len(mesh.uv), 1), np.float32)], axis=1)
+    in_texture = _area(flat.astype(np.float64), mesh.faces)
+    return float(np.sqrt(in_texture / max(_area(mesh.vertices_mm, mesh.faces), 1e-9)))
+
+
+def _placed(taken: NDArray[np.bool_], radius: float) -> tuple[Floats, float] | None:
+    """Return middle and radius of the emptiest place, smaller where it must be; None: no room."""
+    far = ndimage.distance_transform_edt(np.pad(~taken, 1))[1:-1, 1:-1]
+    row, column = np.unravel_index(int(np.argmax(far)), far.shape)
+    most = (float(far[row, column]) - 1.0) / CELLS - MARGIN
+    if most < LEAST_SCALE * radius:
+        return None
+    center = np.array([(column + 0.5) / CELLS, 1.0 - (row + 0.5) / CELLS])
+    return center, min(radius, most)
+
+
+def _take(taken: NDArray[np.bool_], center: Floats, radius: float) -> None:
+    at = (np.arange(CELLS) + 0.5) / CELLS
+    far2 = (at[None, :] - center[0]) ** 2 + (1.0 - at[:, None] - center[1]) ** 2
+    taken[far2 <= (radius + 1.0 / CELLS) ** 2] = True
+
+
+def _paint(layer: NDArray[np.float32], chart: Chart) -> None:
+    """Draw a patch into a map (H, W, C), row 0 at the top, in place."""
+    from scipy.interpolate import LinearNDInterpolator
+
+    height, width, _ = layer.shape
+    if min(height, width) < 2:  # one value for the whole face
+        return
+    rows = (1.0 - chart.rim_uv[:, 1]) * height - 0.5
+    columns = chart.rim_uv[:, 0] * width - 0.5
+    rim = np.stack(
+        [
+            ndimage.map_coordinates(plane, [rows, columns], order=1, mode="nearest")
+            for plane in np.moveaxis(layer, -1, 0)
+        ],
+        axis=-1,
+    )
+    values = chart.patch.continued(rim.astype(np.float64))
+    reach = chart.radius + MARGIN
+    x0, y0 = chart.center
+    j = np.arange(max(int((x0 - reach) * width), 0), min(int((x0 + reach) * width) + 1, width))
+    i = np.arange(
+        max(int((1 - y0 - reach) * height), 0), min(int((1 - y0 + reach) * height) + 1, height)
+    )
+    disc = np.stack(
+        np.broadcast_arrays(
+            ((j + 0.5) / width - x0)[None, :], (1.0 - (i + 0.5) / height - y0)[:, None]
+        ),
+        axis=-1,
+    )
+    far = np.linalg.norm(disc, axis=-1) / chart.radius
+    inside = far * chart.radius <= reach
+    # beside the disc what its edge has, for filters
+    within = disc / chart.radius / np.maximum(far, 1.0)[..., None]
+    # the rim is a polygon within the circle
+    polygon = np.concatenate([chart.patch.disc, 1.5 * chart.patch.disc[: len(chart.patch.rim)]])
+    both = np.concatenate([values, values[: len(chart.patch.rim)]])
+    found = LinearNDInterpolator(polygon, both)(within[inside])
+    block = layer[i[0] : i[-1] + 1, j[0] : j[-1] + 1]
+    block[inside] = found

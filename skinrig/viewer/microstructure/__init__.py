@@ -1,0 +1,1 @@
+"""Microstructure assets of the viewer."""

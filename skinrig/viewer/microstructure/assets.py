@@ -1,0 +1,234 @@
+"""What the page needs to show microstructure: a patch, its table of kernels, and its roughness.
+
+The page grows a displacement from the patch (`skinrig.viewer.microstructure.relief_growth`) and convolves it by
+the strain of the pose. What a screen's pixel cannot resolve does not vanish: the variance of the
+slopes that are not drawn goes into the roughness of the highlight, by two tables that are computed
+here: how much of the variance each level of the pyramid keeps, and how the variance changes with
+the stretch of the skin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
+from skinrig.viewer.microstructure import relief_growth
+from skinrig.viewer.microstructure.micro_relief import (
+    PATCH_PX,
+    MicroRelief,
+    MicrostructureAssetError,
+    fitted_relief,
+    simulated_relief,
+)
+from skinrig.viewer.microstructure.relief_growth import GrownRelief
+from skinrig.viewer.microstructure.slope_variances import (
+    STRETCH_RANGE,
+    slope_rms,
+    strained_variance,
+)
+from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
+from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, ViewerScene
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+SAMPLE_PX: Final = 512
+"""Side of the part of a displacement that its slopes are known from."""
+CELL_PX: Final = 56
+MOST_BREAKS: Final = 8
+"""Lines of alpha that the shader has room for, less one."""
+MOST_REACH_PX: Final = 64
+"""Kernels that reach farther than this leave nothing of the window."""
+
+
+def assets(source: SceneSource) -> Assets:
+    """Return the microstructure of a scene, or why there is none.
+
+    A fitted relief comes before a simulated one; what is simulated on a captured face is said.
+    """
+    dynamic = source.appearances.get("dynamic")
+    relief = None if dynamic is None else fitted_relief(dynamic)
+    if relief is not None:
+        return from_relief(relief, source.mesh, seed=source.seed)
+    add = "`skinrig fit microstructure` adds its own"
+    if source.subject is None:
+        return Assets(left_out=(("microstructure", f"none was measured; {add}"),))
+    made = from_relief(simulated_relief(source.seed), source.mesh, seed=source.seed)
+    if source.kind in ("dynamic", "dome", "model"):
+        told = f"what is drawn of it is simulated, its kernels are the paper's forehead; {add}"
+        made["left_out"] = (("microstructure of this face", told),)
+    return made
+
+
+def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
+    """Return what is grown in the page: the middle of the relief, without its mean and tilt.
+
+    Raises
+    ------
+    MicrostructureAssetError
+        For a relief too small to choose places from.
+    """
+    side = min(*relief.height_um.shape, PATCH_PX) // relief_growth.STEP_PX * relief_growth.STEP_PX
+    cell = min(CELL_PX, relief_growth.largest_cell_px(side))
+    if cell < 2 * relief_growth.STEP_PX:
+        raise MicrostructureAssetError(
+            f"relief: got {relief.height_um.shape}, expected at least 96 pixels a side"
+        )
+    top, left = ((n - side) // 2 for n in relief.height_um.shape)
+    part = relief.height_um[top : top + side, left : left + side].astype(np.float64)
+    # a tilt would be a slope that no skin has, and steps where places meet
+    y, x = (np.mgrid[:side, :side] - 0.5 * (side - 1)).reshape(2, -1)
+    plane = np.stack([np.ones_like(x), x, y], axis=1)
+    part -= (plane @ np.linalg.lstsq(plane, part.ravel(), rcond=None)[0]).reshape(side, side)
+    return GrownRelief(part.astype(np.float32), relief.pixel_um, cell, seed % 2**32)
+
+
+def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Assets:
+    """Return textures, tables and parameters of a relief on a mesh.
+
+    Parameters
+    ----------
+    relief : MicroRelief
+    mesh : ViewerMesh
+        Its texture's scale says how many pixels the grown displacement has.
+    seed : int
+
+    Raises
+    ------
+    MicrostructureAssetError
+        For a table of more lines than the shader holds, or a texture whose scale is so uneven
+        that kernels reach too far.
+    """
+    growth = grown(relief, seed=seed)
+    table = relief.table
+    if len(table.alpha_breaks) > MOST_BREAKS:
+        raise MicrostructureAssetError(
+            f"table: got {len(table.alpha_breaks)} breaks, expected at most {MOST_BREAKS}"
+        )
+    scale = px_per_mm(mesh)
+    virtual = round(1e3 / (relief.pixel_um * float(np.median(scale))))
+    virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
+    virtual = min(virtual, relief_growth.LARGEST_PX // 2)
+    reach = reach_px(table, scale, virtual)
+    below, above = table.sigma_lines_um()
+    return Assets(
+        textures={"relief_patch": Texture(growth.patch[..., None], "u16", "nearest")},
+        tables={
+            "kernel_alpha_breaks": np.asarray([table.alpha_breaks], np.float32),
+            "kernel_alpha_lines": np.asarray(table.alpha_lines, np.float32),
+            "kernel_sigma_lines_mm": 1e-3 * np.asarray([below, above], np.float32),
+            "strained_variance": strained_variance(growth, table).astype(np.float32),
+        },
+        facts={
+            "microstructure": {
+                "pixel_um": growth.pixel_um,
+                "patch_px": growth.patch.shape[0],
+                "cell_px": growth.cell_px,
+                "choices": growth.choices,
+                "seed": growth.seed,
+                "virtual_px": virtual,
+                "levels": relief_growth.LEVELS,
+                "reach_px": reach,
+                "stretch_range": list(table.stretch_range),
+                "alpha_limits": list(ALPHA_LIMITS),
+                "variance_stretch_range": list(STRETCH_RANGE),
+                "slope_rms": slope_rms(growth),
+                "source": relief.source,
+                "table": table.source,
+            }
+        },
+    )
+
+
+def reach_px(table: KernelTable, scale: Floats, virtual_px: int) -> int:
+    """Return how many pixels of the displacement a kernel reaches, and two for its samples.
+
+    Parameters
+    ----------
+    table : KernelTable
+    scale : ndarray
+        Texture units per mm of skin, see `px_per_mm`.
+    virtual_px : int
+        Side of the displacement.
+
+    Raises
+    ------
+    MicrostructureAssetError
+        For more than `MOST_REACH_PX`.
+    """
+    # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
+    finest = float(np.percentile(scale, 99.0))
+    reach = math.ceil(4.0 * largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
+    if reach > MOST_REACH_PX:
+        raise MicrostructureAssetError(
+            f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
+            f"{MOST_REACH_PX}: lengths differ too much over its texture"
+        )
+    return reach
+
+
+def with_displacement(
+    scene: ViewerScene, pyramid: Pyramid, *, table: KernelTable = FOREHEAD
+) -> ViewerScene:
+    """Return a scene that fetches its relief as tiles in place of growing it from a patch.
+
+    Parameters
+    ----------
+    scene : ViewerScene
+        Its own relief, where it has one, is left out.
+    pyramid : Pyramid
+        Of the displacement, in the texture of the scene's mesh.
+    table : KernelTable
+        Of that skin.
+
+    Raises
+    ------
+    MicrostructureAssetError
+        As of `from_relief`.
+    """
+    scale = px_per_mm(scene.mesh)
+    pixel_um = 1e3 / (pyramid.size * float(np.median(scale)))
+    source = pyramid.levels[0]
+    first = (pyramid.size - SAMPLE_PX) // 2
+    middle = np.asarray(source[first : first + SAMPLE_PX, first : first + SAMPLE_PX], np.float32)
+    made = from_relief(MicroRelief(middle, pixel_um, table, "displacement"), scene.mesh)
+    facts = dict(made["facts"]["microstructure"])
+    for unused in ("patch_px", "cell_px", "choices", "seed"):
+        del facts[unused]
+    facts |= {
+        "virtual_px": pyramid.size,
+        "levels": len(pyramid.levels),
+        "reach_px": reach_px(table, scale, pyramid.size),
+        "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
+    }
+    bare = replace(
+        scene,
+        textures={k: v for k, v in scene.textures.items() if k != "relief_patch"},
+        tables={k: v for k, v in scene.tables.items() if k not in made["tables"]},
+        facts={k: v for k, v in scene.facts.items() if k != "microstructure"},
+        left_out=tuple(row for row in scene.left_out if row[0] != "microstructure"),
+    )
+    return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
+
+
+def px_per_mm(mesh: ViewerMesh) -> Floats:
+    """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
+    from model.microstructure.mesh_strain import strain
+
+    rest = mesh.positions.astype(np.float64)
+    found = strain(rest, rest, mesh.faces, mesh.uv)
+    if not found.valid.any():
+        raise MicrostructureAssetError("mesh: got no triangle with an area in the texture")
+    a, b, c = found.uv_metric[found.valid].T
+    return np.asarray(np.sqrt(np.abs(a * c - b * b)))
+
+
+def largest_sigma_um(table: KernelTable) -> float:
+    """Return the widest kernel of a table within its range, um."""
+    ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
+    return float(kernel_parameters(ends, table)[1].max())

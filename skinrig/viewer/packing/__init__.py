@@ -1,0 +1,1 @@
+"""Packing of arrays and text into the page."""

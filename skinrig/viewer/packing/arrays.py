@@ -1,0 +1,262 @@
+"""Arrays made small for a page: quantized with a stated error, predicted, compressed.
+
+Everything goes into one gzip stream with a JSON header that says where each array lies. The words
+of an array are first replaced by their differences from neighbors (modulo the word), which a
+cumulative sum undoes, and their bytes are sorted by rank; which neighbors is chosen by what
+compresses best.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.viewer.packing import deflating, octaves
+from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
+
+Float32 = NDArray[np.float32]
+Words = NDArray[Any]
+"""uint8, uint16, int16, float16 or float32."""
+
+PREDICTORS: Final = ("none", "left", "up", "plane")
+"""Which neighbors a word is predicted from; "plane" is left + up - upper left."""
+NORMAL_STEPS: Final = 8191.0
+"""Steps of a normal's component from 0 to 1: 0.005 degrees."""
+SHAPE_BITS: Final = 32767
+"""Steps of a blend shape's largest movement, at most."""
+SHAPE_STEP_MM: Final = 2.5e-4
+"""Steps of blend shapes are no finer than this: over an edge of 1 mm a strain of 2e-4."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A scene as bytes.
+
+    Attributes
+    ----------
+    header
+        JSON values: everything but the arrays, and where they lie in the payload.
+    payload
+        gzip of the arrays.
+    errors
+        Largest quantization error by array, in its own unit.
+    """
+
+    header: Mapping[str, Any]
+    payload: bytes
+    errors: Mapping[str, float]
+
+    def header_bytes(self) -> bytes:
+        """Return the header as JSON, the same bytes for the same scene."""
+        return json.dumps(
+            self.header, allow_nan=False, sort_keys=True, separators=(",", ":")
+        ).encode("utf-8")
+
+
+def quantize(values: Float32, storage: Storage) -> tuple[Words, Float32, Float32]:
+    """Return the words of a texture, and the range of each layer and channel.
+
+    Parameters
+    ----------
+    values
+        Shape (H, W, C) or (L, H, W, C).
+    storage
+        "u8", "u16", "f16" or "f32"; the range of floats is 0 to 1: they are not scaled.
+
+    Returns
+    -------
+    words, low, high
+        Words of the same shape; low and high of shape (C,) or (L, C).
+    """
+    kept = (*range(values.ndim - 3), values.ndim - 1)
+    shape = tuple(values.shape[axis] for axis in kept)
+    if storage in ("f16", "f32"):
+        kind = np.float16 if storage == "f16" else np.float32
+        return values.astype(kind), np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    low, high = values.min(axis=(-3, -2)), values.max(axis=(-3, -2))
+    top = 255.0 if storage == "u8" else 65535.0
+    spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
+    share = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
+    words = np.rint(np.clip(share, 0.0, 1.0) * top)
+    return words.astype(np.uint8 if storage == "u8" else np.uint16), low, high
+
+
+def dequantize(words: Words, low: Float32, high: Float32) -> Float32:
+    """Return what the page makes of words."""
+    if words.dtype.kind == "f":
+        return words.astype(np.float32)
+    top = np.float32(np.iinfo(words.dtype).max)
+    span = (high - low)[..., None, None, :]
+    return np.asarray(low[..., None, None, :] + span * (words.astype(np.float32) / top), np.float32)
+
+
+def stored(texture: Texture) -> tuple[Words, Float32, Float32]:
+    """Return the words that the page holds of a texture, and their range."""
+    if texture.fine == 1:
+        return quantize(texture.values, texture.storage)
+    _, low, high = quantize(texture.values, "u8")
+    coarse, steps = octaves.split(_unrounded(texture.values, low, high), texture.fine)
+    return octaves.joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
+
+
+def _unrounded(values: Float32, low: Float32, high: Float32) -> NDArray[np.float64]:
+    """Return words of 0 to 255 before rounding, (L, H, W, C)."""
+    spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
+    share = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
+    return share.reshape(-1, *values.shape[-3:]) * 255.0
+
+
+def as_packed(scene: ViewerScene) -> ViewerScene:
+    """Return the scene as the page holds it: textures and blend shapes after quantization.
+
+    References in tests are computed from this, so that they compare shaders and not storage.
+    """
+    textures = {
+        name: replace(texture, values=dequantize(*stored(texture)))
+        for name, texture in scene.textures.items()
+    }
+    shapes = {
+        name: (words * np.float32(step)).astype(np.float32)
+        for name, (words, step) in _shape_words(scene.mesh).items()
+    }
+    return replace(scene, textures=textures, mesh=replace(scene.mesh, shapes=shapes))
+
+
+def pack(scene: ViewerScene) -> Packed:
+    """Return a scene as a header and one compressed payload."""
+    chunks: list[bytes] = []
+    errors: dict[str, float] = {}
+    offset = 0
+
+    def put(words: Words) -> dict[str, Any]:
+        nonlocal offset
+        predictor, data = _predicted(words)
+        entry = {
+            "offset": offset,
+            "shape": list(words.shape),
+            "type": words.dtype.str[1:],
+            "predictor": predictor,
+        }
+        # typed arrays want offsets in whole words of any size
+        padded = data + b"\0" * (-len(data) % 4)
+        chunks.append(padded)
+        offset += len(padded)
+        return entry
+
+    mesh = scene.mesh
+    kind = np.uint16 if len(mesh.positions) <= 65536 else np.uint32
+    header: dict[str, Any] = {
+        "mesh": {
+            "positions": put(mesh.positions),
+            "normals": put(np.rint(mesh.normals * NORMAL_STEPS).astype(np.int16)),
+            "uv": put(mesh.uv),
+            "faces": put(mesh.faces.astype(kind)),
+            "weld": put(welded(mesh.positions).astype(kind)[:, None]),
+            "shapes": {
+                name: {"step": float(np.float32(step)), "deltas": put(words)}
+                for name, (words, step) in _shape_words(mesh).items()
+            },
+        },
+        "textures": {},
+        "tables": {name: put(np.asarray(table)) for name, table in sorted(scene.tables.items())},
+    }
+    for name, (_, step) in _shape_words(mesh).items():
+        errors[f"shape {name}"] = 0.5 * float(step)
+    for name, texture in sorted(scene.textures.items()):
+        words, low, high = stored(texture)
+        off = dequantize(words, low, high) - texture.values
+        errors[name] = float(np.abs(off).max())
+        data: dict[str, Any]
+        if texture.fine == 1:
+            data = put(np.ascontiguousarray(words[..., ::-1, :, :]))
+        else:
+            errors[f"{name} rms"] = float(np.sqrt(np.mean(off.astype(np.float64) ** 2)))
+            turned = np.ascontiguousarray(_unrounded(texture.values, low, high)[:, ::-1])
+            coarse, steps = octaves.split(turned, texture.fine)
+            data = {
+                "predictor": "octaves",
+                "fine": texture.fine,
+                "coarse": put(coarse),
+                "steps": put(steps),
+            }
+        header["textures"][name] = _texture_entry(texture, low, high) | {"data": data}
+    header |= {
+        "params": scene.params,
+        "presets": scene.presets,
+        "facts": scene.facts,
+        "provenance": scene.provenance,
+        "left_out": [list(row) for row in scene.left_out],
+        "quantization_error": errors,
+        "bytes": offset,
+    }
+    payload = deflating.gzipped(chunks)
+    header["packed_bytes"] = len(payload)
+    plain = json.loads(json.dumps(header, allow_nan=False, default=dict))
+    return Packed(plain, payload, errors)
+
+
+def welded(positions: Float32) -> NDArray[np.intp]:
+    """Return for each vertex the first that lies at the same place, shape (V,)."""
+    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse.reshape(-1)])
+
+
+def _texture_entry(texture: Texture, low: Float32, high: Float32) -> dict[str, Any]:
+    shape = texture.values.shape
+    return {
+        "width": shape[-2],
+        "height": shape[-3],
+        "layers": shape[0] if len(shape) == 4 else 0,
+        "channels": shape[-1],
+        "storage": texture.storage,
+        "filter": texture.filter,
+        "low": low.tolist(),
+        "high": high.tolist(),
+    }
+
+
+def _shape_words(mesh: ViewerMesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+    out = {}
+    for name, deltas in mesh.shapes.items():
+        step = np.float32(max(float(np.abs(deltas).max()) / SHAPE_BITS, SHAPE_STEP_MM))
+        out[name] = (np.rint(deltas / step).astype(np.int16), step)
+    return out
+
+
+def _predicted(words: Words) -> tuple[str, bytes]:
+    """Return the predictor under which words compress best, and their bytes."""
+    little = words.astype(words.dtype.newbyteorder("<"), copy=False)
+    if words.ndim < 2:
+        return "raw", little.tobytes()
+    # floats as words: those beside each other share sign, exponent and first digits
+    little = np.ascontiguousarray(little).view(np.dtype(f"<u{words.dtype.itemsize}"))
+    flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
+    best = ("raw", little.tobytes())
+    least = -1
+    for predictor in PREDICTORS:
+        data = _bytes_of(_differences(flat, predictor))
+        size = deflating.guessed_size(data)
+        if least < 0 or size < least:
+            least, best = size, (predictor, data)
+    return best
+
+
+def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:
+    """Return words less their prediction, modulo the word; shape (L, H, W, C)."""
+    out = words.copy()
+    if predictor in ("left", "plane"):
+        out[:, :, 1:] -= out[:, :, :-1].copy()
+    if predictor in ("up", "plane"):
+        out[:, 1:] -= out[:, :-1].copy()
+    return out
+
+
+def _bytes_of(words: NDArray[Any]) -> bytes:
+    """Return all low bytes, then all high ones: each compresses better by itself."""
+    size = words.dtype.itemsize
+    return words.reshape(-1).view(np.uint8).reshape(-1, size).T.tobytes()
