@@ -174,7 +174,8 @@ def build(
         them is within 4 % with 8 nodes, 0.3 % with 16, 4e-5 with 32 and 4e-7 with 128.
     anisotropy
         Mean cosine g of scattering, in [0, 1). The paper's model has 0; skin has
-        `model.tissue_optics.layers.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it matters.
+        `model.tissue_optics.layers.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it
+        matters.
     beta_m, oxygenation, eta
         As in `model.tissue_optics.two_layer_reflectance`. With other values than the defaults, or
         a g that is not stored, the spectra are computed first: 1 s (g = 0) to 5 s instead of 0.1.

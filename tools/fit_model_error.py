@@ -6,10 +6,11 @@ Subjects of seeds 0 to 19 over all skin types stand before the flash rig, at two
 each pixel the color that the table predicts for the true chromophores is compared with the crossed
 image over a white tile's, both seen through the color filter array but without noise. What the two
 differ by, in the logarithm and without the brightness that is common to the channels, is the
-model's error. Its terms (see ``reconstruction.chromophores.model_error``) are those under which the errors are
-likeliest, as of Student's t with few degrees of freedom: outlines, nostrils and eyelids must not
-widen everybody's intervals. Fine structure is taken from the picture with its noise, as later. The
-whole is scaled so that with the sensor's noise 68 % of pixels lie inside the 68 % ellipse of both.
+model's error. Its terms (see ``reconstruction.chromophores.model_error``) are those under which the
+errors are likeliest, as of Student's t with few degrees of freedom: outlines, nostrils and eyelids
+must not widen everybody's intervals. Fine structure is taken from the picture with its noise, as
+later. The whole is scaled so that with the sensor's noise 68 % of pixels lie inside the 68 %
+ellipse of both.
 
 For where there is no picture there is also one covariance of all pixels of the larger resolution,
 without the outermost 5 %, scaled likewise. The brightness itself is the pixels' log shading. All go

@@ -3,7 +3,8 @@
 Run from the repository root, ``python tools/make_trait_space.py`` (about 3 minutes of one core;
 see `main` for options).
 
-- People: the 87 of `rigsim.population.population.table_1`. A random half of them gets a tan (1.5 times the
+- People: the 87 of `rigsim.population.population.table_1`. A random half of them gets a tan (1.5
+times the
   melanin); everybody gets one of normal (twice as often), cold, hot, sweat, lotion, makeup and
   powder instead of what they wore.
 - Surface: materials fitted to 2 % noisy light from 40 points of each face in 240 pairs of light

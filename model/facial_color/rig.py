@@ -70,7 +70,8 @@ def local_statistics(
     mu, sigma : ndarray
         Shape of the map, over the valid pixels of each disc within the map; NaN where it holds
         none. float32 for float32 and float16 maps, float64 otherwise.
-        `model.facial_color.disc_statistics.measure` tells how many pixels they are of, and gives float64.
+        `model.facial_color.disc_statistics.measure` tells how many pixels they are of, and gives
+        float64.
 
     Raises
     ------
@@ -225,8 +226,8 @@ class HemoglobinRig:
         Notes
         -----
         A state's statistics are compared with those of the neutral map over the same pixels. The
-        scale is sigma_i/sigma_n under the prior of `model.facial_color.deviation_ratio`, which bounds it where
-        the neutral map is constant.
+        scale is sigma_i/sigma_n under the prior of `model.facial_color.deviation_ratio`, which
+        bounds it where the neutral map is constant.
         """
         from model.facial_color.basis import fitted
 

@@ -1,7 +1,8 @@
 """Microstructure of skin under strain: kernels of displacement maps, and which one a stretch asks.
 
-The strain of a mesh is `model.microstructure.mesh_strain`, its fields on a texture `model.microstructure.strain_fields`, the
-convolution `model.microstructure.convolution`; `strain` and `convolve` are found here too.
+The strain of a mesh is `model.microstructure.mesh_strain`, its fields on a texture
+`model.microstructure.strain_fields`, the convolution `model.microstructure.convolution`; `strain`
+and `convolve` are found here too.
 
 A neutral displacement map is convolved along the axis of strain with
 ``k = (1 - alpha) delta + alpha G(sigma)`` (eq. 6): alpha > 0 blurs, alpha < 0 sharpens. A

@@ -1,9 +1,9 @@
 """The statistics of a texture as one vector, and textures that have given statistics.
 
-Histograms of an image and of its steerable-pyramid responses, in decorrelated channels, describe
-a stochastic texture; matching them in turn, starting from an image or from noise, makes another
-texture with them. `model.texture_statistics.space` says how the vector is laid out and what a population
-shares.
+Histograms of an image and of its steerable-pyramid responses, in decorrelated channels, describe a
+stochastic texture; matching them in turn, starting from an image or from noise, makes another
+texture with them. `model.texture_statistics.space` says how the vector is laid out and what a
+population shares.
 
 References
 ----------
@@ -59,9 +59,9 @@ class MatchedTexture:
     image: Array
     """As the image given; texels outside the mask or the region as they were."""
     distances: Floats
-    """(iterations + 1, C, responses): how far the values of each response are from the target's,
-    in spreads of the population (`model.texture_statistics.histograms.distance`): at the start, then after
-    each iteration."""
+    """(iterations + 1, C, responses): how far the values of each response are from the target's, in
+    spreads of the population (`model.texture_statistics.histograms.distance`): at the start, then
+    after each iteration."""
     clipped: Floats
     """(C, responses): share of the result's samples outside the space's edges."""
 

@@ -139,7 +139,8 @@ class TextureSpace:
         ------
         TextureError
             For a wrong length, negative shares, or histograms that do not sum to 1 within 1e-6:
-            `model.texture_statistics.histograms.project_to_histograms` makes valid ones of edited ones.
+            `model.texture_statistics.histograms.project_to_histograms` makes valid ones of edited
+            ones.
         """
         h = self.histograms(vector)
         if h.ndim != 3 or not np.isfinite(h).all() or h.min() < 0.0:

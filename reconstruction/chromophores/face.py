@@ -1,7 +1,7 @@
 """The distribution of one person's melanin and blood, from the colors of the face's pixels.
 
-`reconstruction.chromophores.face_distribution` says what it is and why; `reconstruction.chromophores.posterior`
-weighs each pixel by it.
+`reconstruction.chromophores.face_distribution` says what it is and why;
+`reconstruction.chromophores.posterior` weighs each pixel by it.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ Probability = NDArray[np.floating[Any]]
 
 UNEXPECTED: Final = 0.01
 """Least part of the skin that follows no distribution at all, as of the light
-(`reconstruction.chromophores.shading_prior.UNEXPECTED`): moles and lips are not pulled to the face's mean."""
+(`reconstruction.chromophores.shading_prior.UNEXPECTED`): moles and lips are not pulled to the
+face's mean."""
 MOST_UNEXPECTED: Final = 0.5
 LEAST_SPREAD: Final = (0.02, 0.05)
 """Least standard deviations of log melanin, below which no colors tell it, and of blood's cube

@@ -191,9 +191,9 @@ class Alignment:
             Of the moving picture.
         place
             Whether the error of the place is added to the map's own. Colors for
-            `reconstruction.facial_color.shared_melanin` go without: `reconstruction.facial_color.registration_error` tells it with
-            how the channels go together. What interpolation averages of the noise is taken off
-            then.
+            `reconstruction.facial_color.shared_melanin` go without:
+            `reconstruction.facial_color.registration_error` tells it with how the channels go
+            together. What interpolation averages of the noise is taken off then.
         """
         values, seen = self.warp(skin_map.values, skin_map.valid)
         stderr = None

@@ -1,7 +1,8 @@
 """Levels, delay and time constant of blood that relaxes, with what the samples can tell of them.
 
 The curves of a prompted cycle and of an event are here, and what a fit tells; how likely each delay
-and time constant is, and the intervals of that, are of `reconstruction.facial_color.perfusion_likelihood`.
+and time constant is, and the intervals of that, are of
+`reconstruction.facial_color.perfusion_likelihood`.
 
 Where the face moves, what is found of the blood of one pose is off that of the other by an unknown
 step, the same in all samples of a pose. It comes as promptly as the movement and would be taken

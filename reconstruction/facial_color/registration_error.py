@@ -1,12 +1,13 @@
 """What the color of a picture errs by because it was laid over another one.
 
 A picture of an expression is laid over the neutral one with an error of place
-(`reconstruction.correspondence.expression_alignment`), so that a pixel shows the color of skin beside it. That is
-the picture's own error, where a face that holds still has errors that its pictures share.
+(`reconstruction.correspondence.expression_alignment`), so that a pixel shows the color of skin
+beside it. That is the picture's own error, where a face that holds still has errors that its
+pictures share.
 
 Light that slopes evenly makes a misplaced picture brighter or darker all around alike. Who follows
-how the light changes from picture to picture (`reconstruction.facial_color.light_change`) has taken that off:
-what is left is the slopes that are finer than the window in which it is followed.
+how the light changes from picture to picture (`reconstruction.facial_color.light_change`) has taken
+that off: what is left is the slopes that are finer than the window in which it is followed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The blood of several states of one pixel under one melanin: all pixels in parallel.
 
-`reconstruction.facial_color.shared_melanin` is the door and says what is computed; a plain NumPy twin is in its
-tests.
+`reconstruction.facial_color.shared_melanin` is the door and says what is computed; a plain NumPy
+twin is in its tests.
 """
 
 from __future__ import annotations

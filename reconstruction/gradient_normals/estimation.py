@@ -141,8 +141,8 @@ def from_patterns(
         The same of the crossed pictures, where skin glows with less detail; default `smooth_px`.
     wiener : bool
         Filter the moments, instead, by what share of each spatial frequency is signal
-        (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask for. Standard
-        errors then hold the detail that is lost, too.
+        (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask for.
+        Standard errors then hold the detail that is lost, too.
     executor : Executor, optional
         Threads to map tiles of rows over; default one thread a core, at most 8.
 

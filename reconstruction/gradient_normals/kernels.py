@@ -399,8 +399,8 @@ def invert(  # type: ignore[no-untyped-def]
     mirror : bool
         A reflection's vector, not a matte surface's.
     table, least, step
-        See :class:`reconstruction.gradient_normals.lobe_response.Response`; a table of size 0: the vector points
-        where it should.
+        See :class:`reconstruction.gradient_normals.lobe_response.Response`; a table of size 0: the
+        vector points where it should.
     grid : ndarray, shape (G, G, 2)
         Of :func:`starts`; not read without a table.
     analyser : ndarray, shape (2,)

@@ -9,9 +9,9 @@ no fibre may be left out for the sake of its residual, or weighed by its noise: 
 tell of another medium, its sigma_tr off by as much as a tenth where the misfit is a tenth.
 
 So two things are told apart. First what the profile is without noise, at all of the definition's
-fibres: readings, and that what layers do to a profile is smooth (`reconstruction.subsurface.smooth_misfit`).
-Then the medium nearest to that, all fibres alike. A profile that is off by e, of covariance V,
-moves the medium by::
+fibres: readings, and that what layers do to a profile is smooth
+(`reconstruction.subsurface.smooth_misfit`). Then the medium nearest to that, all fibres alike. A
+profile that is off by e, of covariance V, moves the medium by::
 
     A^-1 J' e,   A = J' J - sum r J2
 

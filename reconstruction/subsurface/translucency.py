@@ -44,9 +44,9 @@ SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
     "chin": (0.500, 0.205),
 }
 """Texture coordinates of the places where a probe is set down, on the simulated heads: of the
-points nearest to the landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002); chin is
-below it, where the skin faces down. Left and right as seen in the picture; a cheek that is not
-named otherwise is the left one."""
+points nearest to the landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002);
+chin is below it, where the skin faces down. Left and right as seen in the picture; a cheek that is
+not named otherwise is the left one."""
 TEXTURE_MM: Final = (200.0, 330.0)
 """What the width and the height of that texture measure on the skin near the middle of the face;
 towards the ears the width is up to 340."""

@@ -1,10 +1,10 @@
 """The homogeneous medium whose profile is nearest to a given one.
 
 Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
-fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the given
-one: the logarithms of the ratios have the least variance over the fibres, all of one weight; fibres
-that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from
-noise. The factor is for what pigment in a thin layer on top takes from light on its way in and
+fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
+given one: the logarithms of the ratios have the least variance over the fibres, all of one weight;
+fibres that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them
+from noise. The factor is for what pigment in a thin layer on top takes from light on its way in and
 out, at all distances alike. Tissue without layers that scatters by direction has no such factor:
 with one its nearest media jump between far valleys from one direction to the next. Of dark skin the
 nearest medium scatters without bounds: its profile is that of a dipole at the surface, which tells

@@ -192,8 +192,8 @@ def half_space(
 class SkinTissue:
     """Skin of two layers: an epidermis with melanin on a dermis with blood.
 
-    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Under a head the blood that is not
-    held back is pressed out: of the blood at rest there is left
+    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Under a head the blood that is
+    not held back is pressed out: of the blood at rest there is left
 
         BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
 

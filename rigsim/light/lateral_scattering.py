@@ -1,8 +1,8 @@
 """What leaves the inside of a face under one lamp: light that spread sideways, or came from skin.
 
 The light that enters is gathered in the face's texture; it spreads by the same lateral transport as
-in the flash rig (`rigsim.light.subsurface_radiance.spread_pattern` says how well that holds), and comes from
-other skin by `rigsim.light.interreflection`.
+in the flash rig (`rigsim.light.subsurface_radiance.spread_pattern` says how well that holds), and
+comes from other skin by `rigsim.light.interreflection`.
 """
 
 from __future__ import annotations

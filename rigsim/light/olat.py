@@ -140,7 +140,7 @@ class Hits:
 
 
 def pack_surface(values: Float32Array) -> UInt16Array:
-    """Return rows of `rigsim.light.surface_brdf.SkinSurface.packed` as `Hits.surface` holds them."""
+    """Return `SkinSurface.packed` of `rigsim.light.surface_brdf`, as rows of `Hits.surface`."""
     unit = np.asarray(values, np.float32).copy()
     if not (np.isfinite(unit).all() and unit.min(initial=0.0) >= 0.0):
         raise ValueError("surface: got values that are negative or not finite, expected >= 0")

@@ -1,8 +1,8 @@
 """Shadows of wrinkles: relief that the texture holds and the mesh does not, hiding lights from it.
 
 For each direction over the texture the elevation of its own horizon is found once
-(`rigsim.light.self_shadow`); a light below it is hidden from that texel. Horizons are those of the relief
-over the mesh as if that were flat over a few millimeters; what the mesh hides, rays tell.
+(`rigsim.light.self_shadow`); a light below it is hidden from that texel. Horizons are those of the
+relief over the mesh as if that were flat over a few millimeters; what the mesh hides, rays tell.
 """
 
 from __future__ import annotations

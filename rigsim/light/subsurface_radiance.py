@@ -286,9 +286,9 @@ def spread_pattern(
     leaves: its pattern acts once before and once after the spreading, as m = sqrt(R / R without
     melanin) each time, with log m blurred by `PIGMENT_BLUR_MM` since light crosses the epidermis
     aslant. Blood acts inside, before the spreading. Against photons that walk through patterned
-    skins at two wavelengths (`rigsim.tissue.patterned_tissue`) this errs by 1.4 % rms over six edges and
-    spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which it was
-    not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
+    skins at two wavelengths (`rigsim.tissue.patterned_tissue`) this errs by 1.4 % rms over six
+    edges and spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which
+    it was not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
     """
     channels = reflectance.shape[-1]
     log_m = np.log(reflectance / without_melanin) * np.float32(0.5)

@@ -1,7 +1,7 @@
 """What cold, heat, sweat, lotion, makeup and powder do to a face.
 
-A condition changes what carries the appearance, never pictures: the radius of the vessels, the
-oil, the facets, and what lies on the skin (`rigsim.light.surface_brdf.Coating`). Amounts run from 0,
+A condition changes what carries the appearance, never pictures: the radius of the vessels, the oil,
+the facets, and what lies on the skin (`rigsim.light.surface_brdf.Coating`). Amounts run from 0,
 which changes nothing at all, to 1.
 
 ======== ========================================================================================
@@ -17,8 +17,8 @@ powder   grains on 45 %, which scatter back; a matte white part below them; a fi
 ======== ========================================================================================
 
 What grains scatter once goes every way, and eq. (6) takes the least of it for diffuse light: under
-powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.surface_floor`, the truth's map
-``r_d_floor``).
+powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.surface_floor`, the truth's
+map ``r_d_floor``).
 
 All these amounts are chosen; what is known is their direction and order of size:
 

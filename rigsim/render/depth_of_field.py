@@ -6,14 +6,14 @@ confusion say, all of it; where near skin stands before far skin, the near cover
 
 Notes
 -----
-Weights come from the OTF of a defocused circle (`rigsim.render.lens_blur.Lens`), times those of a pixel
-and of the square that a sample stands for: without blur they are what averaging over a pixel is. A
-pixel that sees nothing but one smooth surface gets weights of sum 1, since radiance does not change
-along rays: what the spreading alone would miss is the change of the circle along a slope, 1e-4 on
-a face. At an edge two layers are told apart by the widest gap in depth; the far one gets what the
-near one leaves free, also of what it hides from the pupil's middle, which looks as the rest does.
-Light further out than `LensSpread.radius` pixels is put back: the far rings of diffraction, and the
-glare of real lenses, are not in the picture.
+Weights come from the OTF of a defocused circle (`rigsim.render.lens_blur.Lens`), times those of a
+pixel and of the square that a sample stands for: without blur they are what averaging over a pixel
+is. A pixel that sees nothing but one smooth surface gets weights of sum 1, since radiance does not
+change along rays: what the spreading alone would miss is the change of the circle along a slope,
+1e-4 on a face. At an edge two layers are told apart by the widest gap in depth; the far one gets
+what the near one leaves free, also of what it hides from the pupil's middle, which looks as the
+rest does. Light further out than `LensSpread.radius` pixels is put back: the far rings of
+diffraction, and the glare of real lenses, are not in the picture.
 """
 
 from __future__ import annotations

@@ -22,7 +22,8 @@ def load(choice: VariantChoice) -> Any:
     Parameters
     ----------
     choice
-        Result of `rigsim.render.variant.choose_variant`; its library is set before the first import.
+        Result of `rigsim.render.variant.choose_variant`; its library is set before the first
+        import.
 
     Returns
     -------

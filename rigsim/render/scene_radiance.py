@@ -1,7 +1,8 @@
 """What is rendered: radiance of described scenes, by the renderer's own materials and sampling.
 
-A mesh that rays are cast on (`rigsim.render.caster`), what rays meet (`rigsim.render.rays`) and the renderer's
-start (`rigsim.render.renderer`) are modules of their own; their names are found here, too.
+A mesh that rays are cast on (`rigsim.render.caster`), what rays meet (`rigsim.render.rays`) and the
+renderer's start (`rigsim.render.renderer`) are modules of their own; their names are found here,
+too.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ def radiance(
     ----------
     description
         Mitsuba's scene dictionary, with numbers, texts and arrays only; a ``to_world`` is a 4 x 4
-        array, a ``bitmap`` an image; a shape of type ``mesh`` has a `rigsim.geometry.mesh.Mesh` as ``mesh``.
+        array, a ``bitmap`` an image; a shape of type ``mesh`` has a `rigsim.geometry.mesh.Mesh` as
+        ``mesh``.
     kind
         Variant kind, see `rigsim.render.variant.choose_variant`.
     samples

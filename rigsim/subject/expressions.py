@@ -1,8 +1,9 @@
 """How a face moves in an expression: action units that pull the skin, and states made of them.
 
-Each action is a smooth field on the mean head, so any mesh that `rigsim.subject.face_regions.on_mean_head`
-places can wear it; a mesh that brings blend shapes of the common names moves by its own. Eyes and
-mouth stay closed: a jaw that drops stretches the lips in place of parting them.
+Each action is a smooth field on the mean head, so any mesh that
+`rigsim.subject.face_regions.on_mean_head` places can wear it; a mesh that brings blend shapes of
+the common names moves by its own. Eyes and mouth stay closed: a jaw that drops stretches the lips
+in place of parting them.
 
 References
 ----------

@@ -1,9 +1,9 @@
 """How blood follows what a person does: prompts, exercise, alcohol; known at every time.
 
-A state's vessels are dilated by a part of what `rigsim.subject.perfusion` says, the state's level: 0 at
-rest, 1 in full. Vessels relax towards what is asked of them, rise and fall with time constants of
-their own. A prompt is answered after the person's reaction time, each a little otherwise. Exercise
-is at its height when it ends, and fades; alcohol is absorbed after it was drunk.
+A state's vessels are dilated by a part of what `rigsim.subject.perfusion` says, the state's level:
+0 at rest, 1 in full. Vessels relax towards what is asked of them, rise and fall with time constants
+of their own. A prompt is answered after the person's reaction time, each a little otherwise.
+Exercise is at its height when it ends, and fades; alcohol is absorbed after it was drunk.
 """
 
 from __future__ import annotations

@@ -115,7 +115,8 @@ class Subject:
         Parameters
         ----------
         state
-            One of `rigsim.subject.perfusion.STATES`; those that are no expression do not move the face.
+            One of `rigsim.subject.perfusion.STATES`; those that are no expression do not move the
+            face.
         amount
             0 (rest) to 1 (full) and 1.5 (an extreme).
 
@@ -189,7 +190,7 @@ class Subject:
         return expressions.blend_shapes(rest.mesh, seed=self.seed)
 
     def tangent_normal(self) -> Float32Array:
-        """Return the normals in the frame of the texture, see `rigsim.subject.relief.tangent_normals`.
+        """Return the normals in the texture's frame (`rigsim.subject.relief.tangent_normals`).
 
         Returns
         -------

@@ -63,9 +63,9 @@ def patterned_reflectance(
 
     Notes
     -----
-    Layers, scattering and absorption are those of `rigsim.tissue.skin_layers`; anisotropic scattering
-    (Henyey-Greenstein), Fresnel reflection at the surface. Absorption attenuates along each flight,
-    sampled at steps of at most half a pixel.
+    Layers, scattering and absorption are those of `rigsim.tissue.skin_layers`; anisotropic
+    scattering (Henyey-Greenstein), Fresnel reflection at the surface. Absorption attenuates along
+    each flight, sampled at steps of at most half a pixel.
     """
     melanin, blood = np.asarray(c_m, np.float64), np.asarray(c_hd, np.float64)
     if melanin.ndim != 2 or melanin.shape != blood.shape or melanin.shape[0] != melanin.shape[1]:

@@ -60,7 +60,8 @@ class MicrostructureReport:
     clipped_share : float
         Of the vertices: an alpha that the table's lines have beyond [-2, 1].
     invalid_share, degenerate_share, uv_degenerate_share, uv_turned_share : float
-        Of the vertices: without strain. Of the triangles: as in `model.microstructure.mesh_strain.MeshStrain`.
+        Of the vertices: without strain. Of the triangles: as in
+        `model.microstructure.mesh_strain.MeshStrain`.
     covered_share : float
         Of the pixels: within a triangle of the texture. Others keep the neutral relief.
     changed_share : float

@@ -3,7 +3,8 @@
 The half that faces +z and a margin are one chart, by stereographic projection from -z, which keeps
 angles: x of the texture is x in space, and its rows go down with y. Relief is a map on that chart,
 from noise in space (top row of the figure) or grown from patches (bottom row), and follows the
-strain of the sphere's mesh like any other (`model.microstructure.mesh_strain`, `model.microstructure`).
+strain of the sphere's mesh like any other (`model.microstructure.mesh_strain`,
+`model.microstructure`).
 
 References
 ----------

@@ -19,11 +19,11 @@ Write = Callable[[SkinAppearance, Path, Delivery], list[tuple[str, str]]]
 
 FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps",
-    "mtlx": "materialx",
-    "gltf": "gltf",
-    "usd": "usd",
-    "spectral": "spectral",
-    "metahuman": "delta_maps",
+    "mtlx": "materials.materialx",
+    "gltf": "materials.gltf",
+    "usd": "materials.usd",
+    "spectral": "sessions.spectral",
+    "metahuman": "packs.delta_maps",
 }
 """Format to the module of this package whose ``write`` makes it: each imports its own libraries."""
 

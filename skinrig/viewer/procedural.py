@@ -42,7 +42,8 @@ def scene(
     ------
     SceneError
         For a size out of range.
-    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.errors.BlendShapeError
+    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
+    skinrig.blend_shapes.errors.BlendShapeError
         For a preset, seed or mesh that cannot be used.
     """
     check_size(size)
@@ -81,8 +82,8 @@ def load_mesh(path: Path) -> Mesh:
     Parameters
     ----------
     path
-        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The face
-        looks towards +z, and its foremost vertex is the tip of the nose.
+        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The
+        face looks towards +z, and its foremost vertex is the tip of the nose.
     """
     from rigsim.geometry.mesh import build_mesh, centered
     from skinrig.blend_shapes import meshes as blend_shapes

@@ -53,7 +53,9 @@ NOT_DRIVEN = {
                 "reconstruction.pipeline.dome.motion": "follow_head",
                 "reconstruction.pipeline.dome.registration": "register spread",
                 "reconstruction.pipeline.dome.stages": "graph maps_of weight_names",
-                "reconstruction.pipeline.flash.facial_color": "alignment_document fit repeats_document",
+                "reconstruction.pipeline.flash.facial_color": (
+                    "alignment_document fit repeats_document"
+                ),
                 "reconstruction.pipeline.flash.stages": "diffuse_of_each graph inputs_of",
                 "reconstruction.pipeline.gradient.images": "state_name",
                 "reconstruction.pipeline.gradient.stages": "graph products",

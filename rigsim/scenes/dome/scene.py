@@ -11,8 +11,8 @@ on-time at level 1::
     signal = gain_c I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
 
 averaged over the pixel, and over the LED's disc where it casts shadows. A dome stands as its
-drawing says, or as it was built (`rigsim.as_built.dome`): with other places and powers, bent images,
-responses that differ, dead LEDs and crossed wires.
+drawing says, or as it was built (`rigsim.as_built.dome`): with other places and powers, bent
+images, responses that differ, dead LEDs and crossed wires.
 """
 
 from __future__ import annotations
@@ -66,13 +66,14 @@ class DomeScene:
     motion
         How the head moves; ``None`` holds it still. Targets stand still.
     state
-        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression where the
-        state is one; targets have none.
+        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression
+        where the state is one; targets have none.
     movement
         Whether the face moves and wrinkles with the state. A subject that is already posed
         (`Subject.posed`) stays in its pose.
     conditions
-        Conditions of the skin with their amounts, see `rigsim.population.conditions`; targets have none.
+        Conditions of the skin with their amounts, see `rigsim.population.conditions`; targets have
+        none.
     sensor
         Sensor of every view; ``None`` takes what each view states.
     seed
@@ -312,12 +313,11 @@ class DomeScene:
             Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
 
             ``r_d``: factor of the diffuse term, white-balanced, see `rigsim.light.surface_brdf`;
-            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
-            ``roughness``, ``oil``, ``fuzz``: of the surface terms, under a condition also
-            ``film``, ``film_alpha``, ``film_eta``, ``powder`` (`rigsim.light.surface_brdf.Coating`);
-            ``uv``: (H, W, 2);
-            ``hair``: part covered by hair (brows, lashes);
-            ``mask``: bool, pixels wholly on skin.
+            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame; ``roughness``,
+            ``oil``, ``fuzz``: of the surface terms, under a condition also ``film``,
+            ``film_alpha``, ``film_eta``, ``powder`` (`rigsim.light.surface_brdf.Coating`); ``uv``:
+            (H, W, 2); ``hair``: part covered by hair (brows, lashes); ``mask``: bool, pixels wholly
+            on skin.
 
         Raises
         ------
@@ -340,10 +340,10 @@ class DomeScene:
         -------
         SkinAppearance
             ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
-            (`rigsim.light.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d even
-            without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``,
-            ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and wrinkles alone;
-            comparable between states texel by texel); of a face that has moved also
+            (`rigsim.light.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d
+            even without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``,
+            ``fuzz``, ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and
+            wrinkles alone; comparable between states texel by texel); of a face that has moved also
             ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
             skin. All is that of the skin under its conditions.
         """

@@ -269,8 +269,8 @@ class TargetScene:
         Returns
         -------
         dict
-            ``position_mm`` (L, 3), ``axis`` (L, 3), ``exponent`` (L,) of the lights in the order
-            of the rig; ``intensity`` (L, 3) in the unit of `rigsim.light.led_light.white_intensity`, 0
+            ``position_mm`` (L, 3), ``axis`` (L, 3), ``exponent`` (L,) of the lights in the order of
+            the rig; ``intensity`` (L, 3) in the unit of `rigsim.light.led_light.white_intensity`, 0
             where dead; ``gain`` by view; ``ball_mm`` (places, 3) or ``plate_pose`` (a list of
             rotation and place).
         """

@@ -19,7 +19,7 @@ HAIR_LIMIT: Final = 0.02
 """Pixels with more hair than this part are not skin."""
 
 COATING: Final = ("film", "film_alpha", "film_eta", "powder")
-"""Names of the maps of a coating, in the order of `rigsim.light.surface_brdf.SkinSurface.packed`."""
+"""Names of a coating's maps, in the order of `SkinSurface.packed` (`rigsim.light.surface_brdf`)."""
 
 
 def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:

@@ -81,8 +81,8 @@ class FlashScene:
     subject
         A face or a target.
     state
-        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression where the
-        state is one; targets have none.
+        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression
+        where the state is one; targets have none.
     movement
         Whether the face moves and wrinkles with the state; else it stays as it is given. A subject
         that is already posed (`Subject.posed`) stays in its pose.
@@ -350,8 +350,8 @@ class FlashScene:
         -------
         dict
             Name to (x, y) on the sensor, px: x to the right, y down, the centre of pixel (0, 0) is
-            (0, 0); see `rigsim.subject.landmarks.POINTS_MM`. Points that the camera does not see are
-            missing. They go with the skin from state to state.
+            (0, 0); see `rigsim.subject.landmarks.POINTS_MM`. Points that the camera does not see
+            are missing. They go with the skin from state to state.
 
         Raises
         ------

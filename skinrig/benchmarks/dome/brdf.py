@@ -41,7 +41,8 @@ SKINS: dict[str, tuple[float, float, float]] = {
     "medium": (0.315, 0.189, 0.133),
     "dark": brdf_truth.DARK_SKIN,
 }
-"""Mean R_d of each band of `skinrig.evaluating.skin_bands`; the middle one is the others' geometric mean."""
+"""Mean R_d of each band of `skinrig.evaluating.skin_bands`; the middle one is the geometric mean
+of the others."""
 
 
 def albedo(*, toy: bool) -> StageBenchmark:

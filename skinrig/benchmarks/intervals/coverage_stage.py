@@ -1,9 +1,9 @@
 """Whether stated intervals hold the truth as often as they say, on subjects that set nothing.
 
 Terms of error models, and the factors from 68 to 95 %, were set on subjects of seeds 0 to 19
-(`reconstruction.chromophores.model_error`); subjects here have seeds from 400 on. Each goes the whole way, from
-calibration targets to maps, with a calibration of its rig's own (`interval_trials_flash` and
-its like).
+(`reconstruction.chromophores.model_error`); subjects here have seeds from 400 on. Each goes the
+whole way, from calibration targets to maps, with a calibration of its rig's own
+(`interval_trials_flash` and its like).
 
 A coverage is the mean of the subjects' shares, and its interval is that of the mean of so many
 subjects. A promise is missed where the interval lies wholly outside the promised range. The

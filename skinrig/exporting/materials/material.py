@@ -149,7 +149,7 @@ class Material:
 
     @property
     def radius_mm(self) -> Floats:
-        """Mean free path, (H, W, 3), mm; see :mod:`skinrig.exporting.materials.subsurface_radius`."""
+        """Mean free path, (H, W, 3), mm; see `skinrig.exporting.materials.subsurface_radius`."""
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
 

@@ -1,7 +1,7 @@
 """What the page needs to wrinkle: base derivatives, wrinkle maps, zones, and who moves them.
 
-Maps are those of `model.wrinkles.evaluation`: fitted (`skinrig fit wrinkles`) where a folder has them,
-otherwise fitted to the simulated person's own expressions. The page adds them as
+Maps are those of `model.wrinkles.evaluation`: fitted (`skinrig fit wrinkles`) where a folder has
+them, otherwise fitted to the simulated person's own expressions. The page adds them as
 `model.wrinkles.combine_layers` does.
 """
 

@@ -1,10 +1,10 @@
 """What the page needs to show microstructure: a patch, its table of kernels, and its roughness.
 
-The page grows a displacement from the patch (`skinrig.viewer.microstructure.relief_growth`) and convolves it by
-the strain of the pose. What a screen's pixel cannot resolve does not vanish: the variance of the
-slopes that are not drawn goes into the roughness of the highlight, by two tables that are computed
-here: how much of the variance each level of the pyramid keeps, and how the variance changes with
-the stretch of the skin.
+The page grows a displacement from the patch (`skinrig.viewer.microstructure.relief_growth`) and
+convolves it by the strain of the pose. What a screen's pixel cannot resolve does not vanish: the
+variance of the slopes that are not drawn goes into the roughness of the highlight, by two tables
+that are computed here: how much of the variance each level of the pyramid keeps, and how the
+variance changes with the stretch of the skin.
 """
 
 from __future__ import annotations
