@@ -149,7 +149,7 @@ class VectorLight:
         return sum_rows(self.hits, r, g, b, color)
 
     def _unpacked(self, dr: Any, mi: Any) -> tuple[Any, list[Any]]:
-        """Return unit normals and the columns of `SkinSurface.packed` (`rigsim.light.surface_brdf`)."""
+        """Return unit normals and columns of `SkinSurface.packed` (`rigsim.light.surface_brdf`)."""
         low = [word & 0xFFFF for word in self._words]
         high = [word >> 16 for word in self._words]
         halves = [half for pair in zip(low, high, strict=True) for half in pair]
