@@ -29,7 +29,7 @@ providers._get_local_constants = providers.Constants
 # What one process writes another reads whether or not it has reached the disk: only a cut of power
 # tells, which tests/faults/test_power_cut.py models operation by operation. Each frame waits three
 # times for the disk, in which its core has nothing to do; an invalid descriptor is still refused.
-# That the calls come, tests/unit/capture/test_disk.py sees.
+# That the calls come, tests/unit/capture/session/test_disk.py sees.
 os.fsync = os.fdatasync = lambda descriptor: os.fstat(descriptor) and None
 
 ROOT = Path(__file__).parents[1]
@@ -66,8 +66,8 @@ LONGEST_FIRST = (
     "tests/recovery/test_head_motion.py",
     "tests/faults/test_power_cut.py",
     "tests/unit/skinrig/exporting/test_consent_on_its_way.py",
-    "tests/unit/rigsim/test_tissue_mc_skin_table.py",
-    "tests/unit/reconstruction/test_kernel_fit.py",
+    "tests/unit/rigsim/tissue/test_skin_table.py",
+    "tests/unit/reconstruction/kernel_fit/test_fit.py",
 )
 """Files that take 20 s and more, the longest first; the rest go by how many tests they have. One
 process runs a file from end to end, so one of these taken up last would leave the others without

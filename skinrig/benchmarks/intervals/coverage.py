@@ -34,8 +34,7 @@ class Trial:
     subject: str
     """Preset or medium, and its seed."""
     band: str
-    """Band of skin color (`skinrig.evaluating.skin_bands`); "any" where the quantity does not depend
-    on it."""
+    """Band of skin color (`skinrig.evaluating.skin_bands`); "any" where the quantity needs none."""
     deviation: Floats
     """|estimate - truth| over the half width of the stated 68 % interval, (n,)."""
     width: float

@@ -99,7 +99,7 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
             Limit("68 % intervals that hold", inside, COVERAGE[0], ">=", "%"),
             Limit("68 % intervals that hold, at most", inside, COVERAGE[1], "<=", "%"),
         ),
-        (("steadiness of the source", "steady here; tests/unit/capture/test_fibre_readings.py"),),
+        (("steadiness of the source", "steady here; see `test_readings.py` of its calibration"),),
         interval_of="fibres and colors",
         no_bands="light of fibres over seven decades, whatever sends it",
     )  # fmt: skip

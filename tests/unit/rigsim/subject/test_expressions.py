@@ -16,7 +16,7 @@ from rigsim.subject.expressions import (
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATES
 
-SCANNED_HEAD = Path(__file__).parents[4] / "shared" / "data" / "ict_face.npz"
+SCANNED_HEAD = Path(__file__).parents[5] / "shared" / "data" / "ict_face.npz"
 
 
 @pytest.fixture(scope="module")

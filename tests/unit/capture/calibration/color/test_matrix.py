@@ -12,7 +12,7 @@ from capture.calibration.color import matrix as color
 from capture.calibration.color.chart import ChartError, find_chart, measure_patches
 from capture.calibration.color.matrix import fit_matrix
 
-DATA = Path(os.environ.get("SKINRIG_TEST_DATA", Path(__file__).parents[4] / "shared" / "data"))
+DATA = Path(os.environ.get("SKINRIG_TEST_DATA", Path(__file__).parents[6] / "shared" / "data"))
 needs_data = pytest.mark.skipif(
     not (DATA / "colorchecker").is_dir(), reason="needs the shared test data (SKINRIG_TEST_DATA)"
 )

@@ -99,7 +99,7 @@ def test_table_agrees_with_many_photons_traced_now(table):
 
 @pytest.fixture(scope="module")
 def recipe():
-    path = Path(__file__).parents[3] / "tools" / "make_skin_reflectance.py"
+    path = Path(__file__).parents[4] / "tools" / "make_skin_reflectance.py"
     spec = importlib.util.spec_from_file_location("make_skin_reflectance", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

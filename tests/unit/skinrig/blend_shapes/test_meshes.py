@@ -10,7 +10,7 @@ from model.microstructure.mesh_strain import strain
 from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
 from skinrig.blend_shapes.meshes import load
 
-ICT = Path(__file__).parents[4] / "shared/data/ict_face.npz"
+ICT = Path(__file__).parents[5] / "shared/data/ict_face.npz"
 
 OBJ = """# a folded strip of two squares, one seam in the texture
 v 0 0 0

@@ -16,7 +16,7 @@ from capture.importers import PhotoError, import_photos, read_photo
 from capture.rig import load_rig
 from capture.session import Session, verify
 
-DATA = Path(os.environ.get("SKINRIG_TEST_DATA", Path(__file__).parents[4] / "shared" / "data"))
+DATA = Path(os.environ.get("SKINRIG_TEST_DATA", Path(__file__).parents[5] / "shared" / "data"))
 needs_data = pytest.mark.skipif(
     not (DATA / "raw").is_dir(), reason="needs the shared test data (SKINRIG_TEST_DATA)"
 )

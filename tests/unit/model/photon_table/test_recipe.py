@@ -10,7 +10,7 @@ import pytest
 from model.tissue_optics import adding_doubling
 
 pytestmark = pytest.mark.long  # compiles the walk
-PATH = Path(__file__).parents[3] / "tools" / "make_photon_table.py"
+PATH = Path(__file__).parents[4] / "tools" / "make_photon_table.py"
 SEED = np.array([11, 12, 13], np.uint64)
 
 

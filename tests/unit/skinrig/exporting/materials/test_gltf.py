@@ -132,7 +132,7 @@ def test_trimesh_sees_the_same_surface(folder, material):
 def validator():
     """Return the folder of the npm package gltf-validator, None where it is not installed."""
     told = os.environ.get("GLTF_VALIDATOR")
-    for place in filter(None, (told, Path(__file__).parents[4] / "node_modules/gltf-validator")):
+    for place in filter(None, (told, Path(__file__).parents[5] / "node_modules/gltf-validator")):
         if (Path(place) / "package.json").is_file() and shutil.which("node"):
             return Path(place)
     return None

@@ -16,7 +16,7 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 
-PAGE = Path(__file__).parents[3] / "docs" / "report.md"
+PAGE = Path(__file__).parents[4] / "docs" / "report.md"
 
 
 @pytest.fixture
