@@ -18,7 +18,8 @@ from model import store
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.light_safety import light_rows
-from skinrig.simulating.simulation import Simulated, simulate_session
+from skinrig.simulating.orders import Simulated
+from skinrig.simulating.simulation import simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
 """Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""

@@ -35,7 +35,7 @@ from reconstruction.chromophores import model_error
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
-from skinrig.simulating.flash import to_superpixels
+from skinrig.simulating.flash_truth import to_superpixels
 
 SEEDS = range(20)
 PRESETS = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")

@@ -18,7 +18,8 @@ from reconstruction.pipeline import recipes as pipeline
 from skinrig.benchmarks.probe.session import medium
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.simulating.simulation import simulate_session, truth_folder
+from skinrig.simulating.orders import truth_folder
+from skinrig.simulating.simulation import simulate_session
 
 
 def main(arguments: list[str]) -> None:

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from capture.rig import Probe
-
-if TYPE_CHECKING:
-    from capture.plan.steps import Step
 
 SLACK_S = 0.1
 """What words on the wire and a camera may take beside exposure and read-out, s."""
 PUMPING_S = 2.0
 """About how long a pump takes to reach its suction, s."""
+
+
+class ProbeStep(Protocol):
+    """What this module needs of a plan's step."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of capture."""
+
+    @property
+    def index(self) -> Mapping[str, str | int | float]:
+        """Position in its series."""
+
+    @property
+    def settings(self) -> Mapping[str, str | int | float | bool]:
+        """Settings by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +43,7 @@ class Placement:
         return f"{self.site} at {self.angle_deg:g} degrees{again}"
 
 
-def placement_of(step: Step) -> Placement | None:
+def placement_of(step: ProbeStep) -> Placement | None:
     """Return where a step wants the head; None where it does not matter.
 
     Examples
@@ -80,7 +93,7 @@ def spans(seconds: Sequence[float], probe: Probe) -> list[range]:
     return [*found, range(first, len(seconds))] if seconds else found
 
 
-def held_s(steps: Sequence[Step], seconds: Sequence[float], probe: Probe) -> float:
+def held_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -> float:
     """Return the time that suction and rests add to a plan's steps, each of so many seconds."""
     total, held, group = 0.0, None, list[float]()
 

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from model.facial_color import coarse_maps, deviation_ratio, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING
 from model.facial_color.disc_statistics import DiscStatistics
-from model.facial_color.rig import (
+from model.facial_color.state_maps import (
     GLOBAL_STATES,
     NEUTRAL,
     FacialColorError,
-    HemoglobinRig,
+    RigMaps,
     StateMaps,
     check_name,
 )
@@ -36,7 +36,7 @@ def fitted(
     stderr: Mapping[str, ArrayLike],
     global_states: Iterable[str] | None,
     stored_size: int | None,
-) -> HemoglobinRig:
+) -> RigMaps:
     """Do the work of `HemoglobinRig.from_maps`."""
     if not states:
         raise FacialColorError("states: got none, expected at least one beside the neutral")
@@ -62,7 +62,7 @@ def fitted(
         for name in states
     }  # fmt: skip
     listed = [n for n in GLOBAL_STATES if n in states] if global_states is None else global_states
-    return HemoglobinRig(
+    return RigMaps(
         neutral=np.where(held, base, base.dtype.type(0)),
         valid=held,
         neutral_stderr=np.where(held, errors[NEUTRAL], 0.0).astype(base.dtype),
@@ -199,13 +199,13 @@ def texture_area_px(base: Floats, valid: Mask) -> float:
 
 
 def transferred(
-    rig: HemoglobinRig,
+    rig: RigMaps,
     neutral: ArrayLike,
     *,
     valid: Mask | None,
     stderr: ArrayLike | None,
     transfer: str,
-) -> HemoglobinRig:
+) -> RigMaps:
     """Do the work of `HemoglobinRig.applied_to`."""
     if transfer not in TRANSFERS:
         raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFERS}")
@@ -245,7 +245,7 @@ def transferred(
             valid=both, prior=state.prior, storage_rms=state.storage_rms,
             storage_largest=state.storage_largest,
         )  # fmt: skip
-    return HemoglobinRig(
+    return RigMaps(
         neutral=np.where(held, base, base.dtype.type(0)),
         valid=held,
         neutral_stderr=np.where(held, error, 0.0).astype(base.dtype),

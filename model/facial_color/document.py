@@ -9,7 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model.facial_color.rig import NEUTRAL, FacialColorError, HemoglobinRig, StateMaps
+from model.facial_color.rig import HemoglobinRig
+from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
 from model.skin import UNITS, SkinMap
 
 SCHEMA: Final = "skinrig.facial-color/1"

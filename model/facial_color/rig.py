@@ -13,41 +13,35 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.facial_color import disc_statistics
-from model.facial_color.coarse_maps import Cells
+from model.facial_color import basis, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING
-from model.skin import SkinMap
+from model.facial_color.state_maps import (
+    NEUTRAL,
+    FacialColorError,
+    Floats,
+    Mask,
+    RigMaps,
+)
 from model.tissue_optics.layers import C_HD_MAX
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
 
-NEUTRAL: Final = "neutral"
 STORED_SIZE: Final = 256
 """Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
 LIMITS: Final = (0.0, C_HD_MAX)
 """Volume fractions of blood that exist, Jimenez2010, Table 1."""
 GLOBAL_GAINS: Final[Mapping[str, float]] = MappingProxyType({"anger": 1.27, "fear": 0.81})
 """Factors of all blood at full emotion, beside the expression (Jimenez2010, section 7)."""
-GLOBAL_STATES: Final = ("exercise", "alcohol")
-"""States of the whole body: nothing of the face moves."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,57}")
 _SUM_ERROR = 1e-6
-
-
-class FacialColorError(ValueError):
-    """Maps that make no rig, or weights that make no blend."""
 
 
 def local_statistics(
@@ -91,42 +85,6 @@ def local_statistics(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StateMaps:
-    """One state as the rig stores it: arrays (h, w), 0 outside ``valid``."""
-
-    scale: Floats
-    """sigma_i/sigma_n under the prior, eq. (5)."""
-    bias: Floats
-    """mu_i, volume fraction."""
-    scale_stderr: Floats
-    """Standard error of the scale."""
-    bias_stderr: Floats
-    """Standard error of the bias, volume fraction."""
-    misfit: Floats
-    """Deviation of the measured state from scale and bias of the neutral map, within a disc,
-    volume fraction: what the state's own pattern, misalignment and noise leave."""
-    valid: Mask
-    """Cells that hold something."""
-    prior: float
-    """Scale that was expected before a place was looked at: sigma_i/sigma_n of the whole map; of
-    a transferred rig, that of its source."""
-    storage_rms: float
-    """Root mean square of what storing small changes in the state, volume fraction."""
-    storage_largest: float
-    """Largest such change."""
-
-    def __post_init__(self) -> None:
-        """Refuse shapes that differ and numbers that are none."""
-        shape = self.valid.shape
-        for name in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit"):
-            values = getattr(self, name)
-            if values.shape != shape:
-                raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape}")
-            if not np.isfinite(values).all():
-                raise FacialColorError(f"{name}: got NaN or infinity, expected finite values")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class HemoglobinBlend:
     """A face's blood in a mixture of states, arrays (H, W)."""
 
@@ -142,43 +100,8 @@ class HemoglobinBlend:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HemoglobinRig:
+class HemoglobinRig(RigMaps):
     """Blood of one face in any affine mixture of the states it was measured in."""
-
-    neutral: Image
-    """Volume fraction in the neutral state, (H, W), float32 or float64; 0 outside ``valid``."""
-    valid: Mask
-    """(H, W)."""
-    neutral_stderr: Image
-    """Standard error of the neutral map, (H, W); 0 where none was stated."""
-    neutral_mean: Floats
-    """mu_n as stored, (h, w), volume fraction; bias of the neutral state."""
-    states: Mapping[str, StateMaps]
-    """By name, all but the neutral."""
-    radius_px: float
-    """Radius of the disc, px of the neutral map."""
-    global_states: tuple[str, ...] = ()
-    """Which of the states are of the whole body."""
-
-    def __post_init__(self) -> None:
-        """Refuse what does not fit together."""
-        shape = self.neutral.shape
-        if self.neutral.ndim != 2 or self.valid.shape != shape:
-            raise FacialColorError(
-                f"neutral: got {shape}, valid {self.valid.shape}, expected (H, W)"
-            )
-        if self.neutral_stderr.shape != shape:
-            raise FacialColorError(f"neutral_stderr: got {self.neutral_stderr.shape}, not {shape}")
-        for name, state in self.states.items():
-            check_name(name)
-            if state.valid.shape != self.neutral_mean.shape:
-                raise FacialColorError(
-                    f"{name}: got shape {state.valid.shape}, expected {self.neutral_mean.shape}"
-                )
-        for name in self.global_states:
-            if name not in self.states:
-                raise FacialColorError(f"global_states: {name!r} is no state of this rig")
-        object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
 
     @classmethod
     def from_maps(
@@ -229,46 +152,20 @@ class HemoglobinRig:
         scale is sigma_i/sigma_n under the prior of `model.facial_color.deviation_ratio`, which
         bounds it where the neutral map is constant.
         """
-        from model.facial_color.basis import fitted
-
-        return fitted(
-            neutral, states, radius_px=radius_px, valid=valid, stderr=stderr or {},
-            global_states=global_states, stored_size=stored_size,
-        )  # fmt: skip
+        maps = basis.fitted(
+            neutral,
+            states,
+            radius_px=radius_px,
+            valid=valid,
+            stderr=stderr or {},
+            global_states=global_states,
+            stored_size=stored_size,
+        )
+        return cls._of(maps)
 
     @classmethod
-    def from_maps_and_document(cls, maps: Mapping[str, SkinMap], document: bytes) -> HemoglobinRig:
-        """Read a rig from the maps of an appearance and its ``facial_color.json``.
-
-        Raises
-        ------
-        FacialColorError
-            Naming what is missing, unknown, of another schema or of another shape.
-        """
-        from model.facial_color.document import from_maps_and_document
-
-        return from_maps_and_document(maps, document)
-
-    def to_maps(self) -> tuple[dict[str, SkinMap], bytes]:
-        """Return the rig as maps of an appearance, and the bytes of ``facial_color.json``.
-
-        Maps: ``hemoglobin``, ``bias_neutral``, and ``scale_<state>``, ``bias_<state>``,
-        ``misfit_<state>`` of each state, in float32.
-        """
-        from model.facial_color.document import to_maps
-
-        return to_maps(self)
-
-    @property
-    def cells(self) -> Cells:
-        """How the stored maps lie on the neutral map."""
-        rows, columns = self.neutral.shape
-        return Cells((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
-
-    @property
-    def neutral_mean_valid(self) -> Mask:
-        """Cells of ``neutral_mean`` that hold something, (h, w)."""
-        return self.cells.coarsen(np.zeros(self.neutral.shape), self.valid)[1]
+    def _of(cls, maps: RigMaps) -> HemoglobinRig:
+        return cls(**{field.name: getattr(maps, field.name) for field in fields(RigMaps)})
 
     @property
     def base(self) -> Floats:
@@ -447,14 +344,6 @@ class HemoglobinRig:
         FacialColorError
             For a map or mask that fits nothing.
         """
-        from model.facial_color.basis import transferred
-
-        return transferred(self, neutral, valid=valid, stderr=stderr, transfer=transfer)
-
-
-def check_name(name: str) -> None:
-    """Refuse a state's name that can be no map's."""
-    if name == NEUTRAL:
-        raise FacialColorError(f"states: {NEUTRAL!r} is the neutral map's own name")
-    if not _NAME.fullmatch(name):
-        raise FacialColorError(f"states: got name {name!r}, expected lower case, digits and _")
+        return self._of(
+            basis.transferred(self, neutral, valid=valid, stderr=stderr, transfer=transfer)
+        )

@@ -6,9 +6,9 @@ from reconstruction.lumitexels.samples import (
     Lumitexels,
     Surface,
     Visibility,
-    gather,
     visibility,
 )
+from reconstruction.lumitexels.store import gather
 
 __all__ = [
     "Camera",

@@ -6,7 +6,6 @@ and a mask of those that count: the point faces both, nothing stands between, th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -29,7 +28,6 @@ __all__ = [
     "Lumitexels",
     "Surface",
     "Visibility",
-    "gather",
     "visibility",
 ]
 
@@ -184,67 +182,3 @@ def _rim(center: Floats, radius: float) -> list[Floats]:
     side /= np.linalg.norm(side)
     other = np.cross(axis, side)
     return [np.asarray(center + radius * way, np.float32) for way in (side, other, -side, -other)]
-
-
-Image = tuple[Floats, Floats, Bools | None]
-"""Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
-
-
-def gather(
-    surface: Surface,
-    *,
-    cameras: Sequence[Camera],
-    lights: Lights,
-    images: Callable[[int, int], Image | None],
-    caster: RayCaster,
-    poses: ArrayLike | None = None,
-    binning: int = 1,
-    light_radius_mm: float = 0.0,
-    offset_mm: float = OFFSET_MM,
-) -> Lumitexels:
-    """Gather the lumitexels of a surface that fit into memory (about 60 bytes a sample).
-
-    Parameters
-    ----------
-    surface : Surface
-    cameras : sequence of Camera
-    lights : Lights
-    images : callable
-        Returns signal, variance and good pixels (or None) of view and light by their indices, or
-        None where there is no such frame.
-    caster : RayCaster
-        What may cast shadows.
-    poses : array_like, shape (L, 4, 4) or (V L, 4, 4), optional
-        Motion of the subject: matrices that take the points to where they were in each frame.
-    binning : int
-        Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
-    light_radius_mm, offset_mm : float
-        See `visibility`.
-
-    Returns
-    -------
-    Lumitexels
-
-    See Also
-    --------
-    reconstruction.lumitexels.store.LumitexelStore : for any number of points.
-    """
-    from reconstruction.lumitexels.store import LumitexelStore
-
-    store = LumitexelStore(
-        surface,
-        cameras=cameras,
-        lights=lights,
-        caster=caster,
-        poses=poses,
-        binning=binning,
-        light_radius_mm=light_radius_mm,
-        offset_mm=offset_mm,
-        dtype=np.float32,
-    )
-    for view in range(len(cameras)):
-        for light in range(store.light_count):
-            image = images(view, light)
-            if image is not None:
-                store.add(view, light, *image)
-    return store.chunk(0, len(surface))

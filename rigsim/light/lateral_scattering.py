@@ -19,8 +19,8 @@ from rigsim.light.interreflection import SkinBounce
 from rigsim.light.interreflection_color import BounceColor
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.subsurface_radiance import HAIR_REFLECTANCE, PIGMENT_BLUR_MM, typical_kernels
-from rigsim.light.surface_brdf import SkinSurface
+from rigsim.light.subsurface_radiance import PIGMENT_BLUR_MM, typical_kernels
+from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
 from rigsim.render import Caster, visibility
 from rigsim.subject import Subject
 from rigsim.tissue.skin_color import skin_color

@@ -16,9 +16,10 @@ from rigsim.geometry.atlas import Atlas
 from rigsim.geometry.mesh import Float32Array
 from rigsim.light import lateral
 from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.surface_brdf import HAIR_REFLECTANCE
 from rigsim.render import Caster, visibility
 from rigsim.subject import Subject
-from rigsim.tissue.lateral_kernels import GaussianSum
+from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 from rigsim.tissue.skin_table import SkinTable
@@ -26,11 +27,6 @@ from rigsim.tissue.skin_table import SkinTable
 if TYPE_CHECKING:
     from rigsim.light.interreflection import SkinBounce
 
-SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
-"""Widths of the Gaussians that stand for the lateral profiles, mm."""
-
-HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
-"""White-balanced reflectance of dark brown hair, seen as a matt cover."""
 
 PIGMENT_BLUR_MM: Final = 0.12
 """Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,

@@ -49,11 +49,12 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.geometry.mesh import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
-from rigsim.light.subsurface_radiance import HAIR_REFLECTANCE
 from rigsim.subject import Subject
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
+HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
+"""White-balanced reflectance of dark brown hair, seen as a matt cover."""
 ETA_OIL: Final = 1.47
 """Refractive index of sebum, that of its triglycerides and wax esters."""
 

@@ -17,8 +17,7 @@ from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
 from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS, bands, polarization
 from rigsim.render.lens_blur import Lens
-from rigsim.scenes.gradient.lighting import lateral_kernel
-from rigsim.skin_patch.microrelief import MicroSkin
+from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
 
 FloatArray = NDArray[np.float64]

@@ -27,6 +27,7 @@ from scipy.ndimage import map_coordinates
 from rigsim.geometry.polygon_net import polygon_net
 from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
 from rigsim.subject.pigment import MELANIN_LIMIT, MELANIN_PRESETS
+from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_layers import MAX_C_HD
 from rigsim.tissue.skin_table import SkinTable
 
@@ -34,6 +35,8 @@ Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 SiteName = Literal["forehead", "cheek", "chin"]
+BLOOD: Final = 0.035
+"""Volume fraction of blood that decides how far light spreads in the patch."""
 SITES: Final = get_args(SiteName)
 """Names of the sites."""
 
@@ -332,3 +335,13 @@ def _alpha(where: _Site, points: Float32Array, seed: int) -> Float32Array:
     """Return GGX roughness: films of oil smooth some places."""
     oil = smooth_noise(points, (2.5, 0.7), seed=1000 * seed + 900)
     return np.asarray(np.clip(where.alpha * (1.0 + 0.07 * oil), 0.1, 0.5), np.float32)
+
+
+def lateral_kernel(skin: MicroSkin) -> tuple[Float64Array, Float64Array]:
+    """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
+    table = SkinTable.load()
+    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    weights = (band / band.sum())[:, None]
+    kernels = table.lateral_kernels(skin.melanin_fraction, BLOOD, weights)
+    gaussians = kernels.gaussians(SIGMAS_MM)
+    return gaussians.sigmas_mm, gaussians.weights[0]

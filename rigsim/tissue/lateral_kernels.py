@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,10 @@ FloatArray = NDArray[np.float64]
 
 GAUSSIAN_SIGMAS_MM = (0.004, 0.01, 0.025, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 """Default widths for `LateralKernels.gaussians`, common to all channels and all skins."""
+
+
+SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
+"""Widths of the Gaussians that stand for the lateral profiles, mm."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,8 @@ from typing import Any
 from capture.devices.camera import CameraError, Exposure, FrameTimeout, Trigger
 from capture.devices.cameras import camera_wire
 from capture.devices.cameras.camera_wire import BadMessage
-from rigsim.world.camera import CameraBody, SimCamera
+from rigsim.world.camera import SimCamera
+from rigsim.world.camera_body import CameraBody
 from rigsim.world.world import World
 
 __all__ = ["CameraService"]

@@ -15,7 +15,7 @@ import zlib
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from rigsim.boxes.dome import LedPulse
 from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.boxes.probe import SourceLight
+from rigsim.world.camera_body import CameraBody
 from rigsim.world.faults import NO_FAULTS, Faults
 from rigsim.world.light_record import Light, LightRecord
 from rigsim.world.link import Link
@@ -34,9 +35,6 @@ from rigsim.world.rig_boxes import Wiring, make_box
 from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
 from rigsim.world.suction import CameraCooler, HeadState, SuckedHead
 from rigsim.world.taped_skin import GripState, TapedSkin
-
-if TYPE_CHECKING:
-    from rigsim.world.camera import CameraBody
 
 __all__ = [
     "CaliperScene",
@@ -237,8 +235,6 @@ class World:
 
     def camera(self, view_name: str) -> CameraBody:
         """Return the camera of a view; it lives as long as the world."""
-        from rigsim.world.camera import CameraBody
-
         with self.lock:
             if view_name not in self._cameras:
                 first = self._shots_made.get(view_name, 0)

@@ -24,10 +24,10 @@ from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
 from skinrig.fitting import traits
-from skinrig.fitting.traits import AlbedoSample, TraitFitError
+from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
-from skinrig.traits.albedo_vectors import VectorKind
+from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 
 Floats = NDArray[np.float64]
 

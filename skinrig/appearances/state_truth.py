@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from model import store
-from skinrig.simulating.simulation import truth_folder
+from skinrig.simulating.orders import truth_folder
 
 USUAL: Final = "neutral"
 """The state that is meant where none is said."""

@@ -174,7 +174,8 @@ def simulate(
     )
     from skinrig.consent import subject_of
     from skinrig.next_steps import after_session
-    from skinrig.simulating.simulation import USES, simulate_session
+    from skinrig.simulating.orders import USES
+    from skinrig.simulating.simulation import simulate_session
     from skinrig.simulating.subject_records import pseudonym
 
     console = Console(json)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.facial_color import HemoglobinRig
-from model.facial_color.rig import NEUTRAL
+from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
 
 Map = NDArray[np.floating[Any]]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skinrig.extremes.cases import (
+from skinrig.extremes.expectations import (
     INTEGERS,
     RENDERER,
     Case,

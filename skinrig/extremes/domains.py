@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinrig.extremes.cases import Case, Real, Unexpected, as_real, clean, masked, near, refused
-from skinrig.extremes.cases import within as within_bounds
+from skinrig.extremes.expectations import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+)
+from skinrig.extremes.expectations import within as within_bounds
 
 NO_MEDIUM = (np.nan, np.inf, -1.0)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.extremes.cases import (
+from skinrig.extremes.expectations import (
     INTEGERS,
     Case,
     Real,

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinrig.extremes.cases import (
-    Case,
-    Real,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-    within,
-)
+from skinrig.extremes.expectations import Case, Real, as_real, clean, masked, near, refused, within
 
 
 def _near_constant(real: Real) -> str:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from skinrig.extremes.cases import Case, Real, Unexpected, as_real, near, within
+from skinrig.extremes.expectations import Case, Real, Unexpected, as_real, near, within
 
 STAGE = "Monte Carlo"
 Matter = tuple[float, float, float, float]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinrig.extremes.cases import Case, Real, as_real, masked, near, refused, rising, within
+from skinrig.extremes.expectations import Case, Real, as_real, masked, near, refused, rising, within
 
 
 def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]

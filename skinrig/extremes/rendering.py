@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import load_rig
-from skinrig.extremes.cases import RENDERER, Case, Real, Unexpected, as_real, near, refused, within
+from skinrig.extremes.expectations import (
+    RENDERER,
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    near,
+    refused,
+    within,
+)
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor

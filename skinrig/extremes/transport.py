@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from skinrig.extremes.cases import (
+from skinrig.extremes.expectations import (
     Case,
     Real,
     Unexpected,

@@ -28,7 +28,7 @@ from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.errors import UsageError
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
-from skinrig.traits.albedo_vectors import VectorKind
+from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 from skinrig.traits.labels import Labels
 
 Floats = NDArray[np.float64]
@@ -69,16 +69,6 @@ class TraitFit:
     rows: tuple[tuple[str, str, int, int, float, float], ...]
     warnings: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AlbedoSample:
-    """One face's albedo in the common map."""
-
-    r_d: Image
-    """(N, N, 3)."""
-    valid: Bools
-    """(N, N)."""
 
 
 def fit_traits(

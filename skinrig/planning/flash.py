@@ -111,7 +111,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.scene import FlashScene
     from rigsim.sensor import sensor_of, vignetting_map
-    from skinrig.simulating.flash import to_superpixels
+    from skinrig.simulating.flash_truth import to_superpixels
 
     small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
     view = small.views[0]

@@ -21,6 +21,7 @@ from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import PATTERNS
 from capture.rig import Rig
+from rigsim.scenes.gradient.truth import appearance as ground_truth
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
 
 Floats = NDArray[np.float64]
@@ -116,7 +117,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
         if pattern != "dark"
         for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
     }
-    truth = scene.truth_appearance([NEUTRAL]).maps
+    truth = ground_truth(scene, [NEUTRAL]).maps
     seen, sharp = (
         np.asarray(truth[name].values, np.float64) for name in ("normals_seen_a000_n0", "normals")
     )

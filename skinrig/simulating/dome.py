@@ -18,16 +18,8 @@ from model.skin import SkinAppearance
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import subject_records
-from skinrig.simulating.simulation import (
-    OptionsError,
-    Order,
-    Simulated,
-    SimulationError,
-    drive,
-    effects_of,
-    open_session,
-    truth_folder,
-)
+from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.orders import OptionsError, Order, Simulated, SimulationError, truth_folder
 
 if TYPE_CHECKING:
     from rigsim.population.population import Member

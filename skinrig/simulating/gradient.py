@@ -19,17 +19,11 @@ from capture.plan.gradient import (
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
+from rigsim.scenes.gradient.truth import appearance as ground_truth
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
-from skinrig.simulating.simulation import (
-    Order,
-    Simulated,
-    SimulationError,
-    drive,
-    effects_of,
-    open_session,
-    truth_folder,
-)
+from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.orders import Order, Simulated, SimulationError, truth_folder
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
@@ -88,7 +82,7 @@ def simulate_gradient(order: Order) -> Simulated:
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        appearance = scene.truth_appearance(log.grips(session))
+        appearance = ground_truth(scene, log.grips(session))
         appearance = dataclasses.replace(
             appearance,
             parameters={

@@ -21,18 +21,12 @@ from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
+from rigsim.scenes.probe.truth import appearance as ground_truth
 from skinrig.capturing.acquisition import directions_of
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
-from skinrig.simulating.simulation import (
-    Order,
-    Simulated,
-    SimulationError,
-    drive,
-    effects_of,
-    open_session,
-    truth_folder,
-)
+from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.orders import Order, Simulated, SimulationError, truth_folder
 
 PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
@@ -85,7 +79,7 @@ def simulate_probe(order: Order) -> Simulated:
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
-        appearance = scene.truth_appearance(log.probings(session))
+        appearance = ground_truth(scene, log.probings(session))
         appearance = dataclasses.replace(
             appearance,
             parameters={
@@ -221,7 +215,7 @@ class HeadLog:
 
     def probings(self, session: Session) -> list[Any]:
         """Return the placements that the session has series of, in the plan's order."""
-        from rigsim.scenes.probe.truth import Probing
+        from rigsim.scenes.probe.scene import Probing
 
         entries = self._read()
         by_run: dict[int, list[tuple[float, float]]] = {}

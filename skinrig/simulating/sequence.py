@@ -17,22 +17,14 @@ from capture.session import Session
 from model import store
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
-from skinrig.simulating.flash import (
+from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.flash_truth import (
     WIDTHS_PX,
     landmarks_at_superpixels,
     to_superpixels,
     truth_of,
 )
-from skinrig.simulating.simulation import (
-    OptionsError,
-    Order,
-    Simulated,
-    SimulationError,
-    drive,
-    effects_of,
-    open_session,
-    truth_folder,
-)
+from skinrig.simulating.orders import OptionsError, Order, Simulated, SimulationError, truth_folder
 
 COURSE_FILE = "perfusion_course.json"
 """In the truth: the blood of each frame at its own time."""

@@ -15,8 +15,8 @@ from skinrig.errors import INTERRUPTED, UsageError
 from skinrig.next_steps import named
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
+from skinrig.simulating.orders import SIZES, OptionsError, SimulationError
 from skinrig.simulating.shot_numbers import shots_made
-from skinrig.simulating.simulation import SIZES, OptionsError, SimulationError
 from skinrig.simulating.subject_records import unseen
 
 if TYPE_CHECKING:

@@ -169,3 +169,13 @@ def fit(
         seed=seed,
     )  # fmt: skip
     return AlbedoTraits(kind, texture, found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlbedoSample:
+    """One face's albedo in the common map."""
+
+    r_d: Image
+    """(N, N, 3)."""
+    valid: Bools
+    """(N, N)."""

@@ -27,7 +27,7 @@ from reconstruction.correspondence.common_parameterization import Chart, CommonF
 from rigsim.light import surface_brdf
 from rigsim.population import conditions as skin_conditions
 from rigsim.population.population import Member
-from skinrig.fitting.traits import AlbedoSample
+from skinrig.traits.albedo_vectors import AlbedoSample
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
@@ -151,28 +151,3 @@ def _mesh(
                 copy.write_bytes(appearance.files[MESH])
                 return patch_charts.closed(load_mesh(copy)), f"{MESH} of the {kind}"
     return None, "the procedural head stands for the face"
-
-
-def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    """Return named points of the neutral picture that the flash rig's maps are drawn on, px.
-
-    Raises
-    ------
-    SceneError
-        There is no table, and no simulation's truth beside the folder.
-    """
-    from reconstruction.correspondence import landmark_table
-
-    if source.landmarks is not None:
-        return landmark_table.read(source.landmarks)
-    name = (part.get("truth") or {}).get("neutral")
-    if isinstance(name, str):
-        folder = source.paths["dynamic"].resolve().parent / Path(name).name
-        if (folder / store.DOCUMENT).is_file():
-            points: Any = store.read_document(folder).parameters.get("landmarks_px")
-            if isinstance(points, dict):
-                return {key: (float(x), float(y)) for key, (x, y) in points.items()}
-    raise SceneError(
-        f"{source.paths['dynamic']}: its maps are drawn on a picture, and nothing says where that "
-        "lies on the mesh; give --landmarks FILE, a table name,x,y of the neutral picture"
-    )

@@ -10,7 +10,8 @@ from scipy import stats
 
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.subsurface_radiance import SIGMAS_MM, spread_pattern
+from rigsim.light.subsurface_radiance import spread_pattern
+from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.patterned_tissue import patterned_reflectance
 from rigsim.tissue.skin_table import SkinTable
 

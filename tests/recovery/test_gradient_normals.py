@@ -16,6 +16,7 @@ from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.world.taped_skin import GripState
 
@@ -59,7 +60,7 @@ def patch(side, *, smooth, seed=11):
         skin = dataclasses.replace(skin, height_um=height)
     sphere = build_sphere(rig, seed=4)  # LEDs 5 % unequal, films a degree off
     scene = GradientScene(rig, skin, sphere=sphere)
-    maps = scene.truth_appearance([NEUTRAL]).maps
+    maps = ground_truth(scene, [NEUTRAL]).maps
     return scene, sphere, maps["normals_seen_a000_n0"].values, maps["normals"].values
 
 

@@ -9,7 +9,8 @@ from capture.plan.gradient import state_of, states
 from capture.session import Session, verify
 from model import store
 from skinrig.simulating.gradient import GripLog
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 SMALL = {"width_px": 48, "angles": (0.0,), "steps": (-1, 1), "seed": 4}
 

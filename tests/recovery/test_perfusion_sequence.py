@@ -11,7 +11,8 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.evidence import EvidenceError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.sequences import SequenceOrder
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 WIDTH_PX = 192
 

@@ -12,7 +12,8 @@ from skinrig.calibrating.calibrate import calibrate
 from skinrig.cli import main
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.report import build
-from skinrig.simulating.simulation import simulate_session, truth_folder
+from skinrig.simulating.orders import truth_folder
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 

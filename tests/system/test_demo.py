@@ -11,7 +11,7 @@ from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
 from skinrig.simulating import dome
-from skinrig.simulating.simulation import SimulationError
+from skinrig.simulating.orders import SimulationError
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import pytest
 
 from skinrig.cli import main
 from skinrig.extremes import cases as extremes
+from skinrig.extremes import expectations
 from skinrig.report import build
 
 CASES = extremes.all_cases()
@@ -29,7 +30,7 @@ def test_there_are_60_extremes_with_names_of_their_own():
 
 
 def a_case(run):
-    return extremes.Case("a case", "nothing", "much", "it breaks", "it holds", run)
+    return expectations.Case("a case", "nothing", "much", "it breaks", "it holds", run)
 
 
 def broken(_):
@@ -39,12 +40,12 @@ def broken(_):
 @pytest.mark.parametrize(
     ("run", "word"),
     [
-        (lambda real: extremes.near(real(1.0), 2.0), "got 1"),
-        (lambda real: extremes.within([real("nan")], 0.0, 1.0), "finite"),
-        (lambda real: extremes.clean([real("inf")], [True]), "NaN or infinity"),
-        (lambda real: extremes.masked([True, False]), "share of 0.5"),
-        (lambda real: extremes.refused(lambda: real(1.0), ValueError), "expected ValueError"),
-        (lambda real: extremes.rising([real(2.0), real(1.0)]), "rise"),
+        (lambda real: expectations.near(real(1.0), 2.0), "got 1"),
+        (lambda real: expectations.within([real("nan")], 0.0, 1.0), "finite"),
+        (lambda real: expectations.clean([real("inf")], [True]), "NaN or infinity"),
+        (lambda real: expectations.masked([True, False]), "share of 0.5"),
+        (lambda real: expectations.refused(lambda: real(1.0), ValueError), "expected ValueError"),
+        (lambda real: expectations.rising([real(2.0), real(1.0)]), "rise"),
         (broken, "ZeroDivisionError"),
     ],
 )

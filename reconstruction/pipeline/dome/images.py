@@ -13,36 +13,11 @@ from capture import hdr, raw
 from capture.session import FrameRecord, Session
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.hold_out import NOTHING, HoldOut
+from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["DomeImage", "DomeImages", "SensorNoise"]
 
 Float32 = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class SensorNoise:
-    """Conversion gain, electrons per DN, and read noise, electrons rms, of one camera."""
-
-    gain: float
-    read_noise: float
-
-    @staticmethod
-    def of(frame: raw.RawFrame) -> SensorNoise:
-        """Read them off the frame's own noise profile.
-
-        Raises
-        ------
-        EvidenceError
-            Where the frame has none.
-        """
-        if frame.noise_profile is None:
-            raise EvidenceError(
-                f"{frame.path}: does not say how noisy the sensor is; calibrate the sensor"
-            )
-        scale, offset = frame.noise_profile
-        span = frame.white - float(np.mean(frame.black))
-        gain = 1.0 / max(scale * span, 1e-12)
-        return SensorNoise(gain, float(np.sqrt(offset)) * span * gain)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from capture import raw
 from capture.session import FrameRecord, Session
-from reconstruction.pipeline.dome.images import SensorNoise
 from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["GradientImages", "Patterns", "SkinState", "state_name"]
 

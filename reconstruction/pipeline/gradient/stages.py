@@ -24,7 +24,6 @@ from reconstruction.normal_integration.lens_restoration import Aperture, Restore
 from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.dome.images import SensorNoise
 from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.gradient.images import GradientImages, Patterns, SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
@@ -33,6 +32,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
     fit_kernels,
     histogram_document,
 )
+from reconstruction.pipeline.sensor_noise import SensorNoise
 
 REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig, View, load_rig
 from rigsim.geometry.atlas import BoolArray, spread
 from rigsim.geometry.mesh import Float32Array
+from rigsim.light.plastic import plastic_scale
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.render import MovedLight, look_at, radiance
 from rigsim.scenes.dome.scene import DomeScene
@@ -256,17 +257,6 @@ def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
             "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
         },
     }
-
-
-def plastic_scale(eta: float) -> float:
-    """Return eta^2 (1 - F_inner) with the polynomial that Mitsuba takes for the latter.
-
-    References
-    ----------
-    Egan and Hilgeman 1973, doi:10.1364/AO.12.001816; 0.1 % off the exact value at 1.4.
-    """
-    inner = -1.4399 / eta**2 + 0.7099 / eta + 0.6681 + 0.0636 * eta
-    return eta * eta * (1.0 - inner)
 
 
 def matt_image(

@@ -21,17 +21,13 @@ from rigsim.light.lobe_moments import MomentTable, Surface, build_table, direct_
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.light.self_shadow import horizon_tangent
 from rigsim.light.shadowed_lights import remove_hidden
-from rigsim.light.subsurface_radiance import SIGMAS_MM
 from rigsim.scenes.gradient.patch import PatchSurface
-from rigsim.skin_patch.microrelief import BAND_NM, MicroSkin
+from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
-from rigsim.tissue.skin_table import SkinTable
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 
-BLOOD: Final = 0.035
-"""Volume fraction of blood that decides how far light spreads in the patch."""
 
 BLOCK_ROWS: Final = 128
 """Rows that are looked up at once, which bounds memory."""
@@ -235,13 +231,3 @@ def light_skin(
     )
     sigmas, weights = lateral_kernel(skin) if lateral else (np.zeros(0), np.zeros(0))
     return Lighting(sphere, surface, table, leds, sectors, sigmas, weights, furrow_sectors)
-
-
-def lateral_kernel(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
-    """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
-    table = SkinTable.load()
-    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
-    weights = (band / band.sum())[:, None]
-    kernels = table.lateral_kernels(skin.melanin_fraction, BLOOD, weights)
-    gaussians = kernels.gaussians(SIGMAS_MM)
-    return gaussians.sigmas_mm, gaussians.weights[0]

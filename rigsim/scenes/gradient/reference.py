@@ -22,8 +22,8 @@ from rigsim.as_built.polarizers import Films
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
 from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
 from rigsim.light.lobe_moments import led_moments
+from rigsim.light.plastic import plastic_scale
 from rigsim.render import Caster, MovedLight, look_at
-from rigsim.scenes.dome.reference import plastic_scale
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig, RigError
-from model.skin import SkinAppearance
 from rigsim import shading
 from rigsim.as_built.polarizers import Films, films_of
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
@@ -379,17 +378,6 @@ class GradientScene:
         if self.motion is None:
             return Pose(0.0, 0.0, 0.0)
         return self.motion.pose(grip.angle_deg, grip.step)
-
-    def truth_appearance(self, grips: Sequence[Grip]) -> SkinAppearance:
-        """Return the truth of some states at the camera's own pixels.
-
-        See Also
-        --------
-        rigsim.scenes.gradient.truth.appearance : the maps and parameters.
-        """
-        from rigsim.scenes.gradient.truth import appearance
-
-        return appearance(self, grips)
 
     # inside -------------------------------------------------------------------------------------
 

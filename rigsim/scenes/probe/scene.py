@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -28,8 +29,7 @@ from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.world.suction import HeadState
 
 if TYPE_CHECKING:
-    from model.skin import SkinAppearance
-    from rigsim.scenes.probe.truth import Probing
+    pass
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -250,17 +250,6 @@ class ProbeScene:
         light += hot[..., None]
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 
-    def truth_appearance(self, probings: Sequence[Probing]) -> SkinAppearance:
-        """Return the truth of some placements of the head.
-
-        See Also
-        --------
-        rigsim.scenes.probe.truth.appearance : the parameters.
-        """
-        from rigsim.scenes.probe.truth import appearance
-
-        return appearance(self, probings)
-
     # inside -------------------------------------------------------------------------------------
 
     def _check_view(self, name: str | None) -> None:
@@ -278,3 +267,17 @@ def _hot_pixels(sensor: Sensor, shape: tuple[int, ...]) -> Float32Array:
     rng = np.random.default_rng([0x686F74, *sensor.serial.encode()])
     hot = rng.random(shape) < HOT_SHARE
     return np.where(hot, rng.exponential(HOT_E_PER_S, shape), 0.0).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Probing:
+    """One placement of the head on the skin, during one series of exposures."""
+
+    site: str
+    """Name of the site."""
+    repeat: int
+    """Number of the placement there, from 0."""
+    angle_deg: float
+    """Turn of the head about its own axis, degrees."""
+    suction_mbar: float
+    """Mean suction while it was lit, mbar below the air's pressure, >= 0."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,23 +12,10 @@ from model.skin import SkinAppearance
 from rigsim.fiber.homogeneous_fit import nearest_medium
 from rigsim.fiber.probe_profile import fibres_of
 from rigsim.fiber.probe_tissue import HomogeneousTissue
+from rigsim.scenes.probe.scene import Probing
 
 if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
-
-
-@dataclass(frozen=True, slots=True)
-class Probing:
-    """One placement of the head on the skin, during one series of exposures."""
-
-    site: str
-    """Name of the site."""
-    repeat: int
-    """Number of the placement there, from 0."""
-    angle_deg: float
-    """Turn of the head about its own axis, degrees."""
-    suction_mbar: float
-    """Mean suction while it was lit, mbar below the air's pressure, >= 0."""
 
 
 def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance:

@@ -240,7 +240,7 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
             texture = spaces["texture"]
 
             def vectors(
-                shown: Sequence[fitting_traits.AlbedoSample],
+                shown: Sequence[albedo_vectors.AlbedoSample],
                 texture: Any = texture,
                 kind: VectorKind = kind,
             ) -> Floats:

@@ -18,6 +18,7 @@ from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patt
 from reconstruction.normal_maps import NormalMaps
 from rigsim.as_built.sphere import BuiltSphere, as_drawn
 from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
@@ -97,7 +98,7 @@ def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
         for name in NAMES
         for polarizer in READINGS
     }
-    truth = scene.truth_appearance([NEUTRAL]).maps
+    truth = ground_truth(scene, [NEUTRAL]).maps
     view = rig.views[0]
     # as fractions of full scale; a full well is one
     noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)

@@ -26,7 +26,8 @@ from skinrig.benchmarks.intervals.trials import (
     truth_of,
     valid_of,
 )
-from skinrig.simulating.simulation import Simulated, simulate_session
+from skinrig.simulating.orders import Simulated
+from skinrig.simulating.simulation import simulate_session
 
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTOR_95: Final = 2.4
@@ -105,7 +106,7 @@ def _of_rig(
 ) -> Iterator[Trial]:
     from skinrig.evaluating import facial_color
     from skinrig.fitting.facial_color import fit_facial_color
-    from skinrig.simulating.simulation import truth_folder
+    from skinrig.simulating.orders import truth_folder
 
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")

@@ -20,7 +20,8 @@ from skinrig.benchmarks.intervals.trials import ANY_BAND, Floats, forget, truth_
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.simulating.simulation import Simulated, simulate_session
+from skinrig.simulating.orders import Simulated
+from skinrig.simulating.simulation import simulate_session
 
 PHOTONS: Final = "full"
 """Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,

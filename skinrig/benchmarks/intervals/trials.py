@@ -19,7 +19,8 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, RAYLEIGH_95, Trial
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
-from skinrig.simulating.simulation import Simulated, simulate_session
+from skinrig.simulating.orders import Simulated
+from skinrig.simulating.simulation import simulate_session
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -18,7 +18,8 @@ from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchma
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-from skinrig.simulating.simulation import simulate_session, truth_folder
+from skinrig.simulating.orders import truth_folder
+from skinrig.simulating.simulation import simulate_session
 
 MEDIA = 8
 SEED = 40

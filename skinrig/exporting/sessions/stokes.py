@@ -200,7 +200,7 @@ def _write(
 
 def _noise(evidence: Any, camera: str) -> Any:
     from capture.calibration.sensor import SensorCalibration
-    from reconstruction.pipeline.dome.images import SensorNoise
+    from reconstruction.pipeline.sensor_noise import SensorNoise
 
     serial = evidence.session.rig.view(camera).serial
     found = evidence.load("sensor", [serial], "the frames are as noisy as they say of themselves")

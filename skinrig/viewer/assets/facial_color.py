@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table, spectra
 from model.facial_color import HemoglobinRig
-from model.facial_color.rig import GLOBAL_GAINS, NEUTRAL
+from model.facial_color.rig import GLOBAL_GAINS
+from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.viewer.assets import camera_color
 from skinrig.viewer.assets.camera_color import CameraColor
+from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor, Floats, Mask
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -23,44 +22,14 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 if TYPE_CHECKING:
     from rigsim.subject import Subject
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 TABLE_SIZE: Final = 128
 """Nodes along each axis of the color table."""
-RIG_SIZE: Final = 256
-"""Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
 RADIUS_OF_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
 FINE: Final = 8
 """Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
 ALBEDO: Final = "r_d"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FaceColor:
-    """Chromophores of a face on its texture, and its hemoglobin rig.
-
-    Attributes
-    ----------
-    melanin, hemoglobin : ndarray of float64, shape (N, N)
-        Volume fractions in the neutral state, known everywhere.
-    states : mapping of str to ndarray of float64, shape (h, w, 2)
-        Scale and bias by state, "neutral" first.
-    global_states
-        Those of the whole body.
-    facts
-        How they came to lie on the texture; JSON values.
-    left_out
-        What could not be placed.
-    """
-
-    melanin: Floats
-    hemoglobin: Floats
-    states: Mapping[str, Floats]
-    global_states: tuple[str, ...]
-    facts: Mapping[str, Any]
-    left_out: tuple[tuple[str, str], ...] = ()
 
 
 def assets(source: SceneSource) -> Assets:

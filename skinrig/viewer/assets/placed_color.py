@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.facial_color import HemoglobinRig
 from model.facial_color.coarse_maps import fitting
-from model.facial_color.document import DOCUMENT
-from model.facial_color.rig import NEUTRAL
+from model.facial_color.document import DOCUMENT, from_maps_and_document
+from model.facial_color.state_maps import NEUTRAL
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.viewer.assets import placing
-from skinrig.viewer.assets.facial_color import RIG_SIZE, FaceColor, Floats
+from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor, Floats
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 
@@ -41,10 +40,10 @@ def placed(source: SceneSource, subject: Subject) -> FaceColor:
         The landmarks do not.
     """
     from rigsim.geometry.atlas import unwrap
-    from skinrig.viewer.from_appearance import picture_landmarks
+    from skinrig.viewer.assets.image_landmarks import picture_landmarks
 
     appearance = source.appearances["dynamic"]
-    rig = HemoglobinRig.from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
+    rig = from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
     marks = picture_landmarks(source, parts_of(appearance)[FACIAL_COLOR])
     surface = subject.surface_landmarks()
     points = {

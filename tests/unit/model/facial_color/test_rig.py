@@ -8,7 +8,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model import store
-from model.facial_color.rig import GLOBAL_GAINS, FacialColorError, HemoglobinRig, local_statistics
+from model.facial_color.document import from_maps_and_document, to_maps
+from model.facial_color.rig import GLOBAL_GAINS, HemoglobinRig, local_statistics
+from model.facial_color.state_maps import FacialColorError
 from model.skin import SkinAppearance
 
 RADIUS_PX = 8.0
@@ -284,14 +286,14 @@ def test_transfer_to_another_size_and_mask(rig, neutral, rng):
 
 
 def test_rig_survives_its_folder(rig, tmp_path):
-    maps, document = rig.to_maps()
+    maps, document = to_maps(rig)
     assert json.loads(document)["schema"] == "skinrig.facial-color/1"
     store.write(
         tmp_path / "a",
         SkinAppearance(maps, "simulated", files={"facial_color.json": document}),
     )
     read = store.read(tmp_path / "a")
-    again = HemoglobinRig.from_maps_and_document(read.maps, read.files["facial_color.json"])
+    again = from_maps_and_document(read.maps, read.files["facial_color.json"])
     assert again.radius_px == rig.radius_px
     assert again.global_states == rig.global_states
     assert again.storage_error() == rig.storage_error()
@@ -302,14 +304,14 @@ def test_rig_survives_its_folder(rig, tmp_path):
 
 
 def test_damaged_documents_are_named(rig):
-    maps, document = rig.to_maps()
+    maps, document = to_maps(rig)
 
     def changed(**parts):
         return json.dumps(json.loads(document) | parts).encode()
 
     def refused(maps, document, message):
         with pytest.raises(FacialColorError, match=message):
-            HemoglobinRig.from_maps_and_document(maps, document)
+            from_maps_and_document(maps, document)
 
     refused(maps, b"no", "is not JSON")
     refused(maps, changed(schema="skinrig.facial-color/2"), "got schema 'skinrig.facial-color/2'")

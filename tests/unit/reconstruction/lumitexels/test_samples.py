@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from reconstruction.lumitexels.ray_casting import RayCaster
-from reconstruction.lumitexels.samples import Surface, gather, visibility
-from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.lumitexels.samples import Surface, visibility
+from reconstruction.lumitexels.store import LumitexelStore, gather
 
 RADIUS = 80.0
 FOCAL_PX, WIDTH, HEIGHT = 500.0, 200, 160

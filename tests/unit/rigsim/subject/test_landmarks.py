@@ -11,7 +11,7 @@ from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import face_regions, landmarks
 from rigsim.subject.expressions import displacement_mm
 from rigsim.subject.person import Subject, make_subject
-from skinrig.simulating.flash import landmarks_at_superpixels, to_superpixels
+from skinrig.simulating.flash_truth import landmarks_at_superpixels, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")

@@ -5,7 +5,8 @@ import pytest
 
 from model import store
 from model.facial_color import document as facial_color_document
-from model.facial_color.rig import FacialColorError, HemoglobinRig
+from model.facial_color.rig import HemoglobinRig
+from model.facial_color.state_maps import FacialColorError
 from model.skin import UNITS, SkinAppearance, SkinMap
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel

@@ -15,7 +15,7 @@ from rigsim.geometry.mesh import build_mesh
 from skinrig.exporting.materials import obj
 from skinrig.exporting.materials.tangents import FramedMesh
 
-collect_ignore = ["read_in_blender.py"]  # of Blender's Python
+collect_ignore = ["materials/read_in_blender.py"]  # of Blender's Python
 
 SIDE, GRID = 64, 13
 MATERIALS = ("ggx 0.22 eta 1.4", "ggx 0.4 eta 1.4")

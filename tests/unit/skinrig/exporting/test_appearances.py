@@ -8,6 +8,7 @@ import pytest
 
 from capture.session import ConsentError
 from model import store
+from model.facial_color.document import to_maps
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.errors import UsageError
@@ -201,7 +202,7 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
 
     neutral = 0.05 + 0.01 * rng.random((16, 16))
     rig = HemoglobinRig.from_maps(neutral, {"smile": 1.2 * neutral}, radius_px=4.0)
-    maps, document = rig.to_maps()
+    maps, document = to_maps(rig)
     maps["melanin"] = SkinMap(np.full((16, 16), 0.04), "volume fraction of the epidermis")
     told = {"consent_scope": ["research"], "consent_expires": None}
     part = {

@@ -12,7 +12,8 @@ from capture.session import Session, verify
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.cli import main
 from skinrig.simulating.dome import small_dome, spread
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 DOME = load_rig("dome")
 SMALL_POSES = 10

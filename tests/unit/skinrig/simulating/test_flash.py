@@ -4,7 +4,8 @@ import pytest
 
 from capture.session import Session
 from model import store
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 
 def test_where_a_face_stands_is_in_its_session_and_its_truth(tmp_path):

@@ -9,7 +9,8 @@ from skinrig.capturing.acquisition import choose_plan, needed_boxes, numbers_of,
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.errors import UsageError
 from skinrig.simulating.gradient import make_scene
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 RIG = load_rig("gradient")
 

@@ -11,7 +11,8 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.scene import GradientScene
 from skinrig.simulating.leaving_out import SWITCHES
-from skinrig.simulating.simulation import SimulationError, simulate_session
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.simulation import simulate_session
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 from scipy.interpolate import griddata
 
 from model import store
+from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinMap
 from rigsim.subject.landmarks import find
@@ -63,7 +64,7 @@ def folder(subject, tmp_path_factory):
         radius_px=10.0,
         valid=valid,
     )
-    maps, document = rig.to_maps()
+    maps, document = to_maps(rig)
     melanin = picture(subject.melanin)
     maps["melanin"] = SkinMap(np.where(valid, melanin, 0), UNITS["melanin"], None, valid)
     root = tmp_path_factory.mktemp("face")

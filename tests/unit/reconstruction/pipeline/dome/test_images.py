@@ -9,8 +9,9 @@ from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject
-from reconstruction.pipeline.dome.images import DomeImage, DomeImages, SensorNoise
+from reconstruction.pipeline.dome.images import DomeImage, DomeImages
 from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.sensor_noise import SensorNoise
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
 VIEW = RIG.views[0]

@@ -11,7 +11,7 @@ from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
 from rigsim.subject.person import Subject, make_subject
 from skinrig.simulating.dome import small_dome
-from skinrig.simulating.flash import truth_of
+from skinrig.simulating.flash_truth import truth_of
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192

@@ -13,6 +13,7 @@ from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.gradient.resolution import Waves, wavy_scene
 from rigsim.scenes.gradient.scene import FLAT_REFLECTANCE, METER_RATE_PER_S, GradientScene
+from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.sensor import fixed_pattern
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import PatchMotion
@@ -185,7 +186,7 @@ def test_drift_moves_the_picture_as_it_says(rig, skin):
 
 def test_truth_of_states_says_what_was_done(scene):
     stretched = GripState(45.0, 2, 9.6, 1.15, True, False)
-    truth = scene.truth_appearance([NEUTRAL, stretched])
+    truth = ground_truth(scene, [NEUTRAL, stretched])
     states = {row["name"]: row for row in truth.parameters["states"]}
     assert set(states) == {"a000_n0", "a045_p2"}
     gradient = np.array(states["a045_p2"]["gradient"])

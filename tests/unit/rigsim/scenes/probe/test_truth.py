@@ -15,8 +15,8 @@ from rigsim.fiber.homogeneous_fit import FAINTEST_PER_MM2, FitError, nearest_med
 from rigsim.fiber.probe_tissue import PHANTOM, HomogeneousTissue
 from rigsim.fiber.profile import Fibres, fibre_profile
 from rigsim.fiber.white_fiber import WhiteFibre, WhiteFibreError
-from rigsim.scenes.probe.scene import ProbeScene
-from rigsim.scenes.probe.truth import Probing
+from rigsim.scenes.probe.scene import ProbeScene, Probing
+from rigsim.scenes.probe.truth import appearance as ground_truth
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 RIG = load_rig("probe")
@@ -84,7 +84,7 @@ def test_what_cannot_be_fitted_is_refused():
 
 def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
     scene = ProbeScene(RIG, HomogeneousTissue(0.1, 2.0), photons=1)
-    truth = scene.truth_appearance([Probing("cheek", 1, 22.5, 59.0)])
+    truth = ground_truth(scene, [Probing("cheek", 1, 22.5, 59.0)])
     (entry,) = truth.parameters["profiles"]
     assert (entry["site"], entry["repeat"], entry["angle_deg"]) == ("cheek", 1, 22.5)
     assert entry["sigma_a_per_mm"] == [0.1] * 3
@@ -101,11 +101,8 @@ def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
 
 
 def test_the_truth_of_a_spectral_medium_lies_between_its_wavelengths():
-    (entry,) = (
-        ProbeScene(RIG, PHANTOM, photons=1)
-        .truth_appearance([Probing("phantom", 0, 0.0, 60.0)])
-        .parameters["profiles"]
-    )
+    scene = ProbeScene(RIG, PHANTOM, photons=1)
+    (entry,) = ground_truth(scene, [Probing("phantom", 0, 0.0, 60.0)]).parameters["profiles"]
     sigma_a = np.array(PHANTOM.sigma_a_per_mm)
     for value in entry["sigma_a_per_mm"]:
         assert 0.98 * sigma_a.min() < value < 1.02 * sigma_a.max()

@@ -8,6 +8,7 @@ import OpenEXR
 import pytest
 
 from model import store, wrinkles
+from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinAppearance, SkinMap
 from model.texture_resampling import resampled
@@ -35,7 +36,7 @@ def color_parts(rng):
     neutral = 0.05 + 0.02 * smooth / np.abs(smooth).max()
     states = {s: neutral * (1.1 + 0.15 * k) for k, s in enumerate(STATES)}
     rig = HemoglobinRig.from_maps(neutral, states, radius_px=8.0, stored_size=None)
-    maps, document = rig.to_maps()
+    maps, document = to_maps(rig)
     melanin = SkinMap(np.full((SIDE, SIDE), 0.04), UNITS["melanin"])
     return {**maps, "melanin": melanin}, {"facial_color.json": document}
 

@@ -1,0 +1,129 @@
+"""Maps of one expression of the hemoglobin rig, and the names of expressions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.facial_color.coarse_maps import Cells
+
+Image = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
+
+
+Mask = NDArray[np.bool_]
+
+
+NEUTRAL: Final = "neutral"
+
+
+GLOBAL_STATES: Final = ("exercise", "alcohol")
+"""States of the whole body: nothing of the face moves."""
+
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,57}")
+
+
+class FacialColorError(ValueError):
+    """Maps that make no rig, or weights that make no blend."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateMaps:
+    """One state as the rig stores it: arrays (h, w), 0 outside ``valid``."""
+
+    scale: Floats
+    """sigma_i/sigma_n under the prior, eq. (5)."""
+    bias: Floats
+    """mu_i, volume fraction."""
+    scale_stderr: Floats
+    """Standard error of the scale."""
+    bias_stderr: Floats
+    """Standard error of the bias, volume fraction."""
+    misfit: Floats
+    """Deviation of the measured state from scale and bias of the neutral map, within a disc,
+    volume fraction: what the state's own pattern, misalignment and noise leave."""
+    valid: Mask
+    """Cells that hold something."""
+    prior: float
+    """Scale that was expected before a place was looked at: sigma_i/sigma_n of the whole map; of
+    a transferred rig, that of its source."""
+    storage_rms: float
+    """Root mean square of what storing small changes in the state, volume fraction."""
+    storage_largest: float
+    """Largest such change."""
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that differ and numbers that are none."""
+        shape = self.valid.shape
+        for name in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit"):
+            values = getattr(self, name)
+            if values.shape != shape:
+                raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape}")
+            if not np.isfinite(values).all():
+                raise FacialColorError(f"{name}: got NaN or infinity, expected finite values")
+
+
+def check_name(name: str) -> None:
+    """Refuse a state's name that can be no map's."""
+    if name == NEUTRAL:
+        raise FacialColorError(f"states: {NEUTRAL!r} is the neutral map's own name")
+    if not _NAME.fullmatch(name):
+        raise FacialColorError(f"states: got name {name!r}, expected lower case, digits and _")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigMaps:
+    """Maps of a hemoglobin rig, as measured or transferred."""
+
+    neutral: Image
+    """Volume fraction in the neutral state, (H, W), float32 or float64; 0 outside ``valid``."""
+    valid: Mask
+    """(H, W)."""
+    neutral_stderr: Image
+    """Standard error of the neutral map, (H, W); 0 where none was stated."""
+    neutral_mean: Floats
+    """mu_n as stored, (h, w), volume fraction; bias of the neutral state."""
+    states: Mapping[str, StateMaps]
+    """By name, all but the neutral."""
+    radius_px: float
+    """Radius of the disc, px of the neutral map."""
+    global_states: tuple[str, ...] = ()
+    """Which of the states are of the whole body."""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together."""
+        shape = self.neutral.shape
+        if self.neutral.ndim != 2 or self.valid.shape != shape:
+            raise FacialColorError(
+                f"neutral: got {shape}, valid {self.valid.shape}, expected (H, W)"
+            )
+        if self.neutral_stderr.shape != shape:
+            raise FacialColorError(f"neutral_stderr: got {self.neutral_stderr.shape}, not {shape}")
+        for name, state in self.states.items():
+            check_name(name)
+            if state.valid.shape != self.neutral_mean.shape:
+                raise FacialColorError(
+                    f"{name}: got shape {state.valid.shape}, expected {self.neutral_mean.shape}"
+                )
+        for name in self.global_states:
+            if name not in self.states:
+                raise FacialColorError(f"global_states: {name!r} is no state of this rig")
+        object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
+
+    @property
+    def cells(self) -> Cells:
+        """How the stored maps lie on the neutral map."""
+        rows, columns = self.neutral.shape
+        return Cells((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
+
+    @property
+    def neutral_mean_valid(self) -> Mask:
+        """Cells of ``neutral_mean`` that hold something, (h, w)."""
+        return self.cells.coarsen(np.zeros(self.neutral.shape), self.valid)[1]

@@ -1,0 +1,212 @@
+"""The body of a simulated camera: shots, exposures and sensor."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import threading
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.devices.camera import (
+    CameraError,
+    Exposure,
+    Frame,
+    FrameTimeout,
+    Trigger,
+)
+from capture.rig import View
+from rigsim.world.faults import Faults
+from rigsim.world.light_record import Light
+
+ISO = (50, 25_600)
+
+
+EXPOSURE_S = (1.0 / 8000.0, 30.0)
+
+
+FOREIGN_SERIAL = "SR-9999"
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """An exposure whose pixels are not made yet."""
+
+    number: int
+    seq: int
+    start_s: float
+    exposure: Exposure
+
+    @property
+    def end_s(self) -> float:
+        return self.start_s + self.exposure.exposure_s
+
+
+class CameraWorld(Protocol):
+    """What a camera asks of the world that it stands in."""
+
+    faults: Faults
+    lock: threading.RLock
+    virtual: bool
+
+    @property
+    def now(self) -> float:
+        """World time, s."""
+
+    def rng_for(self, *names: str) -> np.random.Generator:
+        """Return the random generator of these names."""
+
+    def advance(self, now: float) -> float:
+        """Bring every controller to this time; return when the next event is due, s."""
+
+    def wait(self, until: float) -> None:
+        """Let time pass until this moment, s."""
+
+    def light_between(self, start: float, end: float) -> tuple[Light, ...]:
+        """Return the light of a span of time."""
+
+    def expose(
+        self,
+        view_name: str,
+        exposure: Exposure,
+        start_s: float,
+        *,
+        seed: int,
+        pops: Sequence[Light],
+    ) -> NDArray[np.uint16]:
+        """Return the pixels of an exposure."""
+
+
+class CameraBody:
+    """One camera of a world.
+
+    Parameters
+    ----------
+    world
+        Where it stands.
+    view
+        What it is.
+    first_shot
+        Number of its next shot, >= 0. It seeds the noise, so that no two shots may share one: a
+        camera that goes on where another world's ended goes on counting, too.
+
+    Attributes
+    ----------
+    missed_edges : int
+        Triggers that came while it was not armed or busy.
+    """
+
+    def __init__(self, world: CameraWorld, view: View, *, first_shot: int = 0) -> None:
+        self.world = world
+        self.view = view
+        self.exposure = Exposure(0.01, 100)
+        self.missed_edges = 0
+        self._rng = world.rng_for("camera", view.name)
+        self._armed = 0
+        self._trigger = Trigger.SOFTWARE
+        self._seq = 0
+        self._shots = first_shot
+        self._busy_until = -math.inf
+        self._waiting: deque[_Shot] = deque()
+        self._previous: _Shot | None = None
+
+    def clock_s(self) -> float:
+        """Return the camera's own clock, in s; it drifts as the world's faults say."""
+        return self._stamp(self.world.now)
+
+    def _stamp(self, now: float) -> float:
+        return now * (1.0 + self.world.faults.drift_ppm * 1e-6)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """Make ready for `count` exposures and drop what waits."""
+        with self.world.lock:
+            self._waiting.clear()
+            if self._previous is not None and self._rng.random() < self.world.faults.stale:
+                self._waiting.append(self._previous)
+            self._armed, self._trigger, self._seq = count, trigger, 0
+
+    def disarm(self) -> None:
+        """Give up what was armed; an exposure that has begun is dropped."""
+        with self.world.lock:
+            self._armed = 0
+            self._waiting.clear()
+
+    def edge(self, now: float) -> None:
+        """Notice a pulse on the camera line."""
+        if self._trigger is Trigger.EDGE and self._armed and now >= self._busy_until:
+            self._open_shutter(now)
+        else:
+            self.missed_edges += 1
+
+    @property
+    def reading_out(self) -> bool:
+        """Whether an exposure or its read-out is under way."""
+        return self.world.now < self._busy_until
+
+    def fire(self) -> None:
+        """Start an exposure now."""
+        with self.world.lock:
+            self.world.advance(self.world.now)
+            now = self.world.now
+            if self._trigger is not Trigger.SOFTWARE or not self._armed:
+                raise CameraError(f"camera {self.view.serial}: is not armed for software triggers")
+            if now < self._busy_until:
+                raise CameraError(f"camera {self.view.serial}: is still reading out")
+            self._open_shutter(now)
+
+    def _open_shutter(self, now: float) -> None:
+        shot = _Shot(self._shots, self._seq, now + self.view.shutter_lag_s, self.exposure)
+        self._shots += 1
+        self._seq += 1
+        self._armed -= 1
+        self._busy_until = shot.end_s + self.view.readout_s
+        if self._rng.random() >= self.world.faults.drop_frame:
+            self._waiting.append(shot)
+
+    def next_shot(self, timeout_s: float) -> _Shot:
+        """Wait until the next frame is read out."""
+        world = self.world
+        until = world.now + timeout_s
+        while True:
+            with world.lock:
+                world.advance(world.now)
+                ready = self._waiting[0].end_s + self.view.readout_s if self._waiting else math.inf
+                if ready <= world.now:
+                    self._previous = self._waiting.popleft()
+                    return self._previous
+                now = world.now
+            if now >= until:
+                raise FrameTimeout(f"camera {self.view.serial}: no frame in {timeout_s:g} s")
+            # an edge from another thread may begin an exposure meanwhile
+            pause = min(ready, until) if world.virtual else min(ready, until, now + 0.01)
+            world.wait(pause)
+
+    def develop(self, shot: _Shot) -> Frame:
+        """Make the pixels of an exposure and say what the camera says of it."""
+        faults = self.world.faults
+        rng = self.world.rng_for("frame", self.view.name, str(shot.number))
+        foreign = rng.random() < faults.wrong_camera
+        exposure = shot.exposure
+        if rng.random() < faults.wrong_exposure:
+            exposure = dataclasses.replace(exposure, exposure_s=2.0 * exposure.exposure_s)
+        light = self.world.light_between(shot.start_s, shot.start_s + exposure.exposure_s)
+        image = self.world.expose(
+            self.view.name,
+            exposure,
+            shot.start_s,
+            seed=int(rng.integers(0, 2**63)),
+            pops=light,
+        )
+        return Frame(
+            serial=FOREIGN_SERIAL if foreign else self.view.serial,
+            seq=shot.seq,
+            t_start_s=self._stamp(shot.start_s),
+            t_end_s=self._stamp(shot.start_s + exposure.exposure_s),
+            exposure=exposure,
+            image=image,
+        )

@@ -1,0 +1,117 @@
+"""Cases of the extremes and what is expected of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Real = type[np.float32] | type[np.float64]
+
+
+class Unexpected(AssertionError):
+    """A stage did something else than it should; the text says what."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One extreme."""
+
+    name: str
+    stage: str
+    """Module that is put to the test."""
+    extreme: str
+    """What is extreme."""
+    danger: str
+    """Why that can break."""
+    expected: str
+    """The behavior that holds."""
+    run: Callable[[Real], str]
+    """Tries it with inputs of a precision; returns what happened, or raises `Unexpected`."""
+    one_precision: str = ""
+    """Why its inputs have no precision to choose, so that one run stands for both; empty: they
+    have."""
+
+
+INTEGERS = "pictures of a sensor are integers"
+
+
+RENDERER = "rays are cast in the renderer's own single precision"
+"""Of cases whose inputs have one precision."""
+
+
+def near(
+    got: ArrayLike, expected: ArrayLike, *, relative: float = 0.0, absolute: float = 0.0
+) -> str:
+    """Return the value where it is as near as said, else raise."""
+    value, target = np.asarray(got, np.float64), np.asarray(expected, np.float64)
+    away = np.abs(value - target)
+    if not np.all(away <= absolute + relative * np.abs(target)):
+        raise Unexpected(f"got {_short(value)}, expected {_short(target)}")
+    return _short(value)
+
+
+def within(got: ArrayLike, low: float, high: float, *, what: str = "values") -> str:
+    """Return the range of the values where all are finite and within the bounds, else raise."""
+    value = np.asarray(got, np.float64)
+    if not np.all(np.isfinite(value)) or value.size == 0:
+        raise Unexpected(f"{what}: got {_short(value)}, expected finite values")
+    if np.min(value) < low or np.max(value) > high:
+        raise Unexpected(
+            f"{what}: got {np.min(value):.6g} to {np.max(value):.6g}, expected {low:g} to {high:g}"
+        )
+    return f"{what} {np.min(value):.4g} to {np.max(value):.4g}"
+
+
+def rising(got: ArrayLike, *, strictly: bool = True, what: str = "values") -> str:
+    """Return the ends of the values where they are finite and rise, else raise."""
+    value = np.asarray(got, np.float64)
+    steps = np.diff(value)
+    if not np.all(np.isfinite(value)) or np.any(steps < 0) or (strictly and np.any(steps == 0)):
+        raise Unexpected(f"{what}: got {_short(value)}, expected values that rise")
+    return f"{what} rise from {value[0]:.4g} to {value[-1]:.4g}"
+
+
+def refused(call: Callable[[], object], error: type[BaseException], *words: str) -> str:
+    """Return the message where the call raises this error and says these words, else raise."""
+    try:
+        got = call()
+    except error as caught:
+        text = str(caught)
+        for word in words:
+            if word not in text:
+                raise Unexpected(f"the error does not say {word!r}: {text}") from caught
+        return f"{type(caught).__name__}: {text}"
+    except Exception as caught:
+        raise Unexpected(f"{type(caught).__name__} instead of {error.__name__}: {caught}") from None
+    raise Unexpected(f"got {type(got).__name__}, expected {error.__name__}")
+
+
+def masked(valid: ArrayLike, *, share: tuple[float, float] = (0.0, 0.0)) -> str:
+    """Return how much is valid where that share lies in the range, else raise."""
+    kept = float(np.mean(np.asarray(valid, np.float64)))
+    if not share[0] <= kept <= share[1]:
+        raise Unexpected(f"valid: got a share of {kept:.3g}, expected {share[0]:g} to {share[1]:g}")
+    return f"{100 * kept:.3g} % valid"
+
+
+def clean(values: ArrayLike, valid: ArrayLike, *, what: str = "values") -> str:
+    """Return that every valid value is finite, else raise."""
+    shown = np.asarray(values)[np.asarray(valid, np.bool_)]
+    if not np.all(np.isfinite(shown)):
+        raise Unexpected(f"{what}: got NaN or infinity at a valid place")
+    return f"{what} finite where valid"
+
+
+def as_real(values: ArrayLike, real: Real) -> NDArray[Any]:
+    """Return values as an array of a precision."""
+    return np.asarray(values, real)
+
+
+def _short(value: NDArray[np.float64]) -> str:
+    if value.size <= 4:
+        return ", ".join(f"{v:.6g}" for v in value.ravel())
+    return f"{value.size} values from {np.nanmin(value):.4g} to {np.nanmax(value):.4g}"

@@ -1,0 +1,147 @@
+"""Drive a simulated rig through a plan into a session."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from capture.acquire import run_plan
+from capture.devices.box import Box
+from capture.devices.caliper import CaliperBox
+from capture.devices.camera import open_camera
+from capture.devices.dome import DomeBox, Eyes
+from capture.devices.flash import FlashBox
+from capture.devices.gradient_sphere import GradientSphereBox
+from capture.devices.port import Port
+from capture.devices.probe import ProbeBox
+from capture.plan import Plan
+from capture.rig import Rig
+from capture.session import Session, Subject
+from skinrig.simulating.orders import USES, Order, SimulationError
+from skinrig.simulating.resumption import refusals
+from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.subject_records import pseudonym
+
+BOXES: Mapping[str, type[Box]] = {
+    "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox, "caliper": CaliperBox,
+    "probe": ProbeBox,
+}  # fmt: skip
+"""Driver of each kind of box."""
+
+
+def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
+    """Return what a scene builds and what not, as its manifest and `Simulated` hold it."""
+    return tuple(scene.needs.document())
+
+
+def open_session(
+    order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any], scene: Any
+) -> Session:
+    """Begin the session of an order, or go on with it where it was begun with the same settings."""
+    if order.resume:
+        session = Session.resume(order.out)
+        lines = refusals(session, asked, order.seed, order.person)
+        if lines:
+            session.release()
+            told = "".join(f"\n  {line}" for line in lines)
+            raise SimulationError(
+                f"{order.out}: cannot be gone on with as asked{told}\n"
+                "  resume with the same settings, or name another folder"
+            )
+        return session
+    order.out.parent.mkdir(parents=True, exist_ok=True)
+    created = order.created
+    return Session.create(
+        order.out,
+        plan=plan,
+        rig=rig,
+        devices={
+            **{name: f"rigsim {name} box" for name in rig.boxes},
+            **{view.name: view.serial for view in rig.views},
+        },
+        subject=order.person or Subject(pseudonym(order.subject, order.seed), USES),
+        source="simulated",
+        seed=order.seed,
+        extra={"simulation": dict(asked), "effects": [dict(one) for one in effects_of(scene)]},
+        now=None if created is None else (lambda: created),
+    )
+
+
+def drive(
+    session: Session,
+    rig: Rig,
+    scene: Any,
+    seed: int,
+    prompt: Callable[[Any, str], None],
+    progress: Callable[[str], None] | None,
+    *,
+    eyes: Eyes = "open",
+    force_limit_n: float | None = None,
+    run_id: str = "",
+    all_brackets: bool = False,
+    signal: Callable[[Any, str], None] | None = None,
+    begun_s: float | None = None,
+) -> float:
+    """Run a session's plan through the drivers, on a world registered under its id, and close it.
+
+    Parameters
+    ----------
+    session, rig
+        Open for writing; the rig as it is drawn.
+    scene
+        What the cameras see first.
+    seed
+        Of the world.
+    prompt
+        Called with the world and what the operator is asked for.
+    progress
+        Called with one line now and then.
+    eyes
+        What is said of the subject's eyes.
+    force_limit_n
+        Of a caliper, N.
+    run_id
+        Begins the tokens of this run.
+    all_brackets
+        Of a probe.
+    signal
+        Called with the world and what the subject of a sequence is asked for, at the time.
+    begun_s
+        The host's time at which the world begins, s since 1970; None: the host's clock is not the
+        world's, but this computer's.
+
+    Returns
+    -------
+    float
+        Time that has passed on the rig, s.
+    """
+    from rigsim.world import World
+
+    world = World(rig, seed=seed, clock="virtual", scene=scene, shots_made=shots_made(session))
+    name = world.register(session.id)
+    boxes = {
+        # a number of fixed length: with drawn ones the lines would take a little longer or shorter
+        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock, first_seq=1))
+        for kind in rig.boxes
+    }
+    cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
+    hear = None if signal is None else partial(signal, world)
+    try:
+        run_plan(
+            session.plan, rig, boxes=boxes, cameras=cameras, session=session,
+            progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
+            force_limit_n=force_limit_n, run_id=run_id, all_brackets=all_brackets, signal=hear,
+            timer=world.clock,
+            clock=time.time if begun_s is None else lambda: begun_s + world.now,
+        )  # fmt: skip
+        session.close()
+        return float(world.now)
+    finally:
+        for camera in cameras.values():
+            camera.close()
+        for box in boxes.values():
+            box.close()
+        world.unregister()
+        session.release()
