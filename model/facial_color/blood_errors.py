@@ -51,7 +51,7 @@ def compare(
     --------
     >>> neutral = np.array([[0.02, 0.04]])
     >>> found = compare(1.5 * neutral, 1.5 * neutral, neutral)
-    >>> found.predicted, found.gain, round(found.neutral_kept, 6)
+    >>> found.predicted, round(found.gain, 6), round(found.neutral_kept, 6)
     (0.0, 1.5, 0.015811)
     """
     h, t, n = (np.asarray(image, np.float64) for image in (predicted, truth, neutral))

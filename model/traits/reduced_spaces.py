@@ -241,7 +241,7 @@ def mixtures(
     if basis is None:
         raise TraitError(
             "basis: got none, expected (K, d) non-negative mixtures for space='nmf', such as "
-            "reconstruction.brdf_basis.fit.reduce(weights, K)[1]"
+            "reconstruction.brdf_basis.reduce(weights, K)[1]"
         )
     b = np.asarray(basis, np.float64)
     fits = b.ndim == 2 and b.shape[1] == samples.shape[1] and len(b) > 0
