@@ -8,19 +8,12 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-from numba import (
-    carray,
-    get_num_threads,
-    njit,
-    parallel_chunksize,
-    prange,
-    set_num_threads,
-    types,
-)
+from numba import carray, get_num_threads, njit, parallel_chunksize, prange, set_num_threads, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
+from capture.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from capture.documents import Checks, InputError
 
 __all__ = ["BracketError", "Response", "merge", "merge_reference", "recover_response"]
@@ -39,7 +32,7 @@ _EXACT: Final = 2.0**53
 _LEVELS: Final = 256
 _GROUPS: Final = 8
 
-Merged = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
+Merged = tuple[Float32Array, Float32Array, BoolArray]
 
 
 class BracketError(InputError):
@@ -50,16 +43,14 @@ class BracketError(InputError):
 class Response:
     """How an encoded picture's values follow from exposure, up to one factor a channel."""
 
-    exposure: NDArray[np.float64]
+    exposure: Float64Array
     """Relative exposure (radiance times seconds) of each value, shape (256, C), 1 at value 128."""
-    stderr: NDArray[np.float64]
+    stderr: Float64Array
     """Of `exposure`, shape (256, C), from groups of pixels fitted apart."""
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     """Values that were seen often enough and rise, shape (256, C)."""
 
-    def linearize(
-        self, image: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    def linearize(self, image: UInt8Array) -> tuple[Float32Array, Float32Array, BoolArray]:
         """Return relative exposure, its variance and where it is valid, each of the image's shape.
 
         The variance is that of the response and of the rounding to whole values.
@@ -81,7 +72,7 @@ class Response:
 
 
 def recover_response(
-    images: Sequence[NDArray[np.uint8]],
+    images: Sequence[UInt8Array],
     exposures_s: ArrayLike,
     *,
     rng: np.random.Generator,
@@ -301,7 +292,7 @@ def merge_reference(
     )
 
 
-def _starters(times: NDArray[np.float64]) -> NDArray[np.int64]:
+def _starters(times: Float64Array) -> Int64Array:
     """Return the frames for the first guess: all, or of dense brackets those a factor 3 apart.
 
     The weights need the radiance to some percent only. The shortest and the longest take part.
@@ -327,7 +318,7 @@ def _whole(frame: NDArray[Any]) -> NDArray[np.integer]:
 
 def _check(
     stack: Sequence[NDArray[np.integer]],
-    times: NDArray[np.float64],
+    times: Float64Array,
     *,
     gain: float,
     read_noise: float,
@@ -347,10 +338,12 @@ def _check(
         part = (values == np.rint(values)) & (np.abs(values) < _EXACT)  # NaN is not whole
         if not part.all():
             checks.that(
-                f"frames[{k}]", float(values[~part].flat[0]), False,
+                f"frames[{k}]",
+                float(values[~part].flat[0]),
+                False,
                 "raw DN, whole numbers; in place of averaged frames give the single ones, each "
                 "with its time, and in place of subtracting a dark frame its level as black",
-            )  # fmt: skip
+            )
             break
     one_each = times.shape == (len(stack),)
     checks.that("exposures_s", times.shape, one_each, f"{len(stack)} times")
@@ -372,12 +365,7 @@ def _as_pointer(typing_context: Any, address: Any) -> Any:
     return types.voidptr(address), build
 
 
-@njit(
-    cache=True,
-    parallel=True,
-    error_model="numpy",
-    fastmath=_FAST,
-)
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=_FAST)
 def _merge_tiles(  # type: ignore[no-untyped-def]
     addresses, times, starters, per_gain, floor, black, white, per_time, radiance, variance, valid
 ):

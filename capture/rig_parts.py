@@ -169,9 +169,7 @@ class Caliper:
     def __post_init__(self) -> None:
         checks = Checks("Caliper", RigError)
         checks.positive(
-            aperture_mm=self.aperture_mm,
-            step_mm=self.step_mm,
-            speed_mm_per_s=self.speed_mm_per_s,
+            aperture_mm=self.aperture_mm, step_mm=self.step_mm, speed_mm_per_s=self.speed_mm_per_s
         )
         checks.that("settle_s", self.settle_s, 0 <= self.settle_s < math.inf, "seconds >= 0")
         open_mm = self.aperture_mm + self.first_step * self.step_mm

@@ -7,15 +7,14 @@ from functools import lru_cache
 from importlib import resources
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from model import spectra
+from model.arrays import Float64Array
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import two_layer_reflectance
 from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX, OXYGENATION
-
-FloatArray = NDArray[np.float64]
 
 SPECTRAL_NODES = 41
 """Nodes along each axis of the stored spectral table, see tools/make_reflectance_table.py."""
@@ -43,7 +42,7 @@ class ColorTable:
     """Name of the camera's spectral sensitivities."""
     illuminant: str
     """Name of the light's spectrum."""
-    rgb: FloatArray
+    rgb: Float64Array
     """Shape (size, size, 3): [i, j] is the color at C_m = c_m_max (i/(size-1))^3 and
     C_hd = c_hd_max (j/(size-1))^3; each channel of a perfect white reflector is 1."""
     c_m_max: float = C_M_MAX
@@ -52,7 +51,7 @@ class ColorTable:
     """Volume fraction of dermal blood at the end of the second axis."""
     anisotropy: float = 0.0
     """Mean cosine g of scattering behind the table."""
-    cells: FloatArray = field(init=False, repr=False)
+    cells: Float64Array = field(init=False, repr=False)
     """Shape (size-1, size-1, 3, 4, 4): coefficients of x^p y^q in each cell at [..., p, q], with
     x and y the fractions of the way across the cell."""
 
@@ -78,7 +77,7 @@ class ColorTable:
         """Nodes along each axis."""
         return int(self.rgb.shape[0])
 
-    def lookup(self, c_m: ArrayLike, c_hd: ArrayLike) -> FloatArray:
+    def lookup(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
         """Return the color of skin.
 
         Parameters
@@ -98,7 +97,7 @@ class ColorTable:
         """
         return self._evaluate(c_m, c_hd)[0]
 
-    def jacobian(self, c_m: ArrayLike, c_hd: ArrayLike) -> FloatArray:
+    def jacobian(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
         """Return the derivatives of the color.
 
         Parameters
@@ -131,7 +130,7 @@ class ColorTable:
 
     def _evaluate(
         self, c_m: ArrayLike, c_hd: ArrayLike
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the color and its derivatives by the two node indices."""
         i, j = _paired(
             _node_index("c_m", c_m, self.c_m_max, self.size),
@@ -218,7 +217,9 @@ def build(
     return ColorTable(camera, illuminant, rgb, anisotropy=anisotropy)
 
 
-def spectral_reflectance(c_m: ArrayLike, c_hd: ArrayLike, *, anisotropy: float = 0.0) -> FloatArray:
+def spectral_reflectance(
+    c_m: ArrayLike, c_hd: ArrayLike, *, anisotropy: float = 0.0
+) -> Float64Array:
     """Return the spectra that the color tables average, by their splines.
 
     Parameters
@@ -259,7 +260,7 @@ def spectral_reflectance(c_m: ArrayLike, c_hd: ArrayLike, *, anisotropy: float =
     return np.exp(found).reshape(*melanin.shape, -1)
 
 
-def spectral_axes(nodes: int) -> tuple[FloatArray, FloatArray]:
+def spectral_axes(nodes: int) -> tuple[Float64Array, Float64Array]:
     """Return the cube roots of C_m and of C_hd along the axes, from 0 to Table 1's ends."""
     u = np.linspace(0.0, np.cbrt(C_M_MAX), nodes)  # eq. (7)
     v = np.linspace(0.0, np.cbrt(C_HD_MAX), nodes)
@@ -267,7 +268,7 @@ def spectral_axes(nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @lru_cache(maxsize=8)
-def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: float) -> FloatArray:
+def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: float) -> Float64Array:
     """Return log reflectance over (C_m, C_hd, wavelength), stored or computed."""
     paper = (beta_m, oxygenation, eta) == (BETA_M, OXYGENATION, ETA_SKIN)
     if paper and anisotropy in STORED_ANISOTROPIES and C_HE_PER_C_HD == 0.25:
@@ -287,7 +288,7 @@ def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: floa
     return np.asarray(np.log(reflectance))
 
 
-def _spline_cells(rgb: FloatArray) -> FloatArray:
+def _spline_cells(rgb: Float64Array) -> Float64Array:
     """Return the tensor cubic spline through the nodes as one polynomial a cell."""
     nodes = np.arange(rgb.shape[0])
     along_i = CubicSpline(nodes, rgb, axis=0).c[::-1]  # (p, cell i, node j, channel)
@@ -295,7 +296,7 @@ def _spline_cells(rgb: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.transpose(both, (3, 1, 4, 2, 0)))
 
 
-def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> FloatArray:
+def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> Float64Array:
     values = np.asarray(fraction, dtype=np.float64)
     within = (values >= 0.0) & (values <= largest * (1.0 + 1e-12))
     if not within.all():
@@ -305,7 +306,7 @@ def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> Fl
     return np.asarray((size - 1) * np.cbrt(values / largest))
 
 
-def _paired(melanin: FloatArray, blood: FloatArray) -> tuple[FloatArray, ...]:
+def _paired(melanin: Float64Array, blood: Float64Array) -> tuple[Float64Array, ...]:
     try:
         return np.broadcast_arrays(melanin, blood)
     except ValueError:
@@ -314,7 +315,7 @@ def _paired(melanin: FloatArray, blood: FloatArray) -> tuple[FloatArray, ...]:
         ) from None
 
 
-def _powers(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _powers(x: Float64Array) -> tuple[Float64Array, Float64Array]:
     one = np.ones_like(x)
     zero = np.zeros_like(x)
     return (

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 ETA_SKIN = 1.4
 """Refractive index of skin relative to air, the value used where a paper does not give its own.
@@ -20,7 +20,7 @@ LARGEST_INDEX = 100.0
 _POINTS = 96  # the external average is smooth: 96 Gauss points are exact to rounding
 
 
-def reflectance(cos_incident: ArrayLike, eta: float) -> FloatArray:
+def reflectance(cos_incident: ArrayLike, eta: float) -> Float64Array:
     """Return the unpolarized Fresnel reflectance of a smooth surface.
 
     Parameters
@@ -165,6 +165,6 @@ def _denser(eta: float) -> float:
 
 
 @lru_cache(maxsize=1)
-def _gauss_unit() -> tuple[FloatArray, FloatArray]:
+def _gauss_unit() -> tuple[Float64Array, Float64Array]:
     node, weight = np.polynomial.legendre.leggauss(_POINTS)
     return 0.5 * (node + 1.0), 0.5 * weight

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from model.arrays import BoolArray, Float64Array
 
 SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
@@ -44,7 +44,7 @@ class MerlTable:
         then theta_h, theta_d, phi_d. Negative: not measured.
     """
 
-    stored: FloatArray
+    stored: Float64Array
 
     def __post_init__(self) -> None:
         """Check the shape."""
@@ -65,7 +65,7 @@ class MerlTable:
             stored[channel][none] = NOT_MEASURED
         return cls(stored)
 
-    def lookup(self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> FloatArray:
+    def lookup(self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> Float64Array:
         """Return the BRDF of the nearest bin.
 
         Parameters
@@ -97,7 +97,7 @@ class MerlTable:
         return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * SCALE)
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> BoolArray:
         """Bins measured in all channels, (90, 90, 180)."""
         return np.asarray(np.all(self.stored >= 0.0, axis=0))
 
@@ -127,7 +127,7 @@ def bins(
     return index_h, index_d, index_phi
 
 
-def bin_centers() -> tuple[FloatArray, FloatArray, FloatArray]:
+def bin_centers() -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return theta_h (90), theta_d (90) and phi_d (180) at the middles of the bins, rad."""
     h = ((np.arange(SHAPE[0]) + 0.5) / SHAPE[0]) ** 2 * _HALF_PI
     d = (np.arange(SHAPE[1]) + 0.5) / SHAPE[1] * _HALF_PI
@@ -137,7 +137,7 @@ def bin_centers() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def to_angles(
     light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return half and difference angles of directions at a surface.
 
     Parameters
@@ -176,7 +176,7 @@ def to_angles(
 
 def to_directions(
     theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return light and view of half and difference angles, in the frame whose normal is +z.
 
     The half vector is put at azimuth 0 (an isotropic BRDF has no other). Angles can lie such that
@@ -215,7 +215,7 @@ def read(path: str | os.PathLike[str]) -> MerlTable:
     return MerlTable(np.stack(list(_planes(Path(path)))))
 
 
-def read_mean(path: str | os.PathLike[str]) -> FloatArray:
+def read_mean(path: str | os.PathLike[str]) -> Float64Array:
     """Read the mean of a file's channels, plane by plane, with half the memory of `read`.
 
     Returns
@@ -236,7 +236,7 @@ def read_mean(path: str | os.PathLike[str]) -> FloatArray:
     return mean
 
 
-def _planes(file: Path) -> Iterator[FloatArray]:
+def _planes(file: Path) -> Iterator[Float64Array]:
     """Yield the channels, each (90, 90, 180), of a file whose size and header are right."""
     size = file.stat().st_size
     with file.open("rb") as stream:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-Floats = NDArray[np.float64]
+from model.arrays import Float64Array
 
 
-def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Floats:
+def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Float64Array:
     """Return the angle between vectors, accurate for small angles too.
 
     Parameters
@@ -37,7 +37,7 @@ def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Floats:
     return np.where((cross == 0) & (dot == 0), np.nan, angle)
 
 
-def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Floats:
+def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
     """Return the CIEDE2000 color difference with k_L = k_C = k_H = 1.
 
     Parameters
@@ -89,7 +89,7 @@ def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Floats:
     return np.sqrt(np.maximum(squared, 0.0))
 
 
-def individual_typology_angle_deg(lightness: ArrayLike, b_star: ArrayLike) -> Floats:
+def individual_typology_angle_deg(lightness: ArrayLike, b_star: ArrayLike) -> Float64Array:
     """Return the individual typology angle, arctan((L* - 50) / b*), in degrees.
 
     Parameters

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+
+from model.arrays import BoolArray, Float32Array
 
 _FILE = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
 
@@ -48,10 +49,10 @@ class SkinMap:
         One line for people: frame, color space, what was assumed.
     """
 
-    values: NDArray[np.float32]
+    values: Float32Array
     unit: str
-    stderr: NDArray[np.float32] | None = None
-    valid: NDArray[np.bool_] | None = None
+    stderr: Float32Array | None = None
+    valid: BoolArray | None = None
     description: str = ""
 
     def __post_init__(self) -> None:

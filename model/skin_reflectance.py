@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import fresnel, translucency_population
+from model.arrays import BoolArray, Float32Array, Float64Array
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
-
-FloatArray = NDArray[np.float64]
 
 BASIS_FILE = "brdf_basis.npz"
 WEIGHT = "basis_weight_"
@@ -72,17 +71,17 @@ class SkinReflectance:
         Standard errors; None: not known.
     """
 
-    r_d: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    r_d: Float32Array
+    weights: Float32Array
     lobes: BrdfBasis
-    translucency_mm: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    position_mm: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    translucency_mm: Float32Array
+    normals: Float32Array
+    position_mm: Float32Array
+    valid: BoolArray
     eta: float = fresnel.ETA_SKIN
     assumed: tuple[str, ...] = ()
-    r_d_stderr: NDArray[np.float32] | None = None
-    translucency_stderr_mm: NDArray[np.float32] | None = None
+    r_d_stderr: Float32Array | None = None
+    translucency_stderr_mm: Float32Array | None = None
 
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit, and valid texels with values that no skin has."""
@@ -92,9 +91,14 @@ class SkinReflectance:
                 f"valid: got {np.asarray(self.valid).dtype} {shape}, expected bool (H, W)"
             )
         fields = {
-            "r_d": 3, "weights": self.lobes.size, "translucency_mm": 3, "normals": 3,
-            "position_mm": 3, "r_d_stderr": 3, "translucency_stderr_mm": 3,
-        }  # fmt: skip
+            "r_d": 3,
+            "weights": self.lobes.size,
+            "translucency_mm": 3,
+            "normals": 3,
+            "position_mm": 3,
+            "r_d_stderr": 3,
+            "translucency_stderr_mm": 3,
+        }
         for name, channels in fields.items():
             if (given := getattr(self, name)) is None:
                 continue
@@ -207,7 +211,7 @@ def assemble(
     )
 
 
-def population_mean_mm() -> tuple[FloatArray, str]:
+def population_mean_mm() -> tuple[Float64Array, str]:
     """Return 1 over the mean sigma_tr of table 2 over its places, mm, (3,), and words for it."""
     people = translucency_population.weyrich_2005()
     mean = people.mean_per_mm.mean(axis=0)
@@ -255,7 +259,7 @@ def surface_brdf(
     light_dir: ArrayLike,
     view_dir: ArrayLike,
     normals: ArrayLike,
-) -> FloatArray:
+) -> Float64Array:
     """Return what the surface reflects, without the cosine of the light.
 
     Parameters
@@ -284,7 +288,7 @@ def lobe_brdf(
     light_dir: ArrayLike,
     view_dir: ArrayLike,
     normals: ArrayLike,
-) -> FloatArray:
+) -> Float64Array:
     """Return a mixture of lobes, (n,), 1/sr; weights (n, K), for interpolated or edited ones."""
     share = np.asarray(weights, np.float64)
     to = [np.broadcast_to(v, (len(share), 3)) for v in (light_dir, view_dir, normals)]
@@ -301,7 +305,7 @@ def local_diffuse(
     light_dir: ArrayLike,
     view_dir: ArrayLike,
     normals: ArrayLike,
-) -> FloatArray:
+) -> Float64Array:
     """Return R_d F_t(light) F_t(view) / pi, the diffuse part of skin that light does not spread in.
 
     Parameters as of `surface_brdf`.
@@ -318,7 +322,7 @@ def local_diffuse(
     return np.asarray(r_d * passed[..., None] / np.pi)
 
 
-def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> FloatArray:
+def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Array:
     """Return F_t, the share of light that passes the surface at a cosine; 0 below the horizon.
 
     Examples
@@ -333,7 +337,7 @@ def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> FloatArray:
 
 def leaving_radiance(
     exitance: ArrayLike, cos_view: ArrayLike, eta: float = fresnel.ETA_SKIN
-) -> FloatArray:
+) -> Float64Array:
     """Return the radiance towards a view of light that the skin gives back.
 
     Parameters
@@ -352,7 +356,7 @@ def leaving_radiance(
     return np.asarray(passed * np.asarray(exitance, np.float64) / np.pi)
 
 
-def _require(name: str, good: NDArray[np.bool_], expected: str) -> None:
+def _require(name: str, good: BoolArray, expected: str) -> None:
     if not good.all():
         row, column = np.argwhere(~good)[0]
         raise SkinReflectanceError(
@@ -384,7 +388,7 @@ def _normals(appearance: SkinAppearance) -> SkinMap:
     )
 
 
-def _valid(one: SkinMap) -> NDArray[np.bool_]:
+def _valid(one: SkinMap) -> BoolArray:
     return np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
 
 
@@ -402,7 +406,7 @@ def _rows(model: SkinReflectance, rows: ArrayLike) -> NDArray[np.intp]:
 
 def _over_texture(
     given: ArrayLike | SkinMap, shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.bool_]]:
+) -> tuple[Float32Array, Float32Array | None, BoolArray]:
     """Return a translucency on a texture of a shape, its standard error, and where it is known."""
     if isinstance(given, SkinMap):
         if given.values.ndim != 3:
@@ -425,7 +429,7 @@ def _over_texture(
     return even.copy(), None, np.ones(shape, bool)
 
 
-def _resampled(image: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _resampled(image: Float32Array, shape: tuple[int, ...]) -> Float32Array:
     """Return (h, w, C) at the texels of another size, linear, held beyond its outermost texels."""
     for axis, size in enumerate(shape):
         old = image.shape[axis]

@@ -10,14 +10,14 @@ from functools import cache, lru_cache
 from importlib import resources
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 LONGEST_NM = 1e6
 """Longest wavelength that is one of light, nm."""
 
-WAVELENGTH_NM: FloatArray = np.arange(400.0, 701.0, 10.0)
+WAVELENGTH_NM: Float64Array = np.arange(400.0, 701.0, 10.0)
 """Default sampling of the visible spectrum in nm: 400 to 700 in steps of 10, 31 samples."""
 WAVELENGTH_NM.setflags(write=False)
 
@@ -48,7 +48,7 @@ _DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
 
 LINEAR_SRGB = "linear sRGB"
 """Name of the pseudo camera whose channels are the sRGB primaries."""
-XYZ_TO_LINEAR_SRGB: FloatArray = np.array(
+XYZ_TO_LINEAR_SRGB: Float64Array = np.array(
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
 )
 """XYZ under D65 to linear sRGB, IEC 61966-2-1:1999."""
@@ -63,7 +63,7 @@ class SpectrumNameError(KeyError, ValueError):
 
 def hemoglobin_extinction(
     wavelength_nm: ArrayLike = WAVELENGTH_NM,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the molar extinction of oxygenated and of deoxygenated hemoglobin.
 
     Parameters
@@ -90,7 +90,7 @@ def hemoglobin_extinction(
     return values[..., 0], values[..., 1]
 
 
-def eumelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def eumelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the absorption of eumelanin in 1/mm at wavelengths in nm (any shape).
 
     References
@@ -106,7 +106,7 @@ def eumelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray
     return np.asarray(EUMELANIN_FACTOR_PER_MM * wavelength**EUMELANIN_EXPONENT)
 
 
-def pheomelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def pheomelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the absorption of pheomelanin in 1/mm at wavelengths in nm (any shape).
 
     References
@@ -122,7 +122,7 @@ def pheomelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArr
     return np.asarray(PHEOMELANIN_FACTOR_PER_MM * wavelength**PHEOMELANIN_EXPONENT)
 
 
-def baseline_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def baseline_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the absorption in 1/mm of skin without blood and melanin, wavelengths in nm.
 
     References
@@ -139,7 +139,7 @@ def baseline_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
     return np.asarray(BASELINE_OFFSET_PER_MM + BASELINE_FACTOR_PER_MM * decay)
 
 
-def reduced_scattering(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def reduced_scattering(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the reduced scattering of the epidermis in 1/mm, wavelengths in nm (any shape).
 
     The dermis has half of it (Donner et al. 2008, doi:10.1145/1409060.1409093).
@@ -155,7 +155,7 @@ def reduced_scattering(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
     return np.asarray(mie + rayleigh)
 
 
-def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the relative spectral sensitivity of a camera's three channels.
 
     Parameters
@@ -198,7 +198,7 @@ def illuminant_names() -> tuple[str, ...]:
     return (*_DAYLIGHT_NOMINAL_K, "A", "E", "LED-B3", "xenon flash")
 
 
-def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the relative spectral power of a light.
 
     Parameters
@@ -247,7 +247,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArra
         return np.asarray(100.0 * power / _sampled("cie_led_b3.csv", 560.0, outside=0.0)[..., 0])
     if name == "xenon flash":
 
-        def envelope(nm: FloatArray) -> FloatArray:
+        def envelope(nm: Float64Array) -> Float64Array:
             return np.asarray(1.0 / (1.0 + np.exp(-(nm - FLASH_CUTOFF_NM) / FLASH_CUTOFF_WIDTH_NM)))
 
         body = _black_body(wavelength, 1.4388e7, FLASH_TEMPERATURE_K)
@@ -255,7 +255,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArra
     raise SpectrumNameError(_unknown("light", name, illuminant_names()))
 
 
-def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
     """Return the CIE 1931 2-degree color matching functions, shape (n, 3), wavelengths in nm.
 
     References
@@ -267,7 +267,7 @@ def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatA
 
 def band_weights(
     camera: str, illuminant_name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM
-) -> FloatArray:
+) -> Float64Array:
     """Return weights that turn a sampled reflectance into white-balanced camera RGB.
 
     Parameters
@@ -296,7 +296,7 @@ def band_average(
     illuminant_name: str,
     *,
     wavelength_nm: ArrayLike = WAVELENGTH_NM,
-) -> FloatArray:
+) -> Float64Array:
     """Return the white-balanced camera RGB of reflectance spectra.
 
     Parameters
@@ -328,7 +328,7 @@ def band_average(
     return np.asarray(values @ weights)
 
 
-def camera_white(camera: str, illuminant_name: str) -> FloatArray:
+def camera_white(camera: str, illuminant_name: str) -> Float64Array:
     """Return the camera RGB of a perfect white, not balanced, largest channel 1, shape (3,).
 
     Divide camera RGB by it to get the white-balanced RGB of `band_average` (up to one scale).
@@ -340,14 +340,14 @@ def camera_white(camera: str, illuminant_name: str) -> FloatArray:
 
 
 @cache
-def _table(file_name: str) -> tuple[FloatArray, FloatArray]:
+def _table(file_name: str) -> tuple[Float64Array, Float64Array]:
     text = resources.files("model").joinpath("data", file_name).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     values = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
     return values[:, 0], values[:, 1:]
 
 
-def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None) -> FloatArray:
+def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None) -> Float64Array:
     """Interpolate a table linearly; `outside` is the value beyond it, None forbids going there."""
     nodes, values = _table(file_name)
     wavelength = _wavelengths(wavelength_nm)
@@ -364,7 +364,7 @@ def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None)
 
 
 @lru_cache(maxsize=64)
-def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> FloatArray:
+def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> Float64Array:
     nodes = np.array(grid)
     fine = np.linspace(nodes[0], nodes[-1], round(nodes[-1] - nodes[0]) + 1)
     response = illuminant(light_name, fine)[:, None] * camera_sensitivity(camera, fine)
@@ -378,7 +378,7 @@ def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> Floa
     return np.asarray(weights / weights.sum(axis=0))
 
 
-def _wavelengths(wavelength_nm: ArrayLike) -> FloatArray:
+def _wavelengths(wavelength_nm: ArrayLike) -> Float64Array:
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     if not np.all((wavelength > 0.0) & (wavelength <= LONGEST_NM)):
         raise ValueError(
@@ -398,7 +398,7 @@ def _increasing(wavelength_nm: ArrayLike) -> tuple[float, ...]:
     return tuple(_wavelengths(grid).tolist())
 
 
-def _daylight(nominal_k: float, wavelength: FloatArray) -> FloatArray:
+def _daylight(nominal_k: float, wavelength: Float64Array) -> Float64Array:
     # CIE 015:2018, section 4.1.2; the nominal temperature is corrected for the change of c2.
     t = nominal_k * 1.4388 / 1.4380
     if t <= 7000.0:
@@ -413,8 +413,8 @@ def _daylight(nominal_k: float, wavelength: FloatArray) -> FloatArray:
     return np.asarray(components @ np.array([1.0, m1, m2]))
 
 
-def _black_body(wavelength: FloatArray, c2_nm_k: float, temperature_k: float) -> FloatArray:
-    def relative(nm: FloatArray) -> FloatArray:
+def _black_body(wavelength: Float64Array, c2_nm_k: float, temperature_k: float) -> Float64Array:
+    def relative(nm: Float64Array) -> Float64Array:
         return np.asarray(nm**-5.0 / np.expm1(c2_nm_k / (nm * temperature_k)))
 
     return 100.0 * relative(wavelength) / relative(np.array(560.0))

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
+from model.arrays import Float32Array
 from model.skin import SkinAppearance, SkinMap
 
 SCHEMA = "skinrig.appearance/1"
@@ -259,7 +260,7 @@ def _write_map(folder: Path, name: str, skin_map: SkinMap) -> dict[str, Any]:
 
 
 def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
-    def one(file: _FileEntry | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+    def one(file: _FileEntry | None, shape: tuple[int, ...]) -> Float32Array | None:
         if file is None:
             return None
         path = _inside(folder, file.file)
@@ -309,7 +310,7 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_exr(path: str | Path, image: NDArray[np.float32]) -> None:
+def write_exr(path: str | Path, image: Float32Array) -> None:
     """Write (H, W) as channel Y or (H, W, 3) as RGB, float32, compressed without loss."""
     import OpenEXR
 
@@ -327,7 +328,7 @@ EXR_MAGIC = b"v/1\x01"
 """First bytes of an OpenEXR file (technical introduction to OpenEXR, file layout)."""
 
 
-def read_exr(path: str | Path) -> NDArray[np.float32]:
+def read_exr(path: str | Path) -> Float32Array:
     """Read an EXR file with channel Y or RGB as float32 (H, W) or (H, W, 3).
 
     Raises

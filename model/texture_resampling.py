@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-Floats = NDArray[np.floating]
+from model.arrays import Float64Array, FloatArray, Int64Array
 
 
-def taps(texels: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
     """Return each pixel's first texel and the part that the next one has, bilinearly.
 
     Parameters
@@ -62,7 +61,7 @@ def averaging_matrix(pixels: int, texels: int) -> Any:
     return sparse.csr_array((np.concatenate(values), places), shape=(texels, pixels))
 
 
-def resampled(texture: Floats, shape: tuple[int, int]) -> Floats:
+def resampled(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return a texture at another resolution: averaged where finer, read bilinearly where coarser.
 
     Parameters

@@ -29,10 +29,10 @@ from importlib import resources
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
+from model.arrays import BoolArray, Float64Array, Int64Array
+
 Reading: TypeAlias = Literal["deviation", "variance"]
 
 SITES = ("cheek", "forehead", "neck")
@@ -70,8 +70,8 @@ class TranslucencyPopulation:
         Where the moments come from, and how they were read.
     """
 
-    mean_per_mm: Floats
-    deviation_per_mm: Floats
+    mean_per_mm: Float64Array
+    deviation_per_mm: Float64Array
     sites: tuple[str, ...] = SITES
     channels: tuple[str, ...] = CHANNELS
     site_correlation: float = SITE_CORRELATION
@@ -106,16 +106,16 @@ class TranslucencyPopulation:
             )
 
     @property
-    def log_deviation(self) -> Floats:
+    def log_deviation(self) -> Float64Array:
         """Standard deviation of log sigma_tr, (S, C)."""
         return np.sqrt(np.log1p((self.deviation_per_mm / self.mean_per_mm) ** 2))
 
     @property
-    def log_mean(self) -> Floats:
+    def log_mean(self) -> Float64Array:
         """Mean of log sigma_tr, sigma_tr in 1/mm, (S, C)."""
         return np.asarray(np.log(self.mean_per_mm) - 0.5 * self.log_deviation**2)
 
-    def log_covariance(self) -> Floats:
+    def log_covariance(self) -> Float64Array:
         """Return the covariance of log sigma_tr, (S C, S C), channels running fastest."""
         count = len(self.sites)
         between = np.full((count, count), self.site_correlation)
@@ -124,7 +124,7 @@ class TranslucencyPopulation:
         scale = self.log_deviation.reshape(-1)
         return np.asarray(correlation * np.outer(scale, scale))
 
-    def sample(self, n: int, *, rng: np.random.Generator) -> Floats:
+    def sample(self, n: int, *, rng: np.random.Generator) -> Float64Array:
         """Draw people.
 
         Parameters
@@ -242,15 +242,15 @@ class PopulationTable:
 
     sites: tuple[str, ...]
     channels: tuple[str, ...]
-    count: Ints
-    mean_per_mm: Floats
-    deviation_per_mm: Floats
-    mean_stderr_per_mm: Floats
-    deviation_stderr_per_mm: Floats
-    noise_per_mm: Floats
+    count: Int64Array
+    mean_per_mm: Float64Array
+    deviation_per_mm: Float64Array
+    mean_stderr_per_mm: Float64Array
+    deviation_stderr_per_mm: Float64Array
+    noise_per_mm: Float64Array
 
     @property
-    def deviation_without_noise_per_mm(self) -> Floats:
+    def deviation_without_noise_per_mm(self) -> Float64Array:
         """Deviation over people that the errors of measurement do not explain; 0 where all is."""
         deviation, noise = self.deviation_per_mm, self.noise_per_mm
         return np.sqrt(np.maximum(deviation - noise, 0.0)) * np.sqrt(deviation + noise)
@@ -438,7 +438,7 @@ def summarize(
     return table(values, sites=sites, channels=channels, stderr_per_mm=errors, valid=good)
 
 
-def _averaged(repeats: list[SiteMeasurement]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _averaged(repeats: list[SiteMeasurement]) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the mean of repeats by their errors, its standard error, and where there is one."""
     values = np.array([one.sigma_tr_per_mm for one in repeats])
     errors = np.array([one.stderr_per_mm for one in repeats])

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floating = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, FloatArray, Int32Array
 
 
 class PhotometricStereoError(ValueError):
@@ -40,10 +39,10 @@ class NormalMaps:
         Number of samples with weight.
     """
 
-    normals: Floating
-    albedo: Floating
-    residual: Floating
-    valid: NDArray[np.bool_]
-    stderr_rad: Floating
-    stderr_albedo: Floating = field(default_factory=lambda: np.zeros(0))
-    used: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    normals: FloatArray
+    albedo: FloatArray
+    residual: FloatArray
+    valid: BoolArray
+    stderr_rad: FloatArray
+    stderr_albedo: FloatArray = field(default_factory=lambda: np.zeros(0))
+    used: Int32Array = field(default_factory=lambda: np.zeros(0, np.int32))

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 __all__ = ["PolarizerAxes", "Separation", "separate"]
 
-Floating = NDArray[np.floating]
 
 ETA_SKIN = 1.4  # refractive index of skin over that of air, Tuchin 2007 (doi 10.1117/3.684093)
 LEAST_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
@@ -62,23 +63,23 @@ class Separation:
         away from camera or light.
     """
 
-    diffuse: Floating
-    specular: Floating
-    stderr: Floating | None
-    stderr_specular: Floating | None
-    valid: NDArray[np.bool_]
+    diffuse: FloatArray
+    specular: FloatArray
+    stderr: FloatArray | None
+    stderr_specular: FloatArray | None
+    valid: BoolArray
 
 
 def separate(
-    parallel: Floating,
-    crossed: Floating,
+    parallel: FloatArray,
+    crossed: FloatArray,
     *,
     extinction: ArrayLike | None = None,
-    normals: Floating | None = None,
+    normals: FloatArray | None = None,
     light_dir: ArrayLike | None = None,
     view_dir: ArrayLike | None = None,
-    variance: Floating | tuple[Floating, Floating] | None = None,
-    valid: NDArray[np.bool_] | None = None,
+    variance: FloatArray | tuple[FloatArray, FloatArray] | None = None,
+    valid: BoolArray | None = None,
     saturation: float | None = None,
     leak_stderr: ArrayLike = 0.0,
     axes: PolarizerAxes | None = None,
@@ -209,7 +210,7 @@ def separate(
     )
 
 
-def _images(parallel: Floating, crossed: Floating) -> tuple[Floating, Floating]:
+def _images(parallel: FloatArray, crossed: FloatArray) -> tuple[FloatArray, FloatArray]:
     p, c = np.asarray(parallel), np.asarray(crossed)
     if p.shape != c.shape or p.ndim < 1:
         raise ValueError(
@@ -221,7 +222,7 @@ def _images(parallel: Floating, crossed: Floating) -> tuple[Floating, Floating]:
     return p.astype(kind, copy=False), c.astype(kind, copy=False)
 
 
-def _leak(extinction: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _leak(extinction: ArrayLike | None, shape: tuple[int, ...]) -> Float64Array:
     if extinction is None:
         return np.zeros(1)
     ratio = np.asarray(extinction, dtype=np.float64)
@@ -236,8 +237,8 @@ def _leak(extinction: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.fl
 
 
 def _variances(
-    variance: Floating | tuple[Floating, Floating], shape: tuple[int, ...], kind: np.dtype
-) -> tuple[Floating, Floating]:
+    variance: FloatArray | tuple[FloatArray, FloatArray], shape: tuple[int, ...], kind: np.dtype
+) -> tuple[FloatArray, FloatArray]:
     pair = variance if isinstance(variance, tuple) else (variance, variance)
     out = []
     for one in pair:
@@ -248,7 +249,7 @@ def _variances(
     return out[0], out[1]
 
 
-def _unit(name: str, vectors: ArrayLike, kind: np.dtype) -> Floating:
+def _unit(name: str, vectors: ArrayLike, kind: np.dtype) -> FloatArray:
     array = np.asarray(vectors, dtype=kind)
     if array.shape[-1:] != (3,):
         raise ValueError(f"{name}: got shape {array.shape}, expected (..., 3)")
@@ -259,34 +260,34 @@ def _unit(name: str, vectors: ArrayLike, kind: np.dtype) -> Floating:
     return array
 
 
-def _dot(a: Floating, b: Floating) -> Floating:
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray((a * b).sum(axis=-1))
 
 
-def _normalized(a: Floating) -> Floating:
+def _normalized(a: FloatArray) -> FloatArray:
     length = np.linalg.norm(a, axis=-1, keepdims=True)
     return np.asarray(a / np.maximum(length, np.finfo(a.dtype).tiny))
 
 
-def _passed_field(absorbing: Floating, direction: Floating) -> Floating:
+def _passed_field(absorbing: FloatArray, direction: FloatArray) -> FloatArray:
     """Direction of the field a film passes along a ray: across the ray and its absorbing axis."""
     return _normalized(np.cross(np.broadcast_to(absorbing, direction.shape), direction))
 
 
-def _analyser_absorbs(axes: PolarizerAxes, kind: np.dtype) -> tuple[Floating, Floating]:
+def _analyser_absorbs(axes: PolarizerAxes, kind: np.dtype) -> tuple[FloatArray, FloatArray]:
     """Absorbing axes of the parallel and the crossed analyser, in the plane of the film."""
     parallel, crossed = np.asarray(axes.parallel), np.asarray(axes.crossed)
     film = _normalized(np.cross(parallel, crossed))
     return np.cross(film, parallel).astype(kind), np.cross(film, crossed).astype(kind)
 
 
-def _light_absorbs(axes: PolarizerAxes, light: Floating) -> Floating:
+def _light_absorbs(axes: PolarizerAxes, light: FloatArray) -> FloatArray:
     """Absorbing axis of a light's film, which faces the middle of the subject."""
     middle = _normalized(np.nanmean(light.reshape(-1, 3), axis=0))
     return _normalized(np.cross(middle, np.asarray(axes.light, dtype=light.dtype)))
 
 
-def _transmittances(cosine: Floating, eta: float) -> tuple[Floating, Floating]:
+def _transmittances(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
     """Fresnel's power transmittance of a smooth surface across (s) and in (p) the plane."""
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
     r_s = (cosine - eta * inside) / (cosine + eta * inside)
@@ -295,8 +296,8 @@ def _transmittances(cosine: Floating, eta: float) -> tuple[Floating, Floating]:
 
 
 def _polarized_over_unpolarized(
-    normal: Floating, direction: Floating, field: Floating, eta: float
-) -> tuple[Floating, NDArray[np.bool_]]:
+    normal: FloatArray, direction: FloatArray, field: FloatArray, eta: float
+) -> tuple[FloatArray, BoolArray]:
     """Return T(direction, field) over its mean over fields, shape (...), and where it holds."""
     cosine = _dot(normal, direction)
     towards = cosine > 1e-3  # turned away, or so grazing that T vanishes
@@ -309,10 +310,10 @@ def _polarized_over_unpolarized(
 
 
 def _exit_weights(
-    normal: Floating, view: Floating, axes: PolarizerAxes, eta: float
-) -> tuple[Floating, Floating, NDArray[np.bool_]]:
+    normal: FloatArray, view: FloatArray, axes: PolarizerAxes, eta: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     weights = []
-    towards: NDArray[np.bool_] = np.ones(1, dtype=bool)
+    towards: BoolArray = np.ones(1, dtype=bool)
     for absorbs in _analyser_absorbs(axes, normal.dtype):
         weight, towards = _polarized_over_unpolarized(
             normal, view, _passed_field(absorbs, view), eta
@@ -321,7 +322,7 @@ def _exit_weights(
     return weights[0], weights[1], towards
 
 
-def _by_light(light: Floating) -> list[Floating]:
+def _by_light(light: FloatArray) -> list[FloatArray]:
     """Split (L, 1, ..., 3) into its lights; one direction or one field of directions stays one."""
     if light.ndim >= 3 and all(side == 1 for side in light.shape[1:-1]):
         return list(light)
@@ -329,8 +330,8 @@ def _by_light(light: Floating) -> list[Floating]:
 
 
 def _entry_weight(
-    normal: Floating, light: Floating, axes: PolarizerAxes, eta: float
-) -> tuple[Floating, NDArray[np.bool_]]:
+    normal: FloatArray, light: FloatArray, axes: PolarizerAxes, eta: float
+) -> tuple[FloatArray, BoolArray]:
     """How much of the polarized light enters, over as much unpolarized light, shape (..., 1)."""
     polarized = np.zeros(normal.shape[:-1], dtype=normal.dtype)
     unpolarized = np.zeros_like(polarized)
@@ -348,8 +349,8 @@ def _entry_weight(
 
 
 def _tilted_leak(
-    leak: Floating, light: Floating, view: Floating, axes: PolarizerAxes, eta: float
-) -> Floating:
+    leak: FloatArray, light: FloatArray, view: FloatArray, axes: PolarizerAxes, eta: float
+) -> FloatArray:
     """Crossed over parallel of specular light, with the turn of its plane of polarization.
 
     Fresnel's amplitudes at the facet that mirrors light into the camera weigh the s and p parts of

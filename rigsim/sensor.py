@@ -9,11 +9,10 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import View
-
-Float32Array = NDArray[np.float32]
+from rigsim.arrays import Float32Array, UInt16Array
 
 CHANNEL: Final = {"R": 0, "G": 1, "B": 2}
 """Layer of each filter color in camera RGB."""
@@ -139,12 +138,8 @@ def sensor_of(
 
 
 def expose(
-    irradiance_rgb: ArrayLike,
-    *,
-    sensor: Sensor,
-    rng: np.random.Generator,
-    exposure_s: float = 0.0,
-) -> NDArray[np.uint16]:
+    irradiance_rgb: ArrayLike, *, sensor: Sensor, rng: np.random.Generator, exposure_s: float = 0.0
+) -> UInt16Array:
     """Expose the sensor once.
 
     Parameters

@@ -27,11 +27,9 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rigsim.geometry.mesh import Float32Array
-
-FloatArray = NDArray[np.floating]
+from rigsim.arrays import Float32Array, Float64Array, FloatArray
 
 ALPHA_RANGE = (1e-3, 1.0)
 """Roughness (GGX alpha) that is evaluated without loss of digits."""
@@ -280,7 +278,7 @@ def interior_scale(eta: float) -> float:
     return 1.0 / (normal_incidence * average_transmittance(eta))
 
 
-def axis_in_plane(angle_deg: float, facing: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+def axis_in_plane(angle_deg: float, facing: ArrayLike, up: ArrayLike) -> Float64Array:
     """Return a unit vector at an angle in the plane across a beam.
 
     Parameters
@@ -312,7 +310,7 @@ def axis_in_plane(angle_deg: float, facing: ArrayLike, up: ArrayLike) -> NDArray
     return np.asarray(math.cos(angle) * right + math.sin(angle) * top)
 
 
-def _vector(value: ArrayLike) -> NDArray[np.float64]:
+def _vector(value: ArrayLike) -> Float64Array:
     vector = np.ascontiguousarray(value, np.float64)
     if vector.shape != (3,) or not math.isclose(float(vector @ vector), 1.0, rel_tol=1e-5):
         raise ShadingError(f"axis: got {vector.tolist()}, expected a unit vector of 3 numbers")

@@ -30,11 +30,7 @@ from skinrig.commands import (
     view,
 )
 from skinrig.commands.help import Command, Commands
-from skinrig.commands.options import (
-    Json,
-    Out,
-    Seed,
-)
+from skinrig.commands.options import Json, Out, Seed
 from skinrig.console import Console
 
 app = typer.Typer(
@@ -102,10 +98,21 @@ def demo(
 
 
 for command in (
-    simulating.simulate, capturing.capture, capturing.serve, capturing.verify,
-    reconstructing.calibrate, reconstructing.reconstruct, measuring.bench, measuring.doctor,
-    planning.plan, rendering.render, editing.edit, report.report, view.view, export.export,
-):  # fmt: skip
+    simulating.simulate,
+    capturing.capture,
+    capturing.serve,
+    capturing.verify,
+    reconstructing.calibrate,
+    reconstructing.reconstruct,
+    measuring.bench,
+    measuring.doctor,
+    planning.plan,
+    rendering.render,
+    editing.edit,
+    report.report,
+    view.view,
+    export.export,
+):
     app.command(cls=Command)(command)
 dynamic.fit_app.command("traits", cls=Command)(editing.fit_traits)
 app.add_typer(importing.import_app, name="import")

@@ -144,10 +144,11 @@ def require(appearance: Traced, use: str | None, *, where: str, today: date | No
     records = recorded(appearance)
     if _silent(appearance):
         raise ConsentError(
-            "does not record what its subjects agreed to", where=where,
+            "does not record what its subjects agreed to",
+            where=where,
             advice="It was made before consent was kept with maps: make it again from its "
             "sessions with `skinrig reconstruct` or `skinrig fit`.",
-        )  # fmt: skip
+        )
     if records and use is None:
         raise UsageError("--use: got none; say what the copy is for, e.g. research")
     day = today or datetime.now(UTC).date()
@@ -159,9 +160,10 @@ def require(appearance: Traced, use: str | None, *, where: str, today: date | No
         allowed = ", ".join(scope) or "nothing"
         raise ConsentError(
             f"subject {record.get('pseudonym')} has not agreed to this use: got {use!r}, expected "
-            f"one of: {allowed}" + (f", until {expires}" if expires else ""), where=where,
+            f"one of: {allowed}" + (f", until {expires}" if expires else ""),
+            where=where,
             advice="Ask the subject again, or keep the data inside the agreed scope.",
-        )  # fmt: skip
+        )
 
 
 def _day(text: object, where: str) -> date:

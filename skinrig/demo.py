@@ -24,9 +24,18 @@ from skinrig.written_units import unit_sign
 MOST_AT_ONCE = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
 BENCHED = (
-    "hdr", "normals", "lumitexels", "light-order", "diffuse-albedo", "color-table",
-    "layered-reflectance", "facial-color", "misalignment", "skin-stretch", "normal-histogram",
-)  # fmt: skip
+    "hdr",
+    "normals",
+    "lumitexels",
+    "light-order",
+    "diffuse-albedo",
+    "color-table",
+    "layered-reflectance",
+    "facial-color",
+    "misalignment",
+    "skin-stretch",
+    "normal-histogram",
+)
 """Stages whose error is measured against run time, at their small size: of each rig some, which
 take about a second; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
@@ -93,12 +102,14 @@ def run_demo(
         "schema": "skinrig.demo/1",
         "title": "This demo",
         "tables": [
-            {"title": "Seconds" + (", rigs side by side" if at_once > 1 else ""),
-             "head": ["step", "seconds"],
-             "rows": [[name, round(seconds, 2)] for name, seconds in shares.items()]},
+            {
+                "title": "Seconds" + (", rigs side by side" if at_once > 1 else ""),
+                "head": ["step", "seconds"],
+                "rows": [[name, round(seconds, 2)] for name, seconds in shares.items()],
+            },
             *found.tables,
         ],
-    }  # fmt: skip
+    }
     # seconds differ from run to run: they stand in a document of their own, not in the maps
     (out / "demo.json").write_text(json.dumps(plain(document), indent=1), encoding="utf-8")
     with _share("report", shares, console):
@@ -122,9 +133,13 @@ def run_demo(
     for step in suggest(look(out), out):
         console.say(f"next: {step.command}  ({step.why})")
     return {
-        "out": out, "seconds": shares, "total_s": total_s, "errors": found.errors,
-        "bench_passed": bench["passed"], "report": out / "report.html",
-    }  # fmt: skip
+        "out": out,
+        "seconds": shares,
+        "total_s": total_s,
+        "errors": found.errors,
+        "bench_passed": bench["passed"],
+        "report": out / "report.html",
+    }
 
 
 _Order = tuple[Path, int, int | None, Console]

@@ -26,14 +26,29 @@ FLASH_SUBJECTS = ("II", "IV")
 FLASH_STATES = ("neutral", "anger")
 """States of the first face: what a hemoglobin rig is fitted to."""
 FLASH_WANT = (
-    "melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture",
-    "tsumura_melanin", "tsumura_hemoglobin",
-)  # fmt: skip
+    "melanin",
+    "hemoglobin",
+    "shading",
+    "residual",
+    "diffuse",
+    "picture",
+    "specular_picture",
+    "tsumura_melanin",
+    "tsumura_hemoglobin",
+)
 DOME_SUBJECT = "III"
 DOME_WANT = (
-    "half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples",
-    "basis_weight_0", "basis_weight_1", "basis_weight_2", "basis_weight_3",
-)  # fmt: skip
+    "half_vector_normals",
+    "normals",
+    "normals_refined",
+    "r_d",
+    "lobe_residual",
+    "samples",
+    "basis_weight_0",
+    "basis_weight_1",
+    "basis_weight_2",
+    "basis_weight_3",
+)
 DOME_HELD_OUT = "lights=16,23"
 """Lights, by number, whose photographs no fit sees: renderings are compared with them."""
 DOME_LEFT_OUT = ("subsurface",)
@@ -71,13 +86,19 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
     with share("flash: capture the calibration targets"):
         for target in ("flat", "white", "chart", "malus"):
             simulate_session(
-                "flash", out / f"session-flash-{target}", target=target, seed=seed,
+                "flash",
+                out / f"session-flash-{target}",
+                target=target,
+                seed=seed,
                 width_px=width_px,
-            )  # fmt: skip
+            )
     with share("flash: calibrate"):
         for kind, target in (
-            ("sensor", "flat"), ("white", "white"), ("color", "chart"), ("polarization", "malus"),
-        ):  # fmt: skip
+            ("sensor", "flat"),
+            ("white", "white"),
+            ("color", "chart"),
+            ("polarization", "malus"),
+        ):
             calibrate(kind, [out / f"session-flash-{target}"], calibration)
     captures: list[Simulated] = []
     with share("flash: capture two faces"):
@@ -97,9 +118,12 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
             name = capture.session.name.removeprefix("session-")
             truth = capture.truth
             pipeline.reconstruct(
-                capture.session, want=FLASH_WANT, out=out / f"appearance-{name}",
-                calibration=calibration, truth=truth.name if truth else "",
-            )  # fmt: skip
+                capture.session,
+                want=FLASH_WANT,
+                out=out / f"appearance-{name}",
+                calibration=calibration,
+                truth=truth.name if truth else "",
+            )
             found.errors += _chromophore_rows(out / f"appearance-{name}", truth)
     with share("flash: fit the blood of a moving face"):
         moving = out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
@@ -128,25 +152,36 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         calibrate("lights", [sessions["mirror"], sessions["white"]], calibration)
     with share("dome: scan and capture a face"):
         capture = simulate_session(
-            "dome", out / f"session-dome-{DOME_SUBJECT}", subject=DOME_SUBJECT, seed=seed,
+            "dome",
+            out / f"session-dome-{DOME_SUBJECT}",
+            subject=DOME_SUBJECT,
+            seed=seed,
             leave_out=DOME_LEFT_OUT,
             width_px=width,
-        )  # fmt: skip
+        )
     with share("dome: reconstruct normals, albedo and lobes"):
         appearance = out / f"appearance-dome-{DOME_SUBJECT}"
         pipeline.reconstruct(
-            capture.session, want=DOME_WANT, out=appearance, calibration=calibration,
-            truth=capture.truth.name if capture.truth else "", hold_out=DOME_HELD_OUT,
-        )  # fmt: skip
+            capture.session,
+            want=DOME_WANT,
+            out=appearance,
+            calibration=calibration,
+            truth=capture.truth.name if capture.truth else "",
+            hold_out=DOME_HELD_OUT,
+        )
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):
         from skinrig.rendering.photographs.comparison import FULL
         from skinrig.rendering.photographs.evaluation import evaluate_folders
 
         compared = evaluate_folders(
-            appearance, capture.session, out / f"pictures-dome-{DOME_SUBJECT}",
-            calibration=calibration, count=DOME_COMPARED, seed=seed,
-        )  # fmt: skip
+            appearance,
+            capture.session,
+            out / f"pictures-dome-{DOME_SUBJECT}",
+            calibration=calibration,
+            count=DOME_COMPARED,
+            seed=seed,
+        )
     found.tables.append(
         {
             "title": "Luminance of photographs that no fit has seen, on lit pixels",
@@ -180,15 +215,21 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
             calibrate(kind, [ball], calibration)
     with share("gradient: stretch and capture a patch of skin"):
         capture = simulate_session(
-            "gradient", out / f"session-gradient-{GRADIENT_SITE}", site=GRADIENT_SITE, seed=seed,
+            "gradient",
+            out / f"session-gradient-{GRADIENT_SITE}",
+            site=GRADIENT_SITE,
+            seed=seed,
             width_px=None if width_px is None else max(128, min(width_px, 256)),
-        )  # fmt: skip
+        )
     with share("gradient: reconstruct normals, heights and kernels"):
         appearance = out / f"appearance-gradient-{GRADIENT_SITE}"
         pipeline.reconstruct(
-            capture.session, want=GRADIENT_WANT, out=appearance, calibration=calibration,
+            capture.session,
+            want=GRADIENT_WANT,
+            out=appearance,
+            calibration=calibration,
             truth=capture.truth.name if capture.truth else "",
-        )  # fmt: skip
+        )
         fit_microstructure(
             [appearance], out=out / f"appearance-gradient-moving-{GRADIENT_SITE}", paper_table=True
         )
@@ -213,18 +254,27 @@ def _probe(out: Path, seed: int, share: Share, width_px: int | None, found: Find
         calibrate("fibre", [phantom], calibration)
     with share("probe: capture a medium and three sites of a face"):
         captures = [
-            simulate_session("probe", out / "session-probe-medium", subject=PROBE_MEDIUM,
-                             sites=("cheek",), seed=seed),
-            simulate_session("probe", out / f"session-probe-{PROBE_SUBJECT}",
-                             subject=PROBE_SUBJECT, seed=seed),
-        ]  # fmt: skip
+            simulate_session(
+                "probe",
+                out / "session-probe-medium",
+                subject=PROBE_MEDIUM,
+                sites=("cheek",),
+                seed=seed,
+            ),
+            simulate_session(
+                "probe", out / f"session-probe-{PROBE_SUBJECT}", subject=PROBE_SUBJECT, seed=seed
+            ),
+        ]
     with share("probe: reconstruct sigma_tr and translucency"):
         for capture in captures:
             appearance = out / capture.session.name.replace("session", "appearance")
             pipeline.reconstruct(
-                capture.session, want=PROBE_WANT, out=appearance, calibration=calibration,
+                capture.session,
+                want=PROBE_WANT,
+                out=appearance,
+                calibration=calibration,
                 truth=capture.truth.name if capture.truth else "",
-            )  # fmt: skip
+            )
             found.errors += _subsurface_rows(appearance, capture.truth)
     found.tables.append(_left_out("fibre probe", captures[-1]))
 
@@ -253,10 +303,17 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
         return []
     rows = flash.compare(store.read(appearance), store.read(truth), rng=np.random.default_rng(0))
     return [
-        [appearance.name.removeprefix("appearance-"), row.name, 100 * row.median_relative, "%",
-         100 * row.coverage.share, 100 * row.masked]
-        for row in rows if row.band is None and row.against == "blurred"
-    ]  # fmt: skip
+        [
+            appearance.name.removeprefix("appearance-"),
+            row.name,
+            100 * row.median_relative,
+            "%",
+            100 * row.coverage.share,
+            100 * row.masked,
+        ]
+        for row in rows
+        if row.band is None and row.against == "blurred"
+    ]
 
 
 def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
@@ -271,11 +328,17 @@ def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
         found, hemoglobin_rig(found), truths, rng=np.random.default_rng(0)
     )
     return [
-        [appearance.name.removeprefix("appearance-"), f"blood of {row.state}, {row.way}",
-         100 * row.median_relative, "%", 100 * row.coverage, 0.0]
-        for row in states if row.way in (facial_color.WAYS[1],
-                                         facial_color.WAYS[3])
-    ]  # fmt: skip
+        [
+            appearance.name.removeprefix("appearance-"),
+            f"blood of {row.state}, {row.way}",
+            100 * row.median_relative,
+            "%",
+            100 * row.coverage,
+            0.0,
+        ]
+        for row in states
+        if row.way in (facial_color.WAYS[1], facial_color.WAYS[3])
+    ]
 
 
 def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
@@ -308,10 +371,16 @@ def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
         for method in dict.fromkeys(row.method for row in fits)
     }
     return [
-        [name, f"sigma_tr, {row.method}", 100 * row.median, "%", 100 * row.coverage,
-         100 * float(lost[row.method])]
+        [
+            name,
+            f"sigma_tr, {row.method}",
+            100 * row.median,
+            "%",
+            100 * row.coverage,
+            100 * float(lost[row.method]),
+        ]
         for row in subsurface.by_method(fits)
-    ]  # fmt: skip
+    ]
 
 
 def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
@@ -324,10 +393,26 @@ def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for row in microrelief.compare(found, true, rng=np.random.default_rng(0)):
         if row.state.endswith("_n0"):
-            rows.append([name, "normals, neutral", row.mean_deg, "deg", 100 * row.coverage,
-                         100 * row.masked])  # fmt: skip
-            rows.append([name, "height, neutral", 100 * row.height_relative, "%",
-                         100 * row.height_coverage, 100 * row.masked])  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    "normals, neutral",
+                    row.mean_deg,
+                    "deg",
+                    100 * row.coverage,
+                    100 * row.masked,
+                ]
+            )
+            rows.append(
+                [
+                    name,
+                    "height, neutral",
+                    100 * row.height_relative,
+                    "%",
+                    100 * row.height_coverage,
+                    100 * row.masked,
+                ]
+            )
     strain = microrelief.compare_stretch(found, true)
     if strain:
         from skinrig.reporting.map_names import state_words

@@ -22,14 +22,30 @@ class Finding:
 
 
 _REQUIRED = {
-    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "pydantic": "pydantic",
-    "serial": "pyserial", "xxhash": "xxhash", "rawpy": "rawpy", "tifffile": "tifffile",
-    "OpenEXR": "OpenEXR", "cv2": "opencv-contrib-python-headless", "colour": "colour-science",
-    "skimage": "scikit-image", "sklearn": "scikit-learn", "mitsuba": "mitsuba",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "numba": "numba",
+    "pydantic": "pydantic",
+    "serial": "pyserial",
+    "xxhash": "xxhash",
+    "rawpy": "rawpy",
+    "tifffile": "tifffile",
+    "OpenEXR": "OpenEXR",
+    "cv2": "opencv-contrib-python-headless",
+    "colour": "colour-science",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "mitsuba": "mitsuba",
     "matplotlib": "matplotlib",
-}  # fmt: skip
-_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam",
-           "playwright": "browser", "skfem": "fem"}  # fmt: skip
+}
+_EXTRAS = {
+    "distributed": "cluster",
+    "pxr": "usd",
+    "gphoto2": "gphoto",
+    "harvesters": "genicam",
+    "playwright": "browser",
+    "skfem": "fem",
+}
 
 
 def examine(*, probe_renderer: bool = True) -> list[Finding]:
@@ -43,10 +59,12 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     version = platform.python_version()
     findings = [
         Finding(
-            "Python", version, tuple(map(int, version.split(".")[:2])) >= (3, 11),
+            "Python",
+            version,
+            tuple(map(int, version.split(".")[:2])) >= (3, 11),
             "" if sys.version_info >= (3, 11) else "install Python 3.11 or newer",
         )
-    ]  # fmt: skip
+    ]
     for module, name in _REQUIRED.items():
         present = importlib.util.find_spec(module) is not None
         state = importlib.metadata.version(name) if present else "missing"
@@ -55,10 +73,12 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
         present = importlib.util.find_spec(module) is not None
         findings.append(
             Finding(
-                f"optional: {extra}", "installed" if present else "not installed", True,
+                f"optional: {extra}",
+                "installed" if present else "not installed",
+                True,
                 "" if present else f"pip install 'skinrig[{extra}]' when you need it",
             )
-        )  # fmt: skip
+        )
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     findings.append(Finding("cores", str(cores), True))
     if probe_renderer:
@@ -75,9 +95,11 @@ def _renderer() -> Finding:
     choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")
     return Finding(
-        "Mitsuba variant", f"{choice.name} ({choice.why})", True,
+        "Mitsuba variant",
+        f"{choice.name} ({choice.why})",
+        True,
         "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19",
-    )  # fmt: skip
+    )
 
 
 def _serial_ports() -> list[Finding]:
@@ -86,10 +108,12 @@ def _serial_ports() -> list[Finding]:
     ports = serial_ports()
     return [
         Finding(
-            "serial ports", ", ".join(ports) or "none", True,
+            "serial ports",
+            ", ".join(ports) or "none",
+            True,
             "" if ports else "none is needed to simulate; plug the rig in and look again",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _camera_producers() -> Finding:

@@ -12,12 +12,17 @@ from typing import Any, Final
 from skinrig.workspace import Surroundings, look
 
 CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
-    "flash": {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
-              "malus": "polarization"},
+    "flash": {
+        "white": "white",
+        "flat": "sensor",
+        "dark": "sensor",
+        "chart": "color",
+        "malus": "polarization",
+    },
     "dome": {"charuco": "geometry", "mirror": "lights", "white": "lights"},
     "gradient": {"ball": "lights", "flat": "sensor", "dark": "sensor"},
     "probe": {"phantom": "fibre"},
-}  # fmt: skip
+}
 """The calibration that each target of a rig makes."""
 WANTS: Final[Mapping[str, str]] = {
     "flash": "melanin,hemoglobin",

@@ -184,10 +184,7 @@ def _documents(found: Findings, checks: list[page.Check]) -> str:
 
 
 def _appearance_section(
-    name: str,
-    appearance: SkinAppearance,
-    truth: SkinAppearance | None,
-    checks: list[page.Check],
+    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
 ) -> str:
     body = f"<h2>Maps: {page.escape(name)}</h2>"
     pictures = [

@@ -12,8 +12,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-PHOTOGRAPHS: Final = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".tif",
-                      ".tiff", ".jpg", ".jpeg")  # fmt: skip
+PHOTOGRAPHS: Final = (
+    ".dng",
+    ".nef",
+    ".cr2",
+    ".cr3",
+    ".arw",
+    ".raf",
+    ".orf",
+    ".rw2",
+    ".tif",
+    ".tiff",
+    ".jpg",
+    ".jpeg",
+)
 REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
 """How the policy of a report's page begins; that of a live page allows a script."""
 
@@ -34,10 +46,12 @@ class Surroundings:
     def summary(self) -> str:
         """Return what is here in one line; empty where nothing of skinrig's is."""
         counts = [
-            (len(self.sessions), "session"), (len(self.calibrations), "calibration"),
-            (len(self.appearances), "appearance"), (len(self.reports), "report"),
+            (len(self.sessions), "session"),
+            (len(self.calibrations), "calibration"),
+            (len(self.appearances), "appearance"),
+            (len(self.reports), "report"),
             (self.photographs, "photograph"),
-        ]  # fmt: skip
+        ]
         return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
 
 

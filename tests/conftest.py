@@ -98,9 +98,10 @@ def pytest_ignore_collect(collection_path, config):
     above = [
         conftest
         for parent in folder.parents
-        if parent.is_relative_to(ROOT / "tests" / "") and parent != ROOT / "tests"
+        if parent.is_relative_to(ROOT / "tests" / "")
+        and parent != ROOT / "tests"
         and (conftest := parent / "conftest.py").is_file()
-    ]  # fmt: skip
+    ]
     return None if any(map(says_long, (collection_path, *beside, *above))) else True
 
 

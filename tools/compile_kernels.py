@@ -124,8 +124,14 @@ def record() -> None:
     rows = []
     for function, seconds, given in recorder.found:  # all modules are whole by now
         name, kinds = _named(function, given)
-        rows.append({"module": function.__module__, "function": name,
-                     "seconds": f"{seconds:.1f}", "types": kinds})  # fmt: skip
+        rows.append(
+            {
+                "module": function.__module__,
+                "function": name,
+                "seconds": f"{seconds:.1f}",
+                "types": kinds,
+            }
+        )
     write(rows)
 
 

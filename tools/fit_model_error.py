@@ -73,9 +73,12 @@ def seen_by(scene: FlashScene, pattern: str) -> tuple[np.ndarray, np.ndarray]:
     unit = 65_535 / 65_000 * top
     scale, offset = scene.sensor().noise_profile()
     frame = raw.RawFrame(
-        cfa=cfa, pattern=pattern, black=(0.0,) * 4, white=65_535,
+        cfa=cfa,
+        pattern=pattern,
+        black=(0.0,) * 4,
+        white=65_535,
         noise_profile=(scale / unit, offset / unit**2),
-    )  # fmt: skip
+    )
     seen = raw.linear_rgb(frame, demosaic="centered")
     rgb = seen.rgb.astype(np.float64)
     with np.errstate(divide="ignore"):  # where no light falls
@@ -126,9 +129,12 @@ def _sample(rgb, log_error, variance, good, rng) -> Sample:
     error = log_error.reshape(-1, 3)[places]
     with_noise = error + relative.reshape(-1, 3)[places]
     return Sample(
-        error, with_noise - with_noise.mean(axis=1, keepdims=True),
-        spread.reshape(-1, 3)[places], structure.ravel()[places], noisy.reshape(-1, 3)[places],
-    )  # fmt: skip
+        error,
+        with_noise - with_noise.mean(axis=1, keepdims=True),
+        spread.reshape(-1, 3)[places],
+        structure.ravel()[places],
+        noisy.reshape(-1, 3)[places],
+    )
 
 
 def _terms(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -165,9 +171,11 @@ def _fit_terms(samples: list[Sample]) -> tuple[np.ndarray, float]:
         return total / len(samples)
 
     found = minimize(
-        unlikely, BEGIN, method="Nelder-Mead",
+        unlikely,
+        BEGIN,
+        method="Nelder-Mead",
         options={"maxiter": 1500, "xatol": 1e-3, "fatol": 1e-6},
-    )  # fmt: skip
+    )
     covariances = np.concatenate([_planar(found.x, sample) for sample in samples])
     noisy = np.concatenate([sample.noisy for sample in samples])
     variances = np.concatenate([sample.variance for sample in samples])
@@ -239,11 +247,7 @@ def main() -> None:
         "seeds": [SEEDS[0], SEEDS[-1]],
         "pixels": count,
         "scale_to_68_percent": round(scale, 4),
-        "log_shading": {
-            "low": SHADING_LOW,
-            "step": SHADING_STEP,
-            "counts": shadings.tolist(),
-        },
+        "log_shading": {"low": SHADING_LOW, "step": SHADING_STEP, "counts": shadings.tolist()},
         "rms_by_preset": {name: round(float(np.mean(v)), 5) for name, v in by_preset.items()},
         "recipe": "tools/fit_model_error.py",
     }

@@ -48,10 +48,14 @@ def main(arguments: list[str]) -> None:
     for name, scan in (("scanned", None), ("true", out / "truth-dome" / "mesh.ply")):
         with timed(f"reconstruct with the {name} geometry"):
             pipeline.reconstruct(
-                out / "session-dome", want=WANT, out=out / f"appearance-{name}",
-                calibration=out / "calibration", scan=scan, truth="truth-dome",
+                out / "session-dome",
+                want=WANT,
+                out=out / f"appearance-{name}",
+                calibration=out / "calibration",
+                scan=scan,
+                truth="truth-dome",
                 progress=lambda stage: print(f"  {stage}", file=sys.stderr, flush=True),
-            )  # fmt: skip
+            )
         found = store.read(out / f"appearance-{name}")
         print(f"{preset}, seed {seed}, {name} geometry: {found.parameters.get('registration')}")
         for row in surface_evaluation.compare(found, truth, rng=np.random.default_rng(0)):

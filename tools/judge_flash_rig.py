@@ -46,9 +46,12 @@ def main(first: int, last: int) -> None:
                 "flash", folder / f"session-{seed}", subject=preset, states=(state,), seed=seed
             )
             pipeline.reconstruct(
-                done.session, want=[*pooled, "diffuse"], out=folder / f"maps-{seed}", state=state,
+                done.session,
+                want=[*pooled, "diffuse"],
+                out=folder / f"maps-{seed}",
+                state=state,
                 calibration=folder / "calibration",
-            )  # fmt: skip
+            )
             found, truth = store.read(folder / f"maps-{seed}"), store.read(done.truth or "")
             bounds = cramer_rao(found, truth)
             skin = truth.maps["mask"].values > 0.5

@@ -37,23 +37,35 @@ def main(arguments: list[str]) -> None:
         session = out / f"session-{seed}"
         if not truth_folder(session).exists():
             simulate_session(
-                "probe", session, subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
-                sites=("cheek",), repeats=repeats, seed=seed, size="full",
-            )  # fmt: skip
+                "probe",
+                session,
+                subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
+                sites=("cheek",),
+                repeats=repeats,
+                seed=seed,
+                size="full",
+            )
         pipeline.reconstruct(
-            session, want=("profiles", "subsurface"), out=out / f"appearance-{seed}",
-            calibration=out / "calibration", truth=truth_folder(session).name,
-        )  # fmt: skip
+            session,
+            want=("profiles", "subsurface"),
+            out=out / f"appearance-{seed}",
+            calibration=out / "calibration",
+            truth=truth_folder(session).name,
+        )
         truth = store.read(truth_folder(session))
         own = evaluation.compare_fits(store.read(out / f"appearance-{seed}"), truth)
         rows += own
         told = [
             f"{row.method} {row.channel} {100 * row.relative:+.2f} "
             f"({'in' if row.covered else 'out'}{'' if row.valid else ', not valid'})"
-            for row in own if row.name == own[0].name and row.channel == "green"
-        ]  # fmt: skip
-        print(f"seed {seed}: sigma_a {sigma_a:.4f} sigma_s' {sigma_s_prime:.3f} g {g:.2f}; "
-              f"{'; '.join(told)}", flush=True)  # fmt: skip
+            for row in own
+            if row.name == own[0].name and row.channel == "green"
+        ]
+        print(
+            f"seed {seed}: sigma_a {sigma_a:.4f} sigma_s' {sigma_s_prime:.3f} g {g:.2f}; "
+            f"{'; '.join(told)}",
+            flush=True,
+        )
     print("method          fits  median %  worst %  bias %  68 % interval covers %")
     for each in evaluation.by_method(rows):
         print(

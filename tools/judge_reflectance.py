@@ -48,18 +48,29 @@ def main(arguments: list[str]) -> int:
         begun = time.perf_counter()
         if not (out / f"truth-{subject}").exists():
             simulate_session(
-                "dome", out / f"session-{subject}", subject=subject, subsurface=True,
-                interreflections=True, **common,
-            )  # fmt: skip
+                "dome",
+                out / f"session-{subject}",
+                subject=subject,
+                subsurface=True,
+                interreflections=True,
+                **common,
+            )
         pipeline.reconstruct(
-            out / f"session-{subject}", want=WANT, out=out / f"appearance-{subject}",
-            calibration=calibration, hold_out=HOLD_OUT, truth=f"truth-{subject}",
-        )  # fmt: skip
+            out / f"session-{subject}",
+            want=WANT,
+            out=out / f"appearance-{subject}",
+            calibration=calibration,
+            hold_out=HOLD_OUT,
+            truth=f"truth-{subject}",
+        )
         fit_reflectance(out / f"appearance-{subject}", out=out / f"model-{subject}")
         record = evaluate_folders(
-            out / f"model-{subject}", out / f"session-{subject}", out / f"judged-{subject}",
-            calibration=calibration, count=PHOTOGRAPHS,
-        )  # fmt: skip
+            out / f"model-{subject}",
+            out / f"session-{subject}",
+            out / f"judged-{subject}",
+            calibration=calibration,
+            count=PHOTOGRAPHS,
+        )
         records.append(record)
         print(f"{subject}: {time.perf_counter() - begun:.0f} s", file=sys.stderr, flush=True)
         show(subject, record)

@@ -494,8 +494,7 @@ def packed(values, left_out, used):
     full = np.zeros((ETAS.size, kernels.RADIUS_COUNT, kernels.ROOT_COUNT))
     full[:, :, : ROOT_ABSORPTIONS.size] = values
     coefficients = np.linalg.solve(
-        root_spline_matrix(),
-        np.swapaxes(full, 1, 2).reshape(ETAS.size, -1, kernels.RADIUS_COUNT),
+        root_spline_matrix(), np.swapaxes(full, 1, 2).reshape(ETAS.size, -1, kernels.RADIUS_COUNT)
     )
     return np.swapaxes(coefficients, 1, 2), 0.5 * np.log(variance[:, :, ::2])
 

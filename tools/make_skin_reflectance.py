@@ -84,10 +84,7 @@ def ring_sums(
     order = np.argsort(paths.radius_mm)
     ends = np.searchsorted(paths.radius_mm[order], RING_EDGES_MM)
     by_melanin, by_blood = by_melanin[order], by_blood[order]
-    return np.stack(
-        [by_melanin[a:b].T @ by_blood[a:b] for a, b in pairwise(ends)],
-        axis=-1,
-    )
+    return np.stack([by_melanin[a:b].T @ by_blood[a:b] for a, b in pairwise(ends)], axis=-1)
 
 
 def simulate(

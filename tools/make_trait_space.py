@@ -173,13 +173,18 @@ def drawn(
 
 def vectors(maps: np.ndarray, faces: CommonFaces, texture: TextureSpace, region: str) -> np.ndarray:
     inside = common_regions.region(region, faces.frame)
-    return np.array([
-        albedo_vectors.vector(
-            np.ascontiguousarray(one[..., :3]), texture, "quantiles", valid=one[..., 3] > 0,
-            region=inside & (one[..., 3] > 0),
-        )
-        for one in maps
-    ])  # fmt: skip
+    return np.array(
+        [
+            albedo_vectors.vector(
+                np.ascontiguousarray(one[..., :3]),
+                texture,
+                "quantiles",
+                valid=one[..., 3] > 0,
+                region=inside & (one[..., 3] > 0),
+            )
+            for one in maps
+        ]
+    )
 
 
 def albedo_space(
@@ -224,8 +229,7 @@ def albedo_truth(
     bare = found[at[np.searchsorted(at, np.arange(len(shows)), side="right") - 1]]
     return {
         name: cosine(
-            space.trait(name).vector,
-            (found - bare)[[one == name for one in shows]].mean(axis=0),
+            space.trait(name).vector, (found - bare)[[one == name for one in shows]].mean(axis=0)
         )
         for name in PUT_ON
     }
@@ -252,9 +256,10 @@ def main() -> None:
     surface = surface_space(people, means, given.seed)
     tell("surface learned")
     found = kept(
-        given.work, "surface_truth",
+        given.work,
+        "surface_truth",
         lambda: np.array(list(surface_truth(surface, people, given.seed).values())),
-    )  # fmt: skip
+    )
     truth = {"surface": dict(zip(CONDITIONS[1:], found.tolist(), strict=True))}
     tell(f"cosines to the truth: {truth['surface']}")
     faces = CommonFaces.of(people, size=given.size, common=given.common)
@@ -283,13 +288,19 @@ def main() -> None:
         {name: packaged(space) for name, space in {**spaces, "surface": surface}.items()},
         "simulated",
         regions.library_parameters(
-            faces.frame, "quantiles", contrast="regression", seed=given.seed, people=len(people),
-            made_by="tools/make_trait_space.py", tan_factor=TAN,
-            cosine_to_truth={part: {n: round(c, 4) for n, c in row.items()}
-                             for part, row in truth.items()},
+            faces.frame,
+            "quantiles",
+            contrast="regression",
+            seed=given.seed,
+            people=len(people),
+            made_by="tools/make_trait_space.py",
+            tan_factor=TAN,
+            cosine_to_truth={
+                part: {n: round(c, 4) for n, c in row.items()} for part, row in truth.items()
+            },
         ),
         {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
-    )  # fmt: skip
+    )
     content = library.to_bytes(precision="int8")
     back = from_bytes(content)
     for name, space in back.spaces.items():

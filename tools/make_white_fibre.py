@@ -45,11 +45,18 @@ PHOTONS = {
 }
 """Of the runs near, in the middle and far, by absorption: the darker, the cheaper."""
 BASES = tuple(PHOTONS)
-ABSORPTION = np.concatenate([
-    [0.0, 0.0003, 0.001], np.geomspace(0.003, 0.012, 5)[:-1], np.geomspace(0.012, 0.04, 5)[:-1],
-    np.geomspace(0.04, 0.12, 5)[:-1], np.geomspace(0.12, 0.35, 5)[:-1],
-    np.geomspace(0.35, 1.0, 5)[:-1], np.geomspace(1.0, 3.0, 5)[:-1], np.geomspace(3.0, 12.0, 6),
-])  # fmt: skip
+ABSORPTION = np.concatenate(
+    [
+        [0.0, 0.0003, 0.001],
+        np.geomspace(0.003, 0.012, 5)[:-1],
+        np.geomspace(0.012, 0.04, 5)[:-1],
+        np.geomspace(0.04, 0.12, 5)[:-1],
+        np.geomspace(0.12, 0.35, 5)[:-1],
+        np.geomspace(0.35, 1.0, 5)[:-1],
+        np.geomspace(1.0, 3.0, 5)[:-1],
+        np.geomspace(3.0, 12.0, 6),
+    ]
+)
 DISTANCE = np.geomspace(NEAREST, FARTHEST, 81)
 NOISIEST = 0.2  # relative error of a fibre that is still fitted
 LAST_LOG = 26.0  # photons are not asked for where less than exp(-this) of the light is left
@@ -94,8 +101,13 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                 )
                 radii.append(radius)
                 widths.append(np.full(len(radius), width))
-            np.savez(path, told=told, radius=np.concatenate(radii), width=np.concatenate(widths),
-                     value=np.concatenate(values, axis=1))  # fmt: skip
+            np.savez(
+                path,
+                told=told,
+                radius=np.concatenate(radii),
+                width=np.concatenate(widths),
+                value=np.concatenate(values, axis=1),
+            )
             print(f"base {base}: {time.process_time() - started:.0f} s of CPU", flush=True)
         with np.load(path) as stored:
             out.append({name: stored[name] for name in stored.files})
@@ -160,15 +172,23 @@ def smoothed(
     use &= good
     curve = Curve(radius[use], width[use], absorption)
     # errors that follow the light, as single ones are themselves uncertain by a sixth
-    smooth = np.exp(np.convolve(np.pad(np.log(error[use] / mean[use]), 3, "edge"),
-                                np.ones(7) / 7.0, "valid")) * mean[use]  # fmt: skip
+    smooth = (
+        np.exp(
+            np.convolve(
+                np.pad(np.log(error[use] / mean[use]), 3, "edge"), np.ones(7) / 7.0, "valid"
+            )
+        )
+        * mean[use]
+    )
     beta = curve.fit(mean[use], smooth, None)
     chi2 = float((((mean[use] - curve.average(beta)) / smooth) ** 2).sum())
     at = curve.basis(DISTANCE)
-    each = np.array([
-        at @ curve.fit(np.delete(value[:, use], b, axis=0).mean(axis=0), smooth, beta)
-        for b in range(BATCHES)
-    ])  # fmt: skip
+    each = np.array(
+        [
+            at @ curve.fit(np.delete(value[:, use], b, axis=0).mean(axis=0), smooth, beta)
+            for b in range(BATCHES)
+        ]
+    )
     spread = np.sqrt((BATCHES - 1.0) / BATCHES * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
     spread = np.where(radius[use][-1] < DISTANCE, inf, spread)
     return at @ beta, spread, chi2 / (use.sum() - len(beta))
@@ -183,9 +203,13 @@ def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
             shape, spread, chi2 = smoothed(
                 run["radius"], run["width"], run["value"][:, :, column], float(a)
             )
-            print(f"base {base} a {a:.4f}: chi2/dof {chi2:.2f}, error at "
-                  + ", ".join(f"{d:.1f}: {100 * e:.2f} %" for d, e in
-                              zip(DISTANCE[::16], spread[::16], strict=True)))  # fmt: skip
+            print(
+                f"base {base} a {a:.4f}: chi2/dof {chi2:.2f}, error at "
+                + ", ".join(
+                    f"{d:.1f}: {100 * e:.2f} %"
+                    for d, e in zip(DISTANCE[::16], spread[::16], strict=True)
+                )
+            )
             node = int(np.argmin(abs(ABSORPTION - a)))
             share = 1.0 / np.maximum(spread, 1e-4) ** 2
             top[:, node] += share * shape
@@ -217,16 +241,25 @@ def main() -> None:
     runs = trace(asked.work, asked.photons_scale, asked.threads, asked.seed)
     shape, error = combine(runs)
     recipe = {
-        "g": G, "eta": ETA, "numerical_aperture": APERTURE, "bases": BASES, "batches": BATCHES,
+        "g": G,
+        "eta": ETA,
+        "numerical_aperture": APERTURE,
+        "bases": BASES,
+        "batches": BATCHES,
         "photons": [[round(asked.photons_scale * n) for _, _, n in groups(b)] for b in BASES],
-        "seed": asked.seed, "numpy": np.__version__, "numba": numba.__version__,
+        "seed": asked.seed,
+        "numpy": np.__version__,
+        "numba": numba.__version__,
         "python": platform.python_version(),
-    }  # fmt: skip
+    }
     np.savez_compressed(
         ROOT / "rigsim" / "data" / FILE,
-        distance=DISTANCE, absorption=ABSORPTION, shape=shape.astype(np.float32),
-        relative_error=error.astype(np.float32), recipe=json.dumps(recipe),
-    )  # fmt: skip
+        distance=DISTANCE,
+        absorption=ABSORPTION,
+        shape=shape.astype(np.float32),
+        relative_error=error.astype(np.float32),
+        recipe=json.dumps(recipe),
+    )
 
 
 if __name__ == "__main__":

@@ -289,12 +289,17 @@ class _Run:
         dwell_s = min(row.dwell_s for row in rows)
         streams = {
             name: FrameStream(
-                name, camera, row_times_s=times, dwell_s=dwell_s, clock=clocks[name], want=want,
+                name,
+                camera,
+                row_times_s=times,
+                dwell_s=dwell_s,
+                clock=clocks[name],
+                want=want,
                 lag_s=self._rig.view(name).shutter_lag_s,
                 timeout_s=want.exposure_s + self._rig.view(name).readout_s + FRAME_MARGIN_S,
             )
             for name, camera in chosen.items()
-        }  # fmt: skip
+        }
         missing = self._gather(steps, rows, times, streams, attempt)
         for name, camera in chosen.items():
             camera.abort()

@@ -154,9 +154,12 @@ class FrameStream:
         try:
             # the row is known by its time; what is left to check is who took it, and how
             check_frame(
-                frame, self._camera.info, seq=frame.seq, not_before_s=frame.t_start_s,
+                frame,
+                self._camera.info,
+                seq=frame.seq,
+                not_before_s=frame.t_start_s,
                 want=self._want,
-            )  # fmt: skip
+            )
         except FrameRefused as error:
             self.refused.append(str(error))
             return False

@@ -185,7 +185,9 @@ class Scanner:
                 attempt = self._attempts.get((step.id, name), 0) + 1
                 view, camera = self._rig.view(name), self._cameras[name]
                 self._session.commit(
-                    step.id, name, encode(frame, view, camera, step, self._session, light),
+                    step.id,
+                    name,
+                    encode(frame, view, camera, step, self._session, light),
                     settings=dict(step.settings),
                     actual={
                         "exposure_s": frame.exposure.exposure_s,
@@ -199,7 +201,7 @@ class Scanner:
                     t_box_s=one.t_box_s,
                     t_host_s=self._operator.clock(),
                     attempt=attempt,
-                )  # fmt: skip
+                )
                 self._attempts[step.id, name] = attempt
                 self.frames += 1
             self.steps += 1
@@ -254,12 +256,17 @@ class Scanner:
         dwell_s = min(row.dwell_s for row in rows)
         streams = {
             name: FrameStream(
-                name, camera, row_times_s=times, dwell_s=dwell_s, clock=clocks[name], want=want,
+                name,
+                camera,
+                row_times_s=times,
+                dwell_s=dwell_s,
+                clock=clocks[name],
+                want=want,
                 lag_s=self._rig.view(name).shutter_lag_s,
                 timeout_s=want.exposure_s + self._rig.view(name).readout_s + FRAME_MARGIN_S,
             )
             for name, camera in chosen.items()
-        }  # fmt: skip
+        }
         taken = []
         for number, step in enumerate(steps):
             found = {name: stream.until(number) for name, stream in streams.items()}
@@ -280,11 +287,14 @@ class Scanner:
         mask = sum(1 << numbers[name] for name in steps[0].cameras)
         return [
             PatternRow(
-                str(step.settings["pattern"]), reading_deg(step), float(step.settings["level"]),
-                float(step.settings["dwell_s"]), mask,
+                str(step.settings["pattern"]),
+                reading_deg(step),
+                float(step.settings["level"]),
+                float(step.settings["dwell_s"]),
+                mask,
             )
             for step in steps
-        ]  # fmt: skip
+        ]
 
     def _judged(self, rows: int) -> Judgment:
         """Arm the table, after darkness where the light of a moment ago makes it too much."""

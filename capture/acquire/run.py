@@ -113,9 +113,15 @@ def run_plan(
     )
     if kind == "gradient_sphere":
         return run_gradient(
-            plan, rig, boxes=boxes, cameras=cameras, session=session, operator=operator, eyes=eyes,
+            plan,
+            rig,
+            boxes=boxes,
+            cameras=cameras,
+            session=session,
+            operator=operator,
+            eyes=eyes,
             force_limit_n=force_limit_n,
-        )  # fmt: skip
+        )
     box = boxes[kind]
     if kind == "dome":
         return run_dome(
@@ -123,9 +129,14 @@ def run_plan(
         )
     if kind == "probe":
         return run_probe(
-            plan, rig, box=box, cameras=cameras, session=session, operator=operator,
+            plan,
+            rig,
+            box=box,
+            cameras=cameras,
+            session=session,
+            operator=operator,
             all_brackets=all_brackets,
-        )  # fmt: skip
+        )
     return run_flash(plan, rig, box=box, cameras=cameras, session=session, operator=operator)
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, NotRequired, TypeAlias, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.arrays import Float32Array, Float64Array
 from capture.documents import InputError
 
 __all__ = [
@@ -70,8 +71,8 @@ class Quantity:
         95 % interval of a scalar whose distribution is not symmetric; an open end is None.
     """
 
-    value: NDArray[np.float64]
-    stderr: NDArray[np.float64] | None = None
+    value: Float64Array
+    stderr: Float64Array | None = None
     interval: tuple[float | None, float | None] | None = None
 
     def __post_init__(self) -> None:
@@ -126,7 +127,7 @@ class Calibration:
     valid_until: date
     source: Source
     values: Mapping[str, Mapping[str, Quantity]]
-    maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    maps: Mapping[str, Float32Array] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -192,7 +193,7 @@ def of_one_device(
     kind: str,
     values: Mapping[str, Quantity],
     *,
-    maps: Mapping[str, NDArray[np.float32]] | None = None,
+    maps: Mapping[str, Float32Array] | None = None,
     notes: Mapping[str, str] | None = None,
     **about: Unpack[Provenance],
 ) -> Calibration:

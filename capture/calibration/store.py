@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from capture.arrays import Float32Array
 from capture.calibration.record import (
     KINDS,
     Calibration,
@@ -279,7 +279,7 @@ def _write_atomically(path: Path, data: bytes) -> None:
         os.close(folder)
 
 
-def _write_map(folder: Path, stem: str, image: NDArray[np.float32]) -> dict[str, Any]:
+def _write_map(folder: Path, stem: str, image: Float32Array) -> dict[str, Any]:
     import OpenEXR
 
     pixels = np.ascontiguousarray(image, dtype=np.float32)
@@ -301,7 +301,7 @@ def _write_map(folder: Path, stem: str, image: NDArray[np.float32]) -> dict[str,
     return {"file": path.name, "sha256": digest, "shape": list(pixels.shape)}
 
 
-def _read_map(folder: Path, name: str, entry: _MapFile) -> NDArray[np.float32]:
+def _read_map(folder: Path, name: str, entry: _MapFile) -> Float32Array:
     import OpenEXR
 
     require_plain_name(name)

@@ -15,8 +15,8 @@ from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import UInt16Array
 from capture.devices.port import DeviceError
 
 ENTRY_POINTS = "capture.cameras"
@@ -151,7 +151,7 @@ class Frame:
     t_start_s: float
     t_end_s: float
     exposure: Exposure
-    image: NDArray[np.uint16] | bytes
+    image: UInt16Array | bytes
     light: Mapping[str, Any] = field(default_factory=dict)
 
 

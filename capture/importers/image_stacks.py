@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture import raw
+from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
 from capture.importers.images import Photo, PhotoError, read_photo
@@ -24,7 +25,6 @@ from capture.rig import Light, Rig, View
 from capture.session import Session, Subject
 
 Encoding = Literal["auto", "sRGB", "linear"]
-Floats = NDArray[np.float64]
 
 RIG_NAME = "light-list"
 FAR_MM = 1000.0
@@ -167,9 +167,13 @@ def import_light_list(
         shutil.rmtree(part, ignore_errors=True)
         raise
     return ImportedStack(
-        str(target), len(steps), f"{found.file} ({found.kind})", shown,
-        where_mask.name if where_mask else "", assumed,
-    )  # fmt: skip
+        str(target),
+        len(steps),
+        f"{found.file} ({found.kind})",
+        shown,
+        where_mask.name if where_mask else "",
+        assumed,
+    )
 
 
 def pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
@@ -178,7 +182,7 @@ def pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
     return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
 
 
-def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+def encode_srgb(linear: FloatArray) -> FloatArray:
     """Return display values of linear light in [0, 1], IEC 61966-2-1.
 
     Examples
@@ -193,7 +197,7 @@ def _sha256(file: Path) -> str:
     return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
 
 
-def _sample(found: LightList, mask: Path | None) -> tuple[Floats, Photo, dict[str, None]]:
+def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, dict[str, None]]:
     """Read every picture once; return samples (N, P) over white, the first photo, and its notes."""
     rows, notes, faults = [], {}, []
     first: Photo | None = None
@@ -227,14 +231,14 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Floats, Photo, dict[st
     return np.array(rows), first, notes
 
 
-def _adds_up_as_codes(samples: Floats, found: LightList) -> bool:
+def _adds_up_as_codes(samples: Float64Array, found: LightList) -> bool:
     """Return whether the files' values obey the shading better than the light they should code."""
     decoded = np.clip(samples, 0.0, 1.0)
     codes = np.asarray(encode_srgb(decoded))
     return _misfit(codes, found.directions) < CLEARLY * _misfit(decoded, found.directions)
 
 
-def _misfit(samples: Floats, directions: Floats) -> float:
+def _misfit(samples: FloatArray, directions: Float64Array) -> float:
     """Return the mean residual of a matte shading, bright samples first, over the mean."""
     lit = samples[:, samples.mean(axis=0) > 0.02]
     if lit.shape[1] < 10 or len(lit) < 4:

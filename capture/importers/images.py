@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture import raw
+from capture.arrays import FloatArray, UInt16Array
 from capture.documents import Fault, InputError
 
 Encoding = Literal["raw", "linear", "sRGB"]
@@ -85,7 +86,7 @@ def read_photo(path: str | Path) -> Photo:
     return _raw(file, where)
 
 
-def decode_srgb(values: NDArray[np.floating]) -> NDArray[np.floating]:
+def decode_srgb(values: FloatArray) -> FloatArray:
     """Return linear light of display values in [0, 1], IEC 61966-2-1.
 
     Examples
@@ -96,7 +97,7 @@ def decode_srgb(values: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def cells_of(rgb: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def cells_of(rgb: UInt16Array) -> UInt16Array:
     """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB picture.
 
     Examples
@@ -183,7 +184,7 @@ def _raw(file: Path, where: str) -> Photo:
     return Photo(frame, "raw", tuple(notes))
 
 
-def _frame(values: NDArray[np.uint16], black: int) -> raw.RawFrame:
+def _frame(values: UInt16Array, black: int) -> raw.RawFrame:
     color = values.ndim == 3
     return raw.RawFrame(
         cfa=cells_of(values) if color else np.ascontiguousarray(values),
@@ -349,8 +350,18 @@ def _tiff(file: Path, where: str) -> Photo:
             pixels = np.asarray(page.asarray())
     except InputError:
         raise
-    except (OSError, ValueError, RuntimeError, IndexError, KeyError, TypeError, struct.error,
-            AttributeError, MemoryError, ZeroDivisionError) as exc:  # fmt: skip
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+        IndexError,
+        KeyError,
+        TypeError,
+        struct.error,
+        AttributeError,
+        MemoryError,
+        ZeroDivisionError,
+    ) as exc:
         got = str(exc).splitlines()[0][:120] if str(exc) else type(exc).__name__
         raise _error("is no readable TIFF", where, "TIFF", got, "an uncompressed TIFF") from exc
     if pages > 1:

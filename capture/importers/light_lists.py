@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.documents import Fault, InputError
 from capture.importers.images import read_photo
 from capture.raw import RawFrame
 
-Floats = NDArray[np.float64]
 Kind = Literal["lp", "list", "chrome ball"]
 
 PICTURES = frozenset(
@@ -40,16 +39,16 @@ class LightList:
     """Lights in the order of the pictures."""
 
     pictures: tuple[Path, ...]
-    vectors: Floats
+    vectors: Float64Array
     """(N, 3), as in the file: unit vectors, or positions."""
     kind: Kind
     file: str
     """Name of the file or folder they are from."""
-    intensity: Floats | None = None
+    intensity: Float64Array | None = None
     """(N, 3), relative strength per channel, where the folder has it."""
 
     @property
-    def directions(self) -> Floats:
+    def directions(self) -> Float64Array:
         """Unit vectors towards the lights, (N, 3)."""
         return np.asarray(self.vectors / np.linalg.norm(self.vectors, axis=1, keepdims=True))
 
@@ -150,7 +149,7 @@ def mask_of(directory: Path) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
-def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
     """Return where a mask is brighter than half of its brightest pixel, (H, W).
 
     Raises
@@ -170,7 +169,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.asarray(values > 0.5 * top)
 
 
-def gray(frame: RawFrame) -> NDArray[np.float32]:
+def gray(frame: RawFrame) -> Float32Array:
     """Return the mean of an imported picture's channels, (H, W), DN; each 2 x 2 cell is a pixel."""
     cells = frame.cfa.astype(np.float32)
     if frame.pattern == "MONO":
@@ -321,8 +320,9 @@ def _from_text(path: Path, directory: Path) -> LightList:
     intensity = None
     if strengths.is_file():
         lines = [line.split() for line in _text(strengths).splitlines() if line.split()]
-        intensity = np.array([_vector(row, f"{strengths}, light {k}") for k, row in
-                              enumerate(lines)])  # fmt: skip
+        intensity = np.array(
+            [_vector(row, f"{strengths}, light {k}") for k, row in enumerate(lines)]
+        )
         if intensity.shape != vectors.shape or (intensity <= 0).any():
             raise LightListError(
                 "does not fit the lights",
@@ -332,7 +332,7 @@ def _from_text(path: Path, directory: Path) -> LightList:
     return LightList(pictures, vectors, "list", path.name, intensity)
 
 
-def _from_ball(folder: Path, count: int) -> Floats:
+def _from_ball(folder: Path, count: int) -> Float64Array:
     from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 
     pictures, mask = pictures_in(folder), mask_of(folder)

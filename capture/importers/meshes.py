@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from capture.documents import Fault, InputError
 from capture.session import Session, SessionError, reopen_copy
 
@@ -34,11 +34,11 @@ class MeshImportError(InputError):
 class ScannedMesh:
     """Triangles as they stand in a file, in millimetres; nothing is cleaned or joined."""
 
-    vertices_mm: NDArray[np.float32]
+    vertices_mm: Float32Array
     """Positions, shape (V, 3), mm, the scanner's frame."""
-    faces: NDArray[np.int32]
+    faces: Int32Array
     """Vertex indices, shape (F, 3); polygons of more corners are cut into triangles."""
-    uv: NDArray[np.float32] | None
+    uv: Float32Array | None
     """Texture coordinates, shape (V, 2), (0, 0) bottom left; None where the file has none."""
     about: Mapping[str, str | int | float | bool]
     """Where it is from: hash and kind of the file, unit, counts."""
@@ -185,7 +185,7 @@ def import_mesh(
     )
 
 
-_Arrays = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]
+_Arrays = tuple[Float64Array, Int64Array, Float64Array | None]
 
 
 def _decode(data: bytes, kind: str, place: Path) -> _Arrays:
@@ -216,9 +216,7 @@ def _decode(data: bytes, kind: str, place: Path) -> _Arrays:
     return vertices, faces, uv
 
 
-def _check(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], ply: bytes, where: Path
-) -> None:
+def _check(vertices: Float64Array, faces: Int64Array, ply: bytes, where: Path) -> None:
     counts = {name: int(count) for name, count in _PLY_COUNT.findall(ply.split(b"end_header")[0])}
     for name, got in ((b"vertex", len(vertices)), (b"face", len(faces))):
         if got < counts.get(name, 0):
@@ -232,7 +230,7 @@ def _check(
         raise _error(where, "vertices", f"{bad} that are not finite", "numbers only")
 
 
-def _check_extent(extent_mm: NDArray[np.float64], scale: float, where: Path) -> None:
+def _check_extent(extent_mm: Float64Array, scale: float, where: Path) -> None:
     low, high = EXTENT_RANGE_MM
     longest = float(extent_mm.max())
     if low <= longest <= high:

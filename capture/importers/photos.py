@@ -179,9 +179,13 @@ def import_photos(
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.pattern != "MONO"}
     return Imported(
-        str(target), len(steps), assumed, states, tuple(ignored),
+        str(target),
+        len(steps),
+        assumed,
+        states,
+        tuple(ignored),
         tuple(state for state in states if state in color),
-    )  # fmt: skip
+    )
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
@@ -410,10 +414,5 @@ def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], dat
         session_id=session.id,
     )
     session.commit(
-        step.id,
-        view,
-        blob,
-        settings=step.settings,
-        actual={},
-        t_host_s=clock().timestamp(),
+        step.id, view, blob, settings=step.settings, actual={}, t_host_s=clock().timestamp()
     )

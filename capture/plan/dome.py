@@ -98,9 +98,13 @@ def dome_plan(
                 series.tracking(number, place, exposure_s, shown[max(place - 1, 0)], level)
             name = rig.lights[light].name
             series.add(
-                f"{name}-{number}", "olat", {"light": name, "exposure": number, "pass": number},
-                exposure_s, light=name, level=level,
-            )  # fmt: skip
+                f"{name}-{number}",
+                "olat",
+                {"light": name, "exposure": number, "pass": number},
+                exposure_s,
+                light=name,
+                level=level,
+            )
         if tracking_every:
             series.tracking(number, len(shown), exposure_s, shown[-1], level)
     return series.plan()
@@ -173,16 +177,21 @@ def dome_calibration_plan(
         return series.plan()
     series.darks(darks, exposures_s[0], 0)
     for pose in range(plates):
-        series.several(f"W{pose}-markers", "white", {"pose": pose, "light": "several"},
-                       exposures_s[0], level)  # fmt: skip
+        series.several(
+            f"W{pose}-markers", "white", {"pose": pose, "light": "several"}, exposures_s[0], level
+        )
         normal = None if plate_normals is None else plate_normals[pose]
         for light in order:
             name = rig.lights[light].name
             if normal is None or _cosine(rig.lights[light].position_mm, normal) > LEAST_COSINE:
                 series.add(
-                    f"W{pose}-{name}", "white", {"pose": pose, "light": name}, exposures_s[0],
-                    light=name, level=level,
-                )  # fmt: skip
+                    f"W{pose}-{name}",
+                    "white",
+                    {"pose": pose, "light": name},
+                    exposures_s[0],
+                    light=name,
+                    level=level,
+                )
     return series.plan()
 
 
@@ -242,13 +251,16 @@ class _Series:
         room_s = self.dwell_s - limits.settle_s - limits.overlap_s
         require(
             exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s,
-            "exposure_s", exposure_s,
+            "exposure_s",
+            exposure_s,
             f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light",
-        )  # fmt: skip
+        )
         cameras = tuple(view.name for view in self._rig.views)
         every: dict[str, Value] = {
-            "exposure_s": float(exposure_s), "iso": self._iso, "dwell_s": self.dwell_s,
-        }  # fmt: skip
+            "exposure_s": float(exposure_s),
+            "iso": self._iso,
+            "dwell_s": self.dwell_s,
+        }
         self._steps.append(Step(identity, kind, index, {**settings, **every}, cameras))
 
     def darks(self, count: int, exposure_s: float, number: int) -> None:
@@ -267,9 +279,13 @@ class _Series:
         brightest = level * float(self._eye.max())
         wanted = max(level * float(self._eye[before]), TRACKING_FLOOR * brightest)
         self.several(
-            f"T{number}-{after:03d}", "tracking", {"after": after, "exposure": number}, exposure_s,
-            wanted / max(float(self._eye[self._tracking].sum()), 1e-12), number=number,
-        )  # fmt: skip
+            f"T{number}-{after:03d}",
+            "tracking",
+            {"after": after, "exposure": number},
+            exposure_s,
+            wanted / max(float(self._eye[self._tracking].sum()), 1e-12),
+            number=number,
+        )
 
     def several(
         self,
@@ -298,11 +314,21 @@ class _Series:
         some = max(1, math.ceil(len(order) / min(OUTLINE_LIGHTS, self._limits.max_at_once)))
         groups = math.ceil(len(order) / min(MIRROR_GROUP, self._limits.max_at_once))
         for sphere in range(count):
-            self._lit(f"M{sphere}-outline", {"sphere": sphere, "light": "outline"},
-                      order[::some], exposures_s[0], 1.0)  # fmt: skip
+            self._lit(
+                f"M{sphere}-outline",
+                {"sphere": sphere, "light": "outline"},
+                order[::some],
+                exposures_s[0],
+                1.0,
+            )
             for group in range(groups):
-                self._lit(f"M{sphere}-{group:02d}", {"sphere": sphere, "light": f"group {group}"},
-                          order[group::groups], exposures_s[-1], MIRROR_LEVEL)  # fmt: skip
+                self._lit(
+                    f"M{sphere}-{group:02d}",
+                    {"sphere": sphere, "light": f"group {group}"},
+                    order[group::groups],
+                    exposures_s[-1],
+                    MIRROR_LEVEL,
+                )
 
     def _lit(
         self,

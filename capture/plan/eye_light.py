@@ -14,8 +14,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array
 from capture.rig import Light, Rig, Vector
 
 EYES_MM: tuple[Vector, Vector] = ((-31.0, 25.0, 80.0), (31.0, 25.0, 80.0))
@@ -47,7 +47,7 @@ def radiant_intensity(light: Light) -> float:
 
 def eye_light(
     rig: Rig, *, eyes_mm: Sequence[Vector] | None = None, facing: Vector = (0.0, 0.0, 1.0)
-) -> NDArray[np.float64]:
+) -> Float64Array:
     """Return each light's irradiance at the eyes at level 1, mean of both, W/m^2.
 
     Parameters

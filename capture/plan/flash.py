@@ -166,8 +166,5 @@ class _Series:
             self.add("D", "dark", {"repeat": repeat}, polarizer="parallel", power=0.0)
 
     def plan(self) -> Plan:
-        limits = {
-            "max_pops_per_min": self._rig.max_pops_per_min,
-            "recycle_s": self._rig.recycle_s,
-        }
+        limits = {"max_pops_per_min": self._rig.max_pops_per_min, "recycle_s": self._rig.recycle_s}
         return Plan(self._rig.name, tuple(self._steps), limits)

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array
 from capture.plan.eye_light import eye_light
 from capture.plan.rows import LedRow, led_rows, passes
 from capture.plan.steps import Plan, Step
@@ -51,8 +51,8 @@ class FlickerReport:
 
 
 def eye_signal(
-    rows: Sequence[LedRow], weights: NDArray[np.float64], *, overlap_s: float = 0.0
-) -> NDArray[np.float64]:
+    rows: Sequence[LedRow], weights: Float64Array, *, overlap_s: float = 0.0
+) -> Float64Array:
     """Return the light at the eyes, averaged over each `SAMPLE_S`, with rest before and after.
 
     Parameters
@@ -82,13 +82,13 @@ def eye_signal(
     return np.asarray(np.diff(np.interp(edges, times, held)) / SAMPLE_S)
 
 
-def fused(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+def fused(signal: Float64Array) -> Float64Array:
     """Return a signal averaged over 1/65 s, as the eye sees it."""
     width = round(1.0 / FUSION_HZ / SAMPLE_S)
     return np.convolve(signal, np.full(width, 1.0 / width), mode="same")
 
 
-def count_flashes(signal: NDArray[np.float64], *, least: float) -> float:
+def count_flashes(signal: Float64Array, *, least: float) -> float:
     """Return the most flashes in any second: half the number of turns that differ by ``least``.
 
     Examples
@@ -119,7 +119,7 @@ def count_flashes(signal: NDArray[np.float64], *, least: float) -> float:
     return float(inside.max()) / 2.0
 
 
-def band_rms(signal: NDArray[np.float64]) -> float:
+def band_rms(signal: Float64Array) -> float:
     """Return the rms of a signal's 3 to 65 Hz part over its mean; 0 for no light.
 
     Examples
@@ -138,7 +138,7 @@ def band_rms(signal: NDArray[np.float64]) -> float:
 
 
 def flicker_of_rows(
-    rows: Sequence[LedRow], weights: NDArray[np.float64], *, overlap_s: float = 0.0
+    rows: Sequence[LedRow], weights: Float64Array, *, overlap_s: float = 0.0
 ) -> FlickerReport:
     """Return the figures of rows that follow one another without a pause.
 

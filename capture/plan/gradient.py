@@ -146,11 +146,18 @@ def gradient_plan(
             for polarizer in POLARIZERS:
                 for pattern in ordered:
                     series.add(
-                        f"{name}-{polarizer[:3]}-{pattern}", "gradient",
-                        {"angle": _whole(angle), "caliper": position, "pattern": pattern,
-                         "polarizer": polarizer},
-                        pattern=pattern, polarizer=polarizer, level=level,
-                    )  # fmt: skip
+                        f"{name}-{polarizer[:3]}-{pattern}",
+                        "gradient",
+                        {
+                            "angle": _whole(angle),
+                            "caliper": position,
+                            "pattern": pattern,
+                            "polarizer": polarizer,
+                        },
+                        pattern=pattern,
+                        polarizer=polarizer,
+                        level=level,
+                    )
     return series.plan()
 
 
@@ -208,10 +215,13 @@ def gradient_calibration_plan(
         for repeat in range(count):
             for number, power in enumerate(FLAT_LEVELS):
                 series.add(
-                    f"F{number}-{repeat:02d}", "flat",
+                    f"F{number}-{repeat:02d}",
+                    "flat",
                     {"level": power, "repeat": repeat, "pass": repeat},
-                    pattern="full", polarizer="parallel", level=power,
-                )  # fmt: skip
+                    pattern="full",
+                    polarizer="parallel",
+                    level=power,
+                )
     else:
         for reading, levels in BALL_SERIES.items():
             polarizer = POLARIZERS[round(reading / 90)]
@@ -221,11 +231,19 @@ def gradient_calibration_plan(
                 more = every if share else {**every, "dwell_s": max(dwell_s, BALL_DARK_S)}
                 for repeat in range(count):
                     series.add(
-                        f"B{reading:03d}-{pattern}{number}-{repeat:02d}", "ball",
-                        {"pattern": pattern, "polarizer": polarizer, "reading": reading,
-                         "repeat": repeat},
-                        pattern=pattern, polarizer=polarizer, level=level * share, **more,
-                    )  # fmt: skip
+                        f"B{reading:03d}-{pattern}{number}-{repeat:02d}",
+                        "ball",
+                        {
+                            "pattern": pattern,
+                            "polarizer": polarizer,
+                            "reading": reading,
+                            "repeat": repeat,
+                        },
+                        pattern=pattern,
+                        polarizer=polarizer,
+                        level=level * share,
+                        **more,
+                    )
     return series.plan()
 
 
@@ -298,15 +316,18 @@ class _Series:
         room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
         require(
             0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s,
-            "exposure_s", exposure_s,
+            "exposure_s",
+            exposure_s,
             f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern",
-        )  # fmt: skip
+        )
         self._rig = rig
         self._limits = limits
         self._cameras = tuple(view.name for view in rig.views)
         self._every: dict[str, Value] = {
-            "exposure_s": float(exposure_s), "dwell_s": float(dwell_s), "iso": iso,
-        }  # fmt: skip
+            "exposure_s": float(exposure_s),
+            "dwell_s": float(dwell_s),
+            "iso": iso,
+        }
         self._steps: list[Step] = []
 
     def add(self, identity: str, kind: Kind, index: _Index, **settings: Value) -> None:
@@ -316,9 +337,13 @@ class _Series:
     def darks(self, count: int) -> None:
         for repeat in range(count):
             self.add(
-                f"D{repeat:03d}", "dark", {"repeat": repeat},
-                pattern="dark", polarizer="parallel", level=0.0,
-            )  # fmt: skip
+                f"D{repeat:03d}",
+                "dark",
+                {"repeat": repeat},
+                pattern="dark",
+                polarizer="parallel",
+                level=0.0,
+            )
 
     def plan(self) -> Plan:
         """Return the plan; a piece of it that asks too much of an LED is refused."""
@@ -330,15 +355,13 @@ class _Series:
                 judged[key] = scan_duty(piece, self._rig)
         most = max(judged.values(), default=0.0)
         require(
-            most <= limits.max_duty, "duty", f"{most:.3f} over {limits.duty_window_s:g} s",
+            most <= limits.max_duty,
+            "duty",
+            f"{most:.3f} over {limits.duty_window_s:g} s",
             f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns",
-        )  # fmt: skip
+        )
         return Plan(
             self._rig.name,
             tuple(self._steps),
-            {
-                "max_duty": limits.max_duty,
-                "max_on_s": limits.max_on_s,
-                "dose_ws": limits.dose_ws,
-            },
+            {"max_duty": limits.max_duty, "max_on_s": limits.max_on_s, "dose_ws": limits.dose_ws},
         )

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array
 from capture.plan.eye_light import eye_light
 from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.rows import LedRow
@@ -114,12 +114,12 @@ def best_order(rig: Rig, *, dwell_s: float) -> list[int]:
     return ORDERS[best](rig)
 
 
-def _directions(rig: Rig) -> NDArray[np.float64]:
+def _directions(rig: Rig) -> Float64Array:
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     return np.asarray(place / np.linalg.norm(place, axis=1)[:, None])
 
 
-def _path(place: NDArray[np.float64], members: list[int], first: int) -> list[int]:
+def _path(place: Float64Array, members: list[int], first: int) -> list[int]:
     """Return a short path through ``members`` from ``first``: greedy, then 2-opt."""
     rest = [k for k in members if k != first]
     path = [first] if first in members else []
@@ -131,7 +131,7 @@ def _path(place: NDArray[np.float64], members: list[int], first: int) -> list[in
     return _without_crossings(place, path)
 
 
-def _without_crossings(place: NDArray[np.float64], path: list[int]) -> list[int]:
+def _without_crossings(place: Float64Array, path: list[int]) -> list[int]:
     """Reverse parts of a path while that shortens it; its first light stays."""
     way = np.array(path)
     for _ in range(20):

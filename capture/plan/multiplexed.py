@@ -261,8 +261,11 @@ def multiplexed_plan(
     count = captures or grid.distinct + math.ceil(grid.distinct * REPEATED)
     begun = _darks(rig, darks, exposure_s=exposure_s, iso=iso)
     common: dict[str, Value] = {
-        "polarizer": "crossed", "power": power, "exposure_s": exposure_s, "iso": iso
-    }  # fmt: skip
+        "polarizer": "crossed",
+        "power": power,
+        "exposure_s": exposure_s,
+        "iso": iso,
+    }
     shots = []
     for number in range(count):
         start = number * grid.shot_period_s
@@ -348,8 +351,11 @@ def course_plan(
     _check_flash(rig, period, power)
     begun = _darks(rig, darks, exposure_s=exposure_s, iso=iso)
     common: dict[str, Value] = {
-        "polarizer": "crossed", "power": power, "exposure_s": exposure_s, "iso": iso
-    }  # fmt: skip
+        "polarizer": "crossed",
+        "power": power,
+        "exposure_s": exposure_s,
+        "iso": iso,
+    }
     steps = [s for s in begun.steps if s.kind == "dark"]
     for number in range(before + math.floor(duration / period) + 1):
         after = number - before
@@ -360,9 +366,7 @@ def course_plan(
         }
         at: dict[str, Value] = {} if after < 0 else {"start_s": float(after * period)}
         steps.append(_shot(rig, number, index, {**common, **at}))
-    limits = {
-        **begun.limits, "shot_period_s": float(period), "read_out_s": float(shortest)
-    }  # fmt: skip
+    limits = {**begun.limits, "shot_period_s": float(period), "read_out_s": float(shortest)}
     return Plan(rig.name, tuple(steps), limits)
 
 
@@ -501,9 +505,11 @@ def _check_flash(rig: Rig, period: Fraction, power: float) -> None:
     require(0 < power <= 1, "power", power, "0 < power <= 1")
     slowest = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min)
     require(
-        period >= exact(slowest), "shot_period_s", f"{float(period):g}",
+        period >= exact(slowest),
+        "shot_period_s",
+        f"{float(period):g}",
         f">= {slowest:g} s, what the flash needs to recycle",
-    )  # fmt: skip
+    )
 
 
 def _darks(rig: Rig, count: int, *, exposure_s: float, iso: int) -> Plan:
@@ -511,10 +517,7 @@ def _darks(rig: Rig, count: int, *, exposure_s: float, iso: int) -> Plan:
 
 
 def _shot(
-    rig: Rig,
-    number: int,
-    index: Mapping[str, str | int | float],
-    settings: Mapping[str, Value],
+    rig: Rig, number: int, index: Mapping[str, str | int | float], settings: Mapping[str, Value]
 ) -> Step:
     cameras = tuple(view.name for view in rig.views)
     return Step(f"S{number:03d}", "subject", index, settings, cameras)

@@ -227,9 +227,11 @@ class _Series:
         readout_s = max(view.readout_s for view in rig.views)
         most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
         require(
-            0 < longest_s <= most_s, "longest_s", longest_s,
+            0 < longest_s <= most_s,
+            "longest_s",
+            longest_s,
             f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for",
-        )  # fmt: skip
+        )
         require(0 < level <= 1, "level", level, "0 < level <= 1")
         self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
         self._level, self._iso = float(level), iso
@@ -237,9 +239,13 @@ class _Series:
         self._steps: list[Step] = []
 
     def _add(
-        self, identity: str, kind: Kind, index: dict[str, str | int | float], exposure_s: float,
+        self,
+        identity: str,
+        kind: Kind,
+        index: dict[str, str | int | float],
+        exposure_s: float,
         **settings: Value,
-    ) -> None:  # fmt: skip
+    ) -> None:
         every: dict[str, Value] = {"exposure_s": exposure_s, "level": self._level, "iso": self._iso}
         self._steps.append(Step(identity, kind, index, {**every, **settings}, self._cameras))
 
@@ -249,17 +255,22 @@ class _Series:
         for bracket in dict.fromkeys(round(share * last) for share in DARK_SHARES):
             for repeat in range(count):
                 self._add(
-                    f"dark-b{bracket:02d}-r{repeat}", "dark",
-                    {"bracket": bracket, "repeat": repeat}, self._exposures_s[bracket], level=0.0,
-                )  # fmt: skip
+                    f"dark-b{bracket:02d}-r{repeat}",
+                    "dark",
+                    {"bracket": bracket, "repeat": repeat},
+                    self._exposures_s[bracket],
+                    level=0.0,
+                )
 
     def measure(self, kind: Kind, site: str, repeat: int, angle_deg: float) -> None:
         for bracket, exposure_s in enumerate(self._exposures_s):
             self._add(
-                f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}", kind,
+                f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}",
+                kind,
                 {"site": site, "repeat": repeat, "angle": _whole(angle_deg), "bracket": bracket},
-                exposure_s, suction_mbar=self._probe.suction_mbar,
-            )  # fmt: skip
+                exposure_s,
+                suction_mbar=self._probe.suction_mbar,
+            )
 
     def masks(self) -> None:
         longest_s = max(MASK_LONGEST_S, self._exposures_s[0])
@@ -267,9 +278,13 @@ class _Series:
         for fibre in range(len(self._probe.fibres)):
             for bracket, exposure_s in enumerate(exposures_s):
                 self._add(
-                    f"mask-f{fibre:02d}-b{bracket}", "mask", {"fibre": fibre, "bracket": bracket},
-                    exposure_s, suction_mbar=self._probe.suction_mbar, fibre=fibre,
-                )  # fmt: skip
+                    f"mask-f{fibre:02d}-b{bracket}",
+                    "mask",
+                    {"fibre": fibre, "bracket": bracket},
+                    exposure_s,
+                    suction_mbar=self._probe.suction_mbar,
+                    fibre=fibre,
+                )
 
     def plan(self) -> Plan:
         require(len(self._steps) > 0, "darks", 0, "something to capture")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array
 from capture.plan.steps import Step, require
 from capture.rig import Rig, Vector
 
@@ -28,7 +28,7 @@ class LedRow:
     shares: tuple[float, ...] = ()
     """Of the level, what each of the LEDs gives, 0 to 1; empty: all of them all of it."""
 
-    def given(self, lights: int) -> NDArray[np.float64]:
+    def given(self, lights: int) -> Float64Array:
         """Return the level of each of so many lights, shape (lights,), 0 to 1.
 
         Examples
@@ -41,7 +41,7 @@ class LedRow:
         return levels
 
 
-def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> NDArray[np.float64]:
+def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> Float64Array:
     """Return what a pattern of the gradient sphere asks of lights at these places, 0 to 1.
 
     Parameters
@@ -126,10 +126,17 @@ def passes(steps: Sequence[Step]) -> list[list[Step]]:
     for step in steps:
         settings, index = step.settings, step.index
         key = (
-            settings["exposure_s"], settings.get("iso", 100), step.cameras,
-            index.get("pose"), index.get("sphere"), index.get("pass"), step.kind == "dark",
-            index.get("angle"), index.get("caliper"), index.get("reading"),
-        )  # fmt: skip
+            settings["exposure_s"],
+            settings.get("iso", 100),
+            step.cameras,
+            index.get("pose"),
+            index.get("sphere"),
+            index.get("pass"),
+            step.kind == "dark",
+            index.get("angle"),
+            index.get("caliper"),
+            index.get("reading"),
+        )
         if not pieces or key != before:
             pieces.append([])
         before = key

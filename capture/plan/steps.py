@@ -16,11 +16,22 @@ from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
 Kind = Literal[
-    "dark", "flat", "chart", "malus", "subject",
-    "olat", "tracking", "charuco", "mirror", "white",
-    "gradient", "ball",
-    "fibres", "phantom", "mask",
-]  # fmt: skip
+    "dark",
+    "flat",
+    "chart",
+    "malus",
+    "subject",
+    "olat",
+    "tracking",
+    "charuco",
+    "mirror",
+    "white",
+    "gradient",
+    "ball",
+    "fibres",
+    "phantom",
+    "mask",
+]
 Polarizer = Literal["parallel", "crossed"]
 
 Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]

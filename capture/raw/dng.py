@@ -19,8 +19,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import xxhash
-from numpy.typing import NDArray
 
+from capture.arrays import FloatArray, UInt16Array
 from capture.documents import Fault, canonical_json, read_json
 from capture.raw.frame import ILLUMINANT_CODES, MAX_PIXELS, RawError, RawFrame
 from capture.raw.tiff import (
@@ -59,7 +59,7 @@ _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 
 
 def encode_dng(
-    cfa: NDArray[np.uint16],
+    cfa: UInt16Array,
     *,
     pattern: str,
     black: float | Sequence[float],
@@ -68,7 +68,7 @@ def encode_dng(
     iso: int | None = None,
     camera_model: str = "",
     camera_serial: str = "",
-    color_matrix: NDArray[np.floating] | None = None,
+    color_matrix: FloatArray | None = None,
     color_illuminant: str = "D65",
     neutral: tuple[float, float, float] | None = None,
     noise_profile: tuple[float, float] | None = None,
@@ -154,7 +154,7 @@ def encode_dng(
     return head.ljust(pixels_at, b"\0") + pixels
 
 
-def write_dng(path: str | Path, cfa: NDArray[np.uint16], **description: Any) -> None:
+def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
     """Write a DNG that appears whole or not at all; keyword arguments as for `encode_dng`."""
     blob = encode_dng(cfa, **description)
     target = Path(path)
@@ -341,7 +341,7 @@ def _read_xmp(packet: bytes, where: str) -> dict[str, str]:
     return found
 
 
-def _pixels(buffer: memoryview, tags: Directory, seal: str, where: str) -> NDArray[np.uint16]:
+def _pixels(buffer: memoryview, tags: Directory, seal: str, where: str) -> UInt16Array:
     width, height = tags.integer(256), tags.integer(257)
     if not 0 < width * height <= MAX_PIXELS:
         raise _error("is damaged", where, "size", f"{width} x {height}", f"at most {MAX_PIXELS} px")

@@ -9,8 +9,8 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array, UInt16Array
 from capture.documents import Checks, InputError, canonical_json
 from capture.rig import MAX_SIDE_PX, PATTERNS
 
@@ -29,7 +29,7 @@ class RawError(InputError):
 class RawFrame:
     """Sensor values as read out, with black and white levels and the settings of the exposure."""
 
-    cfa: NDArray[np.uint16]
+    cfa: UInt16Array
     """(H, W) uint16 DN, row 0 at the top; may be read-only."""
     pattern: str
     """Colors of the 2 x 2 cell row by row ("RGGB", "BGGR", "GRBG", "GBRG"), or "MONO"."""
@@ -43,7 +43,7 @@ class RawFrame:
     """Sensitivity; None where the file does not say."""
     camera_model: str = ""
     camera_serial: str = ""
-    color_matrix: NDArray[np.float64] | None = None
+    color_matrix: Float64Array | None = None
     """(3, 3) from CIE XYZ of ``color_illuminant`` to camera RGB; None where unknown."""
     color_illuminant: str = "D65"
     """Illuminant of ``color_matrix``: "A", "D50", "D55", "D65" or "D75"."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float32Array
 from capture.documents import Checks, Fault
 from capture.raw.frame import RawError, RawFrame, noise_profile
 
@@ -23,11 +23,11 @@ _TRIANGLE = (0.5, 1.0, 0.5)
 class LinearImage:
     """Linear camera RGB: black-subtracted, not white-balanced."""
 
-    rgb: NDArray[np.float32]
+    rgb: Float32Array
     """(h, w, 3) fraction of full scale; negative values are kept."""
-    variance: NDArray[np.float32]
+    variance: Float32Array
     """(h, w, 3) variance of ``rgb``."""
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     """(h, w) False where a saturated pixel contributes."""
     unit: str = UNIT
 
@@ -97,7 +97,7 @@ def linear_rgb(
 
 def linear_mono(
     frame: RawFrame, *, gain: float | None = None, read_noise: float | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Return the linear values of a monochrome frame with their variance.
 
     Parameters
@@ -136,9 +136,9 @@ def linear_mono(
 
 
 def interpolate(
-    values: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    good: NDArray[np.bool_],
+    values: Float32Array,
+    variance: Float32Array,
+    good: BoolArray,
     pattern: str,
     *,
     demosaic: Demosaic = "superpixel",
@@ -170,7 +170,7 @@ def interpolate(
 
 def _pixels(
     frame: RawFrame, gain: float | None, read_noise: float | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Return value and variance of each sensor pixel, fractions of full scale."""
     x = np.empty(frame.cfa.shape, np.float32)
     variance = np.empty_like(x)
@@ -195,7 +195,7 @@ def _pixels(
 
 
 def _superpixel(
-    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+    pattern: str, x: Float32Array, variance: Float32Array, good: BoolArray
 ) -> LinearImage:
     height, width = x.shape[0] // 2, x.shape[1] // 2
     rgb = np.zeros((height, width, 3), np.float32)
@@ -212,7 +212,7 @@ def _superpixel(
 
 
 def _centered(
-    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+    pattern: str, x: Float32Array, variance: Float32Array, good: BoolArray
 ) -> LinearImage:
     """Interpolate every color to the middle of its 2 x 2 cell, linearly from its own sites."""
     height, width = x.shape[0] // 2, x.shape[1] // 2
@@ -230,9 +230,7 @@ def _centered(
     return LinearImage(rgb, noise, ~bad)
 
 
-def _to_middle(
-    plane: NDArray[np.float32], ahead: tuple[bool, bool], *, power: int
-) -> NDArray[np.float32]:
+def _to_middle(plane: Float32Array, ahead: tuple[bool, bool], *, power: int) -> Float32Array:
     """Shift a plane by a quarter of its pitch along both axes, with weights to ``power``.
 
     At the border, where the neighbor is missing, the plane's own value stands alone.
@@ -250,7 +248,7 @@ def _to_middle(
 
 
 def _bilinear(
-    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+    pattern: str, x: Float32Array, variance: Float32Array, good: BoolArray
 ) -> LinearImage:
     rgb = np.empty((*x.shape, 3), np.float32)
     noise = np.empty_like(rgb)
@@ -269,7 +267,7 @@ def _bilinear(
     return LinearImage(rgb, noise, valid)
 
 
-def _spread_sparse(plane: NDArray[np.float32], *, power: int) -> NDArray[np.float32]:
+def _spread_sparse(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve a red or blue plane (zero elsewhere) with the triangle's ``power``, separably."""
     side, centre = (np.float32(w**power) for w in _TRIANGLE[:2])
     rows = centre * plane
@@ -281,7 +279,7 @@ def _spread_sparse(plane: NDArray[np.float32], *, power: int) -> NDArray[np.floa
     return both
 
 
-def _spread_green(plane: NDArray[np.float32], *, power: int) -> NDArray[np.float32]:
+def _spread_green(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve the green plane: itself where it is green, else a quarter of each neighbour."""
     weight = np.float32(0.25**power)
     spread = plane.copy()

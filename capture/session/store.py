@@ -42,13 +42,7 @@ from capture.session.journal import (
     is_attachment_name,
     seal_line,
 )
-from capture.session.manifest import (
-    CalibrationRef,
-    Manifest,
-    Subject,
-    calibration_refs,
-    versions,
-)
+from capture.session.manifest import CalibrationRef, Manifest, Subject, calibration_refs, versions
 from capture.session.view import SessionView
 
 _log = logging.getLogger(__name__)

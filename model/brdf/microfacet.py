@@ -16,11 +16,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import fresnel
+from model.arrays import Float64Array
 
-FloatArray = NDArray[np.float64]
 Distribution = Literal["ggx", "beckmann", "blinn"]
 
 LEAST_COSINE = 1e-3
@@ -30,7 +30,7 @@ ROUGHNESS_RANGE = (1e-6, 1e6)
 """Smoother facets are a mirror, which has no density; squares of both overflow far beyond."""
 
 
-def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx") -> FloatArray:
+def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx") -> Float64Array:
     """Return the density D of facet normals, 1/sr; the integral of D cos is 1.
 
     Parameters
@@ -70,7 +70,7 @@ def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx"
 
 def visibility(
     cos_light: ArrayLike, cos_view: ArrayLike, roughness: float, kind: Distribution = "ggx"
-) -> FloatArray:
+) -> Float64Array:
     """Return G / (4 cos cos), height-correlated Smith shadowing and masking.
 
     Cosines below :data:`LEAST_COSINE`, behind the surface too, count as that.
@@ -91,7 +91,7 @@ def brdf(
     roughness: float,
     eta: float,
     kind: Distribution = "ggx",
-) -> FloatArray:
+) -> Float64Array:
     """Return the BRDF of a rough dielectric surface, 1/sr, without what enters and comes back.
 
     Parameters
@@ -116,7 +116,7 @@ def brdf(
     )
 
 
-def _lambda(mu: FloatArray, roughness: float, kind: Distribution) -> FloatArray:
+def _lambda(mu: Float64Array, roughness: float, kind: Distribution) -> Float64Array:
     """Return Smith's Lambda; Beckmann's rational fit (Walter et al.) serves the cosine power."""
     slope = roughness * np.sqrt(1.0 - mu**2) / mu
     if kind == "ggx":

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from model.arrays import Float64Array
 from model.brdf import microfacet
 
-FloatArray = NDArray[np.float64]
-Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 
 GGX_ROUGHNESS = (0.05, 0.07, 0.1, 0.14, 0.18, 0.22, 0.27, 0.33, 0.4, 0.48, 0.58, 0.7)
 GGX_ETA = (1.3, 1.4, 1.55)
@@ -49,7 +48,7 @@ def materials() -> Iterator[tuple[str, Brdf]]:
     yield "rough diffuse", _rough_diffuse
 
 
-def _cosines(light: FloatArray, view: FloatArray) -> tuple[FloatArray, ...]:
+def _cosines(light: Float64Array, view: Float64Array) -> tuple[Float64Array, ...]:
     """Return cosines of light, view and half vector to +z, and of the difference angle."""
     mu_l, mu_v = light[..., 2], view[..., 2]
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + np.sum(light * view, axis=-1)), 0.0, 1.0))
@@ -58,7 +57,7 @@ def _cosines(light: FloatArray, view: FloatArray) -> tuple[FloatArray, ...]:
 
 
 def _facets(roughness: float, eta: float, kind: microfacet.Distribution) -> Brdf:
-    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         return microfacet.brdf(*_cosines(light, view), roughness=roughness, eta=eta, kind=kind)
 
     return brdf
@@ -70,7 +69,7 @@ def _sheen(width: float) -> Brdf:
     Estevez and Kulla 2017 (sheen), with the shadowing of Neubelt and Pettineo 2013.
     """
 
-    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         mu_l, mu_v, cos_h, _ = _cosines(light, view)
         mu_l, mu_v = np.maximum(mu_l, 0.0), np.maximum(mu_v, 0.0)
         density = (2.0 + 1.0 / width) * (1.0 - cos_h**2) ** (0.5 / width) / (2.0 * np.pi)
@@ -82,18 +81,18 @@ def _sheen(width: float) -> Brdf:
 def _retro(width: float) -> Brdf:
     """Light thrown back around its source: a Gaussian of the difference angle."""
 
-    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         _, _, _, cos_d = _cosines(light, view)
         return np.asarray(np.exp((cos_d**2 - 1.0) / width**2) / np.pi)
 
     return brdf
 
 
-def _diffuse(light: FloatArray, view: FloatArray) -> FloatArray:
+def _diffuse(light: Float64Array, view: Float64Array) -> Float64Array:
     return np.full(light.shape[:-1], 1.0 / np.pi)
 
 
-def _rough_diffuse(light: FloatArray, view: FloatArray) -> FloatArray:
+def _rough_diffuse(light: Float64Array, view: Float64Array) -> Float64Array:
     """Oren and Nayar 1994 with slopes of 0.5 rad."""
     mu_l, mu_v, _, _ = _cosines(light, view)
     mu_l, mu_v = np.maximum(mu_l, 0.0), np.maximum(mu_v, 0.0)

@@ -25,10 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.arrays import Float32Array, Float64Array
 from model.brdf import tensor_file
-
-FloatArray = NDArray[np.float64]
-Grid = NDArray[np.float32]
 
 ELEVATIONS = 45
 SIDE = 90
@@ -64,13 +62,13 @@ class RglTable:
         Text.
     """
 
-    theta_i: Grid
-    ndf: Grid
-    sigma: Grid
-    vndf: Grid
-    luminance: Grid
-    values: Grid
-    wavelengths_nm: Grid
+    theta_i: Float32Array
+    ndf: Float32Array
+    sigma: Float32Array
+    vndf: Float32Array
+    luminance: Float32Array
+    values: Float32Array
+    wavelengths_nm: Float32Array
     description: str
 
     def __post_init__(self) -> None:
@@ -97,7 +95,7 @@ class RglTable:
         if not np.all(self.vndf.sum((1, 2)) > 0.0):
             raise RglFileError("vndf: got an elevation without any density")
 
-    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike) -> FloatArray:
+    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike) -> Float64Array:
         """Return the BRDF.
 
         Parameters
@@ -136,7 +134,10 @@ class RglTable:
 
 
 def of_brdf(
-    brdf: Callable[[FloatArray, FloatArray], FloatArray], *, description: str, side: int = SIDE
+    brdf: Callable[[Float64Array, Float64Array], Float64Array],
+    *,
+    description: str,
+    side: int = SIDE,
 ) -> RglTable:
     """Tabulate a BRDF.
 
@@ -178,9 +179,15 @@ def of_brdf(
         luminance[k] = density + (_LEAST_SHARE * density.mean() or 1.0)
     flat = np.ones((2, 2), np.float32)
     return RglTable(
-        theta_i.astype(np.float32), flat, 0.25 * flat, np.ones((ELEVATIONS, 2, 2), np.float32),
-        luminance, values, np.zeros(0, np.float32), description,
-    )  # fmt: skip
+        theta_i.astype(np.float32),
+        flat,
+        0.25 * flat,
+        np.ones((ELEVATIONS, 2, 2), np.float32),
+        luminance,
+        values,
+        np.zeros(0, np.float32),
+        description,
+    )
 
 
 def read(path: str | os.PathLike[str]) -> RglTable:
@@ -210,8 +217,14 @@ def read(path: str | os.PathLike[str]) -> RglTable:
         raise RglFileError(
             f"{path}: got an anisotropic material ({azimuths} azimuths), expected an isotropic one"
         )
-    for name, dimensions in (("theta_i", 1), ("ndf", 2), ("sigma", 2), ("vndf", 4),
-                             ("luminance", 4), (data, 5)):  # fmt: skip
+    for name, dimensions in (
+        ("theta_i", 1),
+        ("ndf", 2),
+        ("sigma", 2),
+        ("vndf", 4),
+        ("luminance", 4),
+        (data, 5),
+    ):
         if fields[name].ndim != dimensions:
             raise RglFileError(
                 f"{path}: {name}: got {fields[name].ndim} dimensions, expected {dimensions}"
@@ -253,7 +266,7 @@ def write(path: str | os.PathLike[str], table: RglTable) -> None:
     tensor_file.write(Path(path), fields)
 
 
-def _elevation(unit: FloatArray) -> FloatArray:
+def _elevation(unit: Float64Array) -> Float64Array:
     """Return the angle to +z, rad, without loss of digits near it."""
     apart = np.linalg.norm(unit - [0.0, 0.0, 1.0], axis=-1)
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
@@ -265,10 +278,10 @@ class _Slices:
 
     low: NDArray[np.intp]
     high: NDArray[np.intp]
-    share: FloatArray
+    share: Float64Array
 
     @classmethod
-    def of(cls, nodes: FloatArray, at: FloatArray) -> _Slices:
+    def of(cls, nodes: Float64Array, at: Float64Array) -> _Slices:
         if len(nodes) == 1:
             zero = np.zeros(len(at), np.intp)
             return cls(zero, zero, np.zeros(len(at)))
@@ -276,12 +289,12 @@ class _Slices:
         share = np.clip((at - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0)
         return cls(low, low + 1, share)
 
-    def take(self, grids: FloatArray, *index: NDArray[np.intp]) -> FloatArray:
+    def take(self, grids: Float64Array, *index: NDArray[np.intp]) -> Float64Array:
         """Return elements of (T, ...), mixed from two tables."""
         low, high = grids[(self.low, *index)], grids[(self.high, *index)]
         return np.asarray((1.0 - self.share) * low + self.share * high)
 
-    def bilinear(self, grids: Grid, square: FloatArray) -> FloatArray:
+    def bilinear(self, grids: Float32Array, square: Float64Array) -> Float64Array:
         """Return (n, C) of (T, C, Y, X) at places (n, 2), x first."""
         (x, y), (fx, fy) = _cells(square, grids.shape[-1], grids.shape[-2])
         out = np.zeros((len(square), grids.shape[1]))
@@ -294,15 +307,15 @@ class _Slices:
 
 
 def _cells(
-    square: FloatArray, width: int, height: int
-) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], tuple[FloatArray, FloatArray]]:
+    square: Float64Array, width: int, height: int
+) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], tuple[Float64Array, Float64Array]]:
     x, y = square[:, 0] * (width - 1), square[:, 1] * (height - 1)
     column = np.clip(x.astype(np.intp), 0, width - 2)
     row = np.clip(y.astype(np.intp), 0, height - 2)
     return (column, row), (x - column, y - row)
 
 
-def _flattened(vndf: Grid, slices: _Slices, square: FloatArray) -> FloatArray:
+def _flattened(vndf: Float32Array, slices: _Slices, square: Float64Array) -> Float64Array:
     """Return where sampling of a piecewise bilinear density would have come from, (n, 2).
 
     Rows first by the marginal density, then columns within the row: shares of the mass below.
@@ -319,7 +332,7 @@ def _flattened(vndf: Grid, slices: _Slices, square: FloatArray) -> FloatArray:
     density = density / total[..., None]
     (column, row), (fx, fy) = _cells(square, width, height)
 
-    def at(grids: FloatArray, *index: NDArray[np.intp]) -> FloatArray:
+    def at(grids: Float64Array, *index: NDArray[np.intp]) -> Float64Array:
         return slices.take(grids, *index)
 
     left = (1.0 - fy) * at(density, row, column) + fy * at(density, row + 1, column)

@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from model import merl
+from model.arrays import Float32Array, Float64Array
 from model.brdf import recipe as brdf_recipe
 
-FloatArray = NDArray[np.float64]
-Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
 NODES_D, NODES_PHI, NODES_H = 32, 12, 90
@@ -57,7 +57,7 @@ class BrdfBasis:
         Angular radius of the light the tables are convolved with; 0: a point.
     """
 
-    table: NDArray[np.float32]
+    table: Float32Array
     names: tuple[str, ...]
     light_radius_rad: float
 
@@ -78,7 +78,9 @@ class BrdfBasis:
         """Number of materials."""
         return len(self.names)
 
-    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike) -> FloatArray:
+    def evaluate(
+        self, light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike
+    ) -> Float64Array:
         """Return each material's BRDF: linear in theta_d and theta_h, at the nearest phi_d.
 
         Parameters
@@ -102,11 +104,11 @@ class BrdfBasis:
         above = (mu_l > 0.0) & (mu_v > 0.0)
         return np.asarray(np.where(above[..., None], found, 0.0)[..., : self.size])
 
-    def strength(self) -> FloatArray:
+    def strength(self) -> Float64Array:
         """Return each material's RMS over the grid, (K,), 1/sr; nodes count by solid angle."""
         return np.asarray(np.sqrt(np.diag(_gram(self))))
 
-    def kinship(self) -> FloatArray:
+    def kinship(self) -> Float64Array:
         """Return the cosines between the materials, (K, K): 1 for one of the same shape."""
         gram = _gram(self)
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -153,7 +155,7 @@ def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> Br
 
 
 def of_columns(
-    columns: FloatArray | NDArray[np.float32], names: Sequence[str], *, light_radius_rad: float
+    columns: Float64Array | Float32Array, names: Sequence[str], *, light_radius_rad: float
 ) -> BrdfBasis:
     """Return the basis whose table, without its padding, was kept.
 
@@ -198,7 +200,7 @@ def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS
     return _padded(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
 
 
-def _of_file(path: Path, light_radius_rad: float) -> NDArray[np.float32]:
+def _of_file(path: Path, light_radius_rad: float) -> Float32Array:
     mean = merl.read_mean(path)
     if not np.nanmax(mean, initial=0.0) > 0.0:
         raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
@@ -213,15 +215,15 @@ def of_merl(table: merl.MerlTable) -> Brdf:
     return _nearest_bin(mean)
 
 
-def _nearest_bin(mean: FloatArray) -> Brdf:
-    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+def _nearest_bin(mean: Float64Array) -> Brdf:
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
         return np.asarray(mean[merl.bins(np.minimum(h, _HALF_PI), d, phi)])
 
     return brdf
 
 
-def nodes() -> tuple[FloatArray, FloatArray, FloatArray]:
+def nodes() -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return theta_d, phi_d and theta_h of the grid's nodes, rad."""
     return (
         np.linspace(0.0, _HALF_PI, NODES_D),
@@ -231,7 +233,7 @@ def nodes() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 @lru_cache(maxsize=4)
-def _gram(basis: BrdfBasis) -> FloatArray:
+def _gram(basis: BrdfBasis) -> Float64Array:
     """Return the products of the materials over the grid, nodes counting by solid angle."""
     d, _, h = nodes()
     solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
@@ -241,7 +243,7 @@ def _gram(basis: BrdfBasis) -> FloatArray:
     return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
 
 
-def _convolved(brdf: Brdf, radius_rad: float) -> FloatArray:
+def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
     """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
     if not 0.0 <= radius_rad <= 0.5:
         raise BasisError(f"light_radius_rad: got {radius_rad}, expected 0 to 0.5 rad")
@@ -270,7 +272,7 @@ def _convolved(brdf: Brdf, radius_rad: float) -> FloatArray:
         return _filled(total / weight)
 
 
-def _filled(values: FloatArray) -> FloatArray:
+def _filled(values: Float64Array) -> Float64Array:
     """Put the nearest known node where a value is unknown, and 0 where it is below 0."""
     unknown = ~np.isfinite(values)
     if np.all(unknown):
@@ -281,7 +283,7 @@ def _filled(values: FloatArray) -> FloatArray:
     return np.maximum(values, 0.0)
 
 
-def _padded(columns: FloatArray, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
+def _padded(columns: Float64Array, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
     lanes = -(-len(names) // LANES) * LANES
     table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
     table[..., : len(names)] = np.where(columns < LEAST, 0.0, columns)
@@ -289,8 +291,8 @@ def _padded(columns: FloatArray, names: Sequence[str], light_radius_rad: float) 
 
 
 def _place(
-    mu_l: FloatArray, mu_v: FloatArray, between: FloatArray
-) -> tuple[tuple[NDArray[np.intp], ...], tuple[FloatArray, FloatArray]]:
+    mu_l: Float64Array, mu_v: Float64Array, between: Float64Array
+) -> tuple[tuple[NDArray[np.intp], ...], tuple[Float64Array, Float64Array]]:
     """Return the cell along theta_d, phi_d, theta_h and the place in it, from cosines alone."""
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + between), 0.0, 1.0))
     sin_d = np.sqrt(np.clip(0.5 * (1.0 - between), 0.0, 1.0))

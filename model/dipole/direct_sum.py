@@ -21,12 +21,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import fresnel
+from model.arrays import Float64Array
 from model.dipole import profile as dipole
-
-FloatArray = NDArray[np.float64]
 
 REACH = 2.0714
 """Reach of a source in sides of a square of its area, so that thirteen sources tell the light at a
@@ -56,10 +55,10 @@ class Media:
         1 over twice the part of the light that survives, R_d / alpha'.
     """
 
-    sigma_tr_per_mm: FloatArray
-    depth_mm: FloatArray
-    height_mm: FloatArray
-    scale: FloatArray
+    sigma_tr_per_mm: Float64Array
+    depth_mm: Float64Array
+    height_mm: Float64Array
+    scale: Float64Array
 
     @staticmethod
     def of(r_d: ArrayLike, translucency_mm: ArrayLike, *, eta: float) -> Media:
@@ -83,13 +82,13 @@ class Media:
 
 
 @lru_cache(maxsize=8)
-def _inverse(eta: float) -> tuple[FloatArray, FloatArray]:
+def _inverse(eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d, rising, and sqrt(3 (1 - alpha')) at nodes, for linear interpolation."""
     q = _DEEPEST * np.linspace(0.0, 1.0, 8193) ** 3
     return dipole.absorbed_fraction(np.minimum(q**2 / 3.0, 1.0), eta), q
 
 
-def profile(radius_mm: ArrayLike, media: Media) -> FloatArray:
+def profile(radius_mm: ArrayLike, media: Media) -> Float64Array:
     """Return the dipole's profile over R_d, 1/mm^2: its integral over the plane is 1.
 
     Where R_d is 1 all light leaves where it entered: 0 at every distance.
@@ -111,7 +110,7 @@ def profile(radius_mm: ArrayLike, media: Media) -> FloatArray:
     return np.asarray(media.scale * total / (2.0 * np.pi))
 
 
-def share_within(radius_mm: ArrayLike, media: Media) -> FloatArray:
+def share_within(radius_mm: ArrayLike, media: Media) -> Float64Array:
     """Return the share of light that comes out within a radius of where it went in.
 
     Examples
@@ -129,7 +128,7 @@ def share_within(radius_mm: ArrayLike, media: Media) -> FloatArray:
     return np.asarray(media.scale * total)
 
 
-def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> FloatArray:
+def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> Float64Array:
     """Return the profile as sources of a finite reach carry it, 1/mm^2, integral 1.
 
     Parameters
@@ -143,7 +142,7 @@ def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> FloatArra
 
 def kernel_parts(
     radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the kernel in two parts: `own` is light that comes out nearer than sources can tell.
 
     It is the part of the bump that a reach of a quarter would have.
@@ -160,7 +159,7 @@ def kernel_parts(
     return np.asarray(far + shape * (missing - own)), np.asarray(shape * own)
 
 
-def _missing(reach_mm: FloatArray, media: Media) -> FloatArray:
+def _missing(reach_mm: Float64Array, media: Media) -> Float64Array:
     """Return the share of light within a reach above that of an even disc as at its edge."""
     return share_within(reach_mm, media) - np.pi * reach_mm**2 * profile(reach_mm, media)
 
@@ -176,7 +175,7 @@ def exitance_directly(
     eta: float = fresnel.ETA_SKIN,
     normalize: bool = True,
     entered_at: ArrayLike | None = None,
-) -> FloatArray:
+) -> Float64Array:
     """Sum over all sources for every exit point; see `model.dipole.gather.exitance`.
 
     Takes Q x S x 3 evaluations of the kernel: a reference, for a few thousand of each.

@@ -26,11 +26,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import fresnel
+from model.arrays import Float32Array, Float64Array, Int32Array
 from model.dipole import gather_kernels as dipole_gather_kernels
 from model.dipole import source_tree_kernels
 from model.dipole.direct_sum import REACH, Media
-
-FloatArray = NDArray[np.float64]
 
 TOLERANCE = 0.1
 """Largest error that exit points may have over the brightest light that entered, if all nodes erred
@@ -62,15 +61,15 @@ class SourceTree:
         Number of sources given.
     """
 
-    center_mm: FloatArray
+    center_mm: Float64Array
     order: NDArray[np.intp]
-    place: NDArray[np.float32]
-    reach: NDArray[np.float32]
-    area: NDArray[np.float32]
-    seen: NDArray[np.float32]
-    low: NDArray[np.int32]
-    high: NDArray[np.int32]
-    skip: NDArray[np.int32]
+    place: Float32Array
+    reach: Float32Array
+    area: Float32Array
+    seen: Float32Array
+    low: Int32Array
+    high: Int32Array
+    skip: Int32Array
     size: int
 
     @staticmethod
@@ -127,9 +126,9 @@ class Gathered:
         Nodes and sources that were summed.
     """
 
-    exitance: FloatArray
-    bound: NDArray[np.float32]
-    work: NDArray[np.int32]
+    exitance: Float64Array
+    bound: Float32Array
+    work: Int32Array
 
 
 def exitance(
@@ -145,7 +144,7 @@ def exitance(
     tolerance: float = TOLERANCE,
     entered_at: ArrayLike | None = None,
     workers: int = 1,
-) -> FloatArray:
+) -> Float64Array:
     """Return the radiant exitance below the surface at points, from light that entered at others.
 
     Parameters
@@ -195,9 +194,17 @@ def exitance(
     [1.2, 0.6, 0.4]
     """
     return gather(
-        SourceTree.of(source_mm, source_area_mm2), entered, at_mm, r_d, translucency_mm, eta=eta,
-        normalize=normalize, tolerance=tolerance, entered_at=entered_at, workers=workers,
-    ).exitance  # fmt: skip
+        SourceTree.of(source_mm, source_area_mm2),
+        entered,
+        at_mm,
+        r_d,
+        translucency_mm,
+        eta=eta,
+        normalize=normalize,
+        tolerance=tolerance,
+        entered_at=entered_at,
+        workers=workers,
+    ).exitance
 
 
 def gather(
@@ -248,11 +255,27 @@ def gather(
         here = np.ascontiguousarray(own[part]).view()
         here.flags.writeable = False  # what may be written would have the kernel compiled anew
         dipole_gather_kernels.gather(
-            (at[part] - tree.center_mm).astype(np.float32), media.sigma_tr_per_mm,
-            media.depth_mm, media.height_mm, media.scale, here,
-            tolerance / NODES, normalize, tree.place, tree.reach, tree.area, light, tree.seen,
-            moments, tree.low, tree.high, tree.skip, found[part], bound[part], work[part],
-        )  # fmt: skip
+            (at[part] - tree.center_mm).astype(np.float32),
+            media.sigma_tr_per_mm,
+            media.depth_mm,
+            media.height_mm,
+            media.scale,
+            here,
+            tolerance / NODES,
+            normalize,
+            tree.place,
+            tree.reach,
+            tree.area,
+            light,
+            tree.seen,
+            moments,
+            tree.low,
+            tree.high,
+            tree.skip,
+            found[part],
+            bound[part],
+            work[part],
+        )
         found[part] *= albedo[part]
 
     starts = range(0, len(at), _CHUNK)
@@ -265,14 +288,14 @@ def gather(
     return Gathered(found, bound, work)
 
 
-def _expect(name: str, values: FloatArray, shape: tuple[int, ...]) -> None:
+def _expect(name: str, values: Float64Array, shape: tuple[int, ...]) -> None:
     if values.shape != shape:
         raise GatherError(f"{name}: got shape {values.shape}, expected {shape}")
     if not np.isfinite(values).all():
         raise GatherError(f"{name}: got NaN or infinity, expected finite; leave such points out")
 
 
-def _spread(name: str, given: ArrayLike, count: int) -> FloatArray:
+def _spread(name: str, given: ArrayLike, count: int) -> Float64Array:
     values = np.asarray(given, np.float64)
     try:
         spread = np.broadcast_to(values, (count, 3))

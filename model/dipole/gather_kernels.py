@@ -129,9 +129,27 @@ def _nearest(point, place, seen, low, high, skip):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def gather(  # type: ignore[no-untyped-def]
-    at, sigma, depth, height, scale, own, tolerance, normalize,
-    place, reach, area, entered, seen, moments, low, high, skip, found, bound, work,
-):  # fmt: skip
+    at,
+    sigma,
+    depth,
+    height,
+    scale,
+    own,
+    tolerance,
+    normalize,
+    place,
+    reach,
+    area,
+    entered,
+    seen,
+    moments,
+    low,
+    high,
+    skip,
+    found,
+    bound,
+    work,
+):
     """Fill the light that reaches each exit point (Q, 3), before R_d, its bound and its work.
 
     Parameters

@@ -15,11 +15,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import fresnel
-
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 LARGEST = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
@@ -28,20 +27,17 @@ LARGEST = 1e100
 class Slopes(NamedTuple):
     """A profile of reflectance and its derivatives, broadcast alike."""
 
-    reflectance_per_mm2: FloatArray
+    reflectance_per_mm2: Float64Array
     """R, 1/mm^2."""
-    by_sigma_a: FloatArray
+    by_sigma_a: Float64Array
     """dR/d sigma_a, 1/mm."""
-    by_sigma_s_prime: FloatArray
+    by_sigma_s_prime: Float64Array
     """dR/d sigma_s', 1/mm."""
 
 
 def reflectance(
-    radius_mm: ArrayLike,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    eta: float,
-) -> FloatArray:
+    radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike, eta: float
+) -> Float64Array:
     """Return the radial profile of diffuse reflectance around a narrow beam.
 
     Parameters
@@ -79,10 +75,7 @@ def reflectance(
 
 
 def derivatives(
-    radius_mm: ArrayLike,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    eta: float,
+    radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike, eta: float
 ) -> Slopes:
     """Return the profile and its derivatives by both coefficients; arguments of `reflectance`.
 
@@ -175,7 +168,7 @@ def image_depth(eta: float) -> float:
     return 1.0 + 4.0 / 3.0 * (1.0 + effective) / (1.0 - effective)
 
 
-def _not_negative(name: str, value: ArrayLike) -> FloatArray:
+def _not_negative(name: str, value: ArrayLike) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
     if not np.all((array >= 0.0) & (array <= LARGEST)):
         raise ValueError(

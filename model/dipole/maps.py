@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array
 from model.dipole import profile as dipole
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,17 +31,17 @@ class DipoleMaps:
     valid : ndarray of bool
     """
 
-    deficit: FloatArray
-    sigma_t_prime_per_mm: FloatArray
-    sigma_s_prime_per_mm: FloatArray
-    sigma_a_per_mm: FloatArray
-    deficit_stderr: FloatArray
-    sigma_t_prime_stderr: FloatArray
-    outlier: NDArray[np.bool_]
-    valid: NDArray[np.bool_]
+    deficit: Float64Array
+    sigma_t_prime_per_mm: Float64Array
+    sigma_s_prime_per_mm: Float64Array
+    sigma_a_per_mm: Float64Array
+    deficit_stderr: Float64Array
+    sigma_t_prime_stderr: Float64Array
+    outlier: BoolArray
+    valid: BoolArray
 
     @property
-    def albedo_prime(self) -> FloatArray:
+    def albedo_prime(self) -> Float64Array:
         """alpha'; rounds to 1 where `deficit` is small."""
         return 1.0 - self.deficit
 
@@ -96,16 +95,22 @@ class DipoleMaps:
             _stderr(translucency_stderr_mm, depth.shape) / np.where(good, depth, 1.0),
         )
 
-        def masked(values: FloatArray) -> FloatArray:
+        def masked(values: Float64Array) -> Float64Array:
             return np.asarray(np.where(good, values, np.nan))
 
         return DipoleMaps(
-            masked(deficit), masked(total), masked(scattered), masked(absorbed), masked(error),
-            masked(total * relative), outlier, good,
-        )  # fmt: skip
+            masked(deficit),
+            masked(total),
+            masked(scattered),
+            masked(absorbed),
+            masked(error),
+            masked(total * relative),
+            outlier,
+            good,
+        )
 
 
-def _stderr(given: ArrayLike | None, shape: tuple[int, ...]) -> FloatArray:
+def _stderr(given: ArrayLike | None, shape: tuple[int, ...]) -> Float64Array:
     if given is None:
         return np.full(shape, np.nan)
     return np.broadcast_to(np.asarray(given, np.float64), shape)

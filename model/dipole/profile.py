@@ -12,11 +12,10 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, eq. (5) and section 9 (the dom
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import fresnel
-
-FloatArray = NDArray[np.float64]
+from model.arrays import BoolArray, Float64Array
 
 LARGEST = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still a number."""
@@ -28,11 +27,8 @@ class ReflectanceOutlierError(ValueError):
 
 
 def reflectance(
-    radius_mm: ArrayLike,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    eta: float,
-) -> FloatArray:
+    radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike, eta: float
+) -> Float64Array:
     """Return the dipole's radial profile of diffuse reflectance around a narrow beam.
 
     Parameters
@@ -88,7 +84,7 @@ def reflectance(
     return np.asarray(np.where(scatters, per_area, 0.0))
 
 
-def total_reflectance(albedo_prime: ArrayLike, eta: float) -> FloatArray:
+def total_reflectance(albedo_prime: ArrayLike, eta: float) -> Float64Array:
     """Return the total diffuse reflectance R_d of a semi-infinite medium, eq. (5).
 
     Parameters
@@ -112,7 +108,7 @@ def total_reflectance(albedo_prime: ArrayLike, eta: float) -> FloatArray:
     return np.asarray(alpha * _survival(np.sqrt(3.0 * (1.0 - alpha)), eta))
 
 
-def absorbed_fraction(deficit: ArrayLike, eta: float) -> FloatArray:
+def absorbed_fraction(deficit: ArrayLike, eta: float) -> Float64Array:
     """Return 1 - R_d for the deficit 1 - alpha', without cancellation near alpha' = 1.
 
     Examples
@@ -127,7 +123,7 @@ def absorbed_fraction(deficit: ArrayLike, eta: float) -> FloatArray:
     return np.asarray(lost)
 
 
-def is_outlier(r_d: ArrayLike) -> NDArray[np.bool_]:
+def is_outlier(r_d: ArrayLike) -> BoolArray:
     """Return where a total reflectance lies outside [0, 1] or is not a number.
 
     Examples
@@ -139,7 +135,7 @@ def is_outlier(r_d: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray(~((value >= 0.0) & (value <= 1.0)))
 
 
-def invert_total_reflectance(r_d: ArrayLike, eta: float) -> FloatArray:
+def invert_total_reflectance(r_d: ArrayLike, eta: float) -> Float64Array:
     """Return the reduced albedo alpha' of a total reflectance, the inverse of eq. (5).
 
     Parameters
@@ -175,7 +171,7 @@ def invert_total_reflectance(r_d: ArrayLike, eta: float) -> FloatArray:
     return np.asarray(np.where(dark, np.minimum(target / _survival(q, eta), 1.0), alpha))
 
 
-def invert_to_deficit(r_d: ArrayLike, eta: float) -> FloatArray:
+def invert_to_deficit(r_d: ArrayLike, eta: float) -> Float64Array:
     """Return 1 - alpha' of a total reflectance, with all its digits near R_d = 1.
 
     Parameters, shapes and outliers as :func:`invert_total_reflectance`.
@@ -189,7 +185,7 @@ def invert_to_deficit(r_d: ArrayLike, eta: float) -> FloatArray:
     return np.asarray(_solve(np.asarray(r_d, dtype=np.float64), eta) ** 2 / 3.0)
 
 
-def albedo_slope(deficit: ArrayLike, eta: float) -> FloatArray:
+def albedo_slope(deficit: ArrayLike, eta: float) -> Float64Array:
     """Return d alpha' / d R_d at a deficit 1 - alpha', which carries standard errors over.
 
     Examples
@@ -202,7 +198,9 @@ def albedo_slope(deficit: ArrayLike, eta: float) -> FloatArray:
     return np.asarray(2.0 / 3.0 * q / slope)
 
 
-def coefficients(deficit: ArrayLike, sigma_tr_per_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def coefficients(
+    deficit: ArrayLike, sigma_tr_per_mm: ArrayLike
+) -> tuple[Float64Array, Float64Array]:
     """Return absorption and reduced scattering from albedo and translucency (section 9).
 
     Parameters
@@ -235,7 +233,7 @@ def coefficients(deficit: ArrayLike, sigma_tr_per_mm: ArrayLike) -> tuple[FloatA
     return np.asarray(delta * sigma_t), np.asarray((1.0 - delta) * sigma_t)
 
 
-def effective_transport(sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike) -> FloatArray:
+def effective_transport(sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike) -> Float64Array:
     """Return sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm, eq. (9).
 
     Examples
@@ -248,13 +246,13 @@ def effective_transport(sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLi
     return np.asarray(np.sqrt(3.0 * sigma_a) * np.sqrt(sigma_a + sigma_s))
 
 
-def _survival(q: FloatArray, eta: float) -> FloatArray:
+def _survival(q: Float64Array, eta: float) -> Float64Array:
     """Return R_d / alpha' at q = sqrt(3 (1 - alpha'))."""
     A = fresnel.boundary_factor(eta)
     return np.asarray(0.5 * (1.0 + np.exp(-4.0 / 3.0 * A * q)) * np.exp(-q))  # eq. (5)
 
 
-def _lost(q: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
+def _lost(q: Float64Array, eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d and its derivative by q; a sum of terms that are all at least 0."""
     b = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
     decayed = -0.5 * (np.expm1(-q) + np.expm1(-b * q))
@@ -263,7 +261,7 @@ def _lost(q: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
     return np.asarray(decayed + q**2 / 3.0 * survived), np.asarray(slope)
 
 
-def _solve(r_d: FloatArray, eta: float) -> FloatArray:
+def _solve(r_d: Float64Array, eta: float) -> Float64Array:
     """Return q = sqrt(3 (1 - alpha')) by Newton steps kept inside a shrinking bracket."""
     outlier = is_outlier(r_d)
     if r_d.ndim == 0 and outlier:
@@ -285,14 +283,14 @@ def _solve(r_d: FloatArray, eta: float) -> FloatArray:
     return np.asarray(np.where(outlier, np.nan, q))
 
 
-def _in_unit(name: str, value: ArrayLike) -> FloatArray:
+def _in_unit(name: str, value: ArrayLike) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
     if not np.all((array >= 0.0) & (array <= 1.0)):
         raise ValueError(f"{name}: got values outside [0, 1], expected a fraction")
     return array
 
 
-def _not_negative(name: str, value: ArrayLike, *, most: float = np.inf) -> FloatArray:
+def _not_negative(name: str, value: ArrayLike, *, most: float = np.inf) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
     if not np.all((array >= 0.0) & (array <= most) & (array < np.inf)):
         limit = "" if most == np.inf else f" and at most {most:g}"

@@ -24,8 +24,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.displacement_synthesis import kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
@@ -33,9 +34,6 @@ from model.displacement_synthesis.sources import Sources, SynthesisError, gather
 
 __all__ = ["Layout", "SynthesisError", "grow", "lay_out", "leveled"]
 
-Float32Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
 
@@ -52,7 +50,7 @@ def grow(
     *,
     rng: np.random.Generator,
     regions: ArrayLike | None = None,
-    out: NDArray[np.float32] | None = None,
+    out: Float32Array | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 1,
     **knobs: Any,
@@ -241,7 +239,9 @@ def _grid(
     return CellGrid(lines[0], lines[1], overlap, longest + overlap, wraps)
 
 
-def _levels(scales: Floats, patch_pixel_um: float, grid: CellGrid) -> tuple[Integers, list[float]]:
+def _levels(
+    scales: Float64Array, patch_pixel_um: float, grid: CellGrid
+) -> tuple[Int64Array, list[float]]:
     """Return the scale of each cell, and pixels of the map per pixel of a patch of each scale."""
     counts = (grid.lines_y.size - 1, grid.lines_x.size - 1)
     if scales.ndim == 0:
@@ -256,7 +256,7 @@ def _levels(scales: Floats, patch_pixel_um: float, grid: CellGrid) -> tuple[Inte
     return levels.reshape(counts).astype(np.int64), zooms
 
 
-def _needed(weights: Floats, grid: CellGrid) -> NDArray[np.bool_]:
+def _needed(weights: Float64Array, grid: CellGrid) -> BoolArray:
     """Return which cells show a site at all, with a margin of a cell."""
     shape = (int(grid.lines_y[-1]), int(grid.lines_x[-1]))
     found = np.empty((grid.lines_y.size - 1, grid.lines_x.size - 1), bool)
@@ -272,8 +272,8 @@ def _needed(weights: Floats, grid: CellGrid) -> NDArray[np.bool_]:
 def _choose(
     sources: Sources,
     grid: CellGrid,
-    levels: Integers,
-    needed: NDArray[np.bool_] | None,
+    levels: Int64Array,
+    needed: BoolArray | None,
     knobs: tuple[int, np.float32, np.uint64],
     threads: int,
 ) -> SiteLayout:
@@ -290,22 +290,57 @@ def _choose(
 
     def choose(row: int, first: int, beside: bool, above: bool) -> None:
         kernels.choose_windows(
-            row, first, cells, grid.lines_y, grid.lines_x, beside, above, wrap_x, wrap_y,
-            grid.window, grid.overlap, levels, sources.level_first, sources.table,
-            sources.heights, sources.turned, sources.filled, allowed, candidates, seed, per_step,
-        )  # fmt: skip
+            row,
+            first,
+            cells,
+            grid.lines_y,
+            grid.lines_x,
+            beside,
+            above,
+            wrap_x,
+            wrap_y,
+            grid.window,
+            grid.overlap,
+            levels,
+            sources.level_first,
+            sources.table,
+            sources.heights,
+            sources.turned,
+            sources.filled,
+            allowed,
+            candidates,
+            seed,
+            per_step,
+        )
 
     def cut_columns(row: int) -> None:
         kernels.cut_columns(
-            row, cells, grid.lines_x, wrap_x, grid.window, grid.overlap, sources.table,
-            sources.heights, per_step, across,
-        )  # fmt: skip
+            row,
+            cells,
+            grid.lines_x,
+            wrap_x,
+            grid.window,
+            grid.overlap,
+            sources.table,
+            sources.heights,
+            per_step,
+            across,
+        )
 
     def cut_rows(line: int) -> None:
         kernels.cut_rows(
-            line, cells, grid.lines_y, grid.lines_x, wrap_x, grid.overlap, sources.table,
-            sources.heights, per_step, across, down,
-        )  # fmt: skip
+            line,
+            cells,
+            grid.lines_y,
+            grid.lines_x,
+            wrap_x,
+            grid.overlap,
+            sources.table,
+            sources.heights,
+            per_step,
+            across,
+            down,
+        )
 
     with ThreadPoolExecutor(threads) as pool:
         for parity, first, beside, above in (

@@ -96,9 +96,16 @@ def _misfit_row(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cut_cost(
-    heights: Any, a: Any, a_step: Any, b: Any, b_step: Any, length: Any, overlap: Any,
-    per_step: Any, bound: Any,
-) -> Any:  # fmt: skip
+    heights: Any,
+    a: Any,
+    a_step: Any,
+    b: Any,
+    b_step: Any,
+    length: Any,
+    overlap: Any,
+    per_step: Any,
+    bound: Any,
+) -> Any:
     """Return the cost of the cheapest cut through an overlap, or `bound` once it must exceed it.
 
     Parameters
@@ -118,9 +125,15 @@ def cut_cost(
     row = np.empty(overlap, np.float32)
     for y in range(length - 1):
         _misfit_row(
-            heights, heights, a + y * a_step, a + (y + 1) * a_step, b + y * b_step,
-            b + (y + 1) * b_step, per_step, row,
-        )  # fmt: skip
+            heights,
+            heights,
+            a + y * a_step,
+            a + (y + 1) * a_step,
+            b + y * b_step,
+            b + (y + 1) * b_step,
+            per_step,
+            row,
+        )
         for x in range(overlap):
             before[x] = cost[x]
         for x in range(1, overlap - 1):
@@ -182,11 +195,28 @@ def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_windows(
-    row: Any, first_column: Any, cells: Any, lines_y: Any, lines_x: Any, neighbours_x: Any,
-    neighbours_y: Any, wrap_x: Any, wrap_y: Any, window: Any, overlap: Any, levels: Any,
-    level_first: Any, sources: Any, heights: Any, turned: Any, filled: Any, most_filled: Any,
-    candidates: Any, seed: Any, per_step: Any,
-) -> Any:  # fmt: skip
+    row: Any,
+    first_column: Any,
+    cells: Any,
+    lines_y: Any,
+    lines_x: Any,
+    neighbours_x: Any,
+    neighbours_y: Any,
+    wrap_x: Any,
+    wrap_y: Any,
+    window: Any,
+    overlap: Any,
+    levels: Any,
+    level_first: Any,
+    sources: Any,
+    heights: Any,
+    turned: Any,
+    filled: Any,
+    most_filled: Any,
+    candidates: Any,
+    seed: Any,
+    per_step: Any,
+) -> Any:
     """Choose windows for every other cell of a row, by the cheapest cuts to neighbours there.
 
     Parameters
@@ -254,15 +284,29 @@ def choose_windows(
                     if side == 0:
                         to = lines_x[other + 1] - lines_x[other]
                         cost += cut_cost(
-                            heights, there + to, sources[o[0], 2], here, wide, window, overlap,
-                            per_step, best - cost,
-                        )  # fmt: skip
+                            heights,
+                            there + to,
+                            sources[o[0], 2],
+                            here,
+                            wide,
+                            window,
+                            overlap,
+                            per_step,
+                            best - cost,
+                        )
                     else:
                         to = lines_x[column + 1] - lines_x[column]
                         cost += cut_cost(
-                            heights, here + to, wide, there, sources[o[0], 2], window, overlap,
-                            per_step, best - cost,
-                        )  # fmt: skip
+                            heights,
+                            here + to,
+                            wide,
+                            there,
+                            sources[o[0], 2],
+                            window,
+                            overlap,
+                            per_step,
+                            best - cost,
+                        )
             if neighbours_y:
                 for side in range(2):
                     other = row - 1 + 2 * side
@@ -275,15 +319,29 @@ def choose_windows(
                     if side == 0:
                         to = lines_y[other + 1] - lines_y[other]
                         cost += cut_cost(
-                            turned, there + to, sources[o[0], 1], here_turned, high, window,
-                            overlap, per_step, best - cost,
-                        )  # fmt: skip
+                            turned,
+                            there + to,
+                            sources[o[0], 1],
+                            here_turned,
+                            high,
+                            window,
+                            overlap,
+                            per_step,
+                            best - cost,
+                        )
                     else:
                         to = lines_y[row + 1] - lines_y[row]
                         cost += cut_cost(
-                            turned, here_turned + to, high, there, sources[o[0], 1], window,
-                            overlap, per_step, best - cost,
-                        )  # fmt: skip
+                            turned,
+                            here_turned + to,
+                            high,
+                            there,
+                            sources[o[0], 1],
+                            window,
+                            overlap,
+                            per_step,
+                            best - cost,
+                        )
             if cost < best:
                 best = cost
                 first = own[k, 3] + y * (wide + 1) + x
@@ -302,9 +360,17 @@ def choose_windows(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cut_columns(
-    row: Any, cells: Any, lines_x: Any, wrap_x: Any, window: Any, overlap: Any, sources: Any,
-    heights: Any, per_step: Any, paths: Any,
-) -> None:  # fmt: skip
+    row: Any,
+    cells: Any,
+    lines_x: Any,
+    wrap_x: Any,
+    window: Any,
+    overlap: Any,
+    sources: Any,
+    heights: Any,
+    per_step: Any,
+    paths: Any,
+) -> None:
     """Cut between the windows of a row of cells.
 
     Parameters
@@ -327,9 +393,15 @@ def cut_columns(
         for y in range(window):
             down = 1 if y < window - 1 else 0
             _misfit_row(
-                heights, heights, from_a + y * wide_a, from_a + (y + down) * wide_a,
-                from_b + y * wide_b, from_b + (y + down) * wide_b, per_step, misfit[y],
-            )  # fmt: skip
+                heights,
+                heights,
+                from_a + y * wide_a,
+                from_a + (y + down) * wide_a,
+                from_b + y * wide_b,
+                from_b + (y + down) * wide_b,
+                per_step,
+                misfit[y],
+            )
         _cheapest_path(misfit, -1, -1, paths[row, column])
 
 
@@ -347,9 +419,16 @@ def _cell_of(line: Any, lines: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _place_in_row(
-    row: Any, y: Any, x: Any, cells: Any, lines_x: Any, wrap_x: Any, overlap: Any, sources: Any,
+    row: Any,
+    y: Any,
+    x: Any,
+    cells: Any,
+    lines_x: Any,
+    wrap_x: Any,
+    overlap: Any,
+    sources: Any,
     across: Any,
-) -> Any:  # fmt: skip
+) -> Any:
     """Return (cell's column, pixel in the sources or -1) that a row of cells shows at (y, x).
 
     ``y`` is the row within the windows, ``x`` within the map.
@@ -376,9 +455,21 @@ def _place_in_row(
 
 @njit(cache=True, nogil=True)
 def _band(
-    line: Any, first: Any, last: Any, cells: Any, lines_y: Any, lines_x: Any, wrap_x: Any,
-    overlap: Any, sources: Any, heights: Any, across: Any, upper: Any, lower: Any, known: Any,
-) -> None:  # fmt: skip
+    line: Any,
+    first: Any,
+    last: Any,
+    cells: Any,
+    lines_y: Any,
+    lines_x: Any,
+    wrap_x: Any,
+    overlap: Any,
+    sources: Any,
+    heights: Any,
+    across: Any,
+    upper: Any,
+    lower: Any,
+    known: Any,
+) -> None:
     """Write both rows of cells at a line between them, turned: (column of the map, place)."""
     ny = cells.shape[0]
     above = (line - 1) % ny
@@ -400,9 +491,18 @@ def _band(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cut_rows(
-    line: Any, cells: Any, lines_y: Any, lines_x: Any, wrap_x: Any, overlap: Any, sources: Any,
-    heights: Any, per_step: Any, across: Any, down: Any,
-) -> None:  # fmt: skip
+    line: Any,
+    cells: Any,
+    lines_y: Any,
+    lines_x: Any,
+    wrap_x: Any,
+    overlap: Any,
+    sources: Any,
+    heights: Any,
+    per_step: Any,
+    across: Any,
+    down: Any,
+) -> None:
     """Cut between the row of cells ``line`` and the one above it, cell by cell.
 
     Where two cells of a row meet, the cut passes through the cheapest place of that column, so
@@ -428,15 +528,33 @@ def cut_rows(
         reach = 3
         begin = lines_x[c] - reach
         _band(
-            line, begin, begin + 2 * reach + 2, cells, lines_y, lines_x, wrap_x, overlap, sources,
-            heights, across, upper, lower, known,
-        )  # fmt: skip
+            line,
+            begin,
+            begin + 2 * reach + 2,
+            cells,
+            lines_y,
+            lines_x,
+            wrap_x,
+            overlap,
+            sources,
+            heights,
+            across,
+            upper,
+            lower,
+            known,
+        )
         sums = np.zeros(overlap, np.float64)
         for i in range(2 * reach + 1):
             _misfit_row(
-                upper.reshape(-1), lower.reshape(-1), i * overlap, (i + 1) * overlap, i * overlap,
-                (i + 1) * overlap, per_step, misfit[i],
-            )  # fmt: skip
+                upper.reshape(-1),
+                lower.reshape(-1),
+                i * overlap,
+                (i + 1) * overlap,
+                i * overlap,
+                (i + 1) * overlap,
+                per_step,
+                misfit[i],
+            )
             for place in range(overlap):
                 sums[place] += misfit[i, place]
         gate = overlap // 2
@@ -450,23 +568,53 @@ def cut_rows(
         begin, end = lines_x[c], lines_x[c + 1]
         length = end - begin
         _band(
-            line, begin, end + 1, cells, lines_y, lines_x, wrap_x, overlap, sources, heights,
-            across, upper, lower, known,
-        )  # fmt: skip
+            line,
+            begin,
+            end + 1,
+            cells,
+            lines_y,
+            lines_x,
+            wrap_x,
+            overlap,
+            sources,
+            heights,
+            across,
+            upper,
+            lower,
+            known,
+        )
         for i in range(length):
             _misfit_row(
-                upper.reshape(-1), lower.reshape(-1), i * overlap, (i + 1) * overlap, i * overlap,
-                (i + 1) * overlap, per_step, misfit[i],
-            )  # fmt: skip
+                upper.reshape(-1),
+                lower.reshape(-1),
+                i * overlap,
+                (i + 1) * overlap,
+                i * overlap,
+                (i + 1) * overlap,
+                per_step,
+                misfit[i],
+            )
         _cheapest_path(misfit[:length], gates[c], gates[c + 1], down[line, begin:end])
 
 
 @njit(cache=True, nogil=True)
 def lay_down(
-    top: Any, left: Any, cells: Any, lines_y: Any, lines_x: Any, wrap_x: Any, wrap_y: Any,
-    overlap: Any, sources: Any, heights: Any, across: Any, down: Any, out: Any, labels: Any,
+    top: Any,
+    left: Any,
+    cells: Any,
+    lines_y: Any,
+    lines_x: Any,
+    wrap_x: Any,
+    wrap_y: Any,
+    overlap: Any,
+    sources: Any,
+    heights: Any,
+    across: Any,
+    down: Any,
+    out: Any,
+    labels: Any,
     pixels: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Write the windows' pixels of one tile.
 
     Parameters

@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.displacement_synthesis import kernels
 from model.displacement_synthesis.regions import interpolated
 from model.displacement_synthesis.sources import Sources, SynthesisError
-
-Float32Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 TILE_PX = 1024
 """Side of the tiles that steps are closed in; part of the result's definition."""
@@ -28,9 +25,9 @@ REACH = 8.0
 class CellGrid:
     """Where cells are on a map."""
 
-    lines_y: Integers
+    lines_y: Int64Array
     """(ny + 1,) rows at which cells begin, the last one the map's height."""
-    lines_x: Integers
+    lines_x: Int64Array
     """(nx + 1,) columns at which cells begin, the last one the map's width."""
     overlap: int
     """Pixels that neighbouring windows share, half of them on each side of a line."""
@@ -45,7 +42,7 @@ class SiteLayout:
     """What the patches of one site were laid out to."""
 
     sources: Sources
-    cells: Integers
+    cells: Int64Array
     """(ny, nx, 4): source, row and column of the window, filled pixels in it; source -2: none."""
     across: NDArray[np.int16]
     """(ny, nx, window): where each cell begins within what it shares with the one to the left."""
@@ -59,7 +56,7 @@ class Layout:
 
     grid: CellGrid
     sites: tuple[SiteLayout, ...]
-    weights: Floats | None
+    weights: Float64Array | None
     """(R, h, w) weights of sites on a coarse grid; None: one site everywhere."""
     range_px: float
     """Distance over which steps at cuts are spread, px."""
@@ -105,7 +102,7 @@ class Layout:
             ]
         return out
 
-    def at_cuts(self, rows: tuple[int, int], columns: tuple[int, int]) -> NDArray[np.bool_]:
+    def at_cuts(self, rows: tuple[int, int], columns: tuple[int, int]) -> BoolArray:
         """Return which pixels touch another window than their own, in any site that shows there.
 
         Parameters
@@ -158,15 +155,27 @@ class Layout:
 
     def _laid_down(
         self, site: SiteLayout, top: int, left: int, size: tuple[int, int]
-    ) -> tuple[Float32Array, Integers, Integers]:
+    ) -> tuple[Float32Array, Int64Array, Int64Array]:
         out = np.empty(size, np.float32)
         labels, pixels = np.empty(size, np.int64), np.empty(size, np.int64)
         grid = self.grid
         kernels.lay_down(
-            top, left, site.cells, grid.lines_y, grid.lines_x, grid.wrap[1], grid.wrap[0],
-            grid.overlap, site.sources.table, site.sources.heights, site.across, site.down,
-            out, labels, pixels,
-        )  # fmt: skip
+            top,
+            left,
+            site.cells,
+            grid.lines_y,
+            grid.lines_x,
+            grid.wrap[1],
+            grid.wrap[0],
+            grid.overlap,
+            site.sources.table,
+            site.sources.heights,
+            site.across,
+            site.down,
+            out,
+            labels,
+            pixels,
+        )
         return out, labels, pixels
 
     def _relief(self, site: SiteLayout, top: int, left: int, size: tuple[int, int]) -> Float32Array:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
+from model.arrays import Float64Array
 from model.displacement_synthesis.sources import SynthesisError
-
-Floats = NDArray[np.float64]
 
 
 def coarse_weights(
     regions: ArrayLike, count: int, shape: tuple[int, int], *, transition_px: float
-) -> Floats:
+) -> Float64Array:
     """Return the weight of each site on a grid no finer than a transition.
 
     Parameters
@@ -72,13 +71,13 @@ def coarse_weights(
 
 
 def interpolated(
-    weights: Floats,
+    weights: Float64Array,
     shape: tuple[int, int],
     rows: tuple[int, int],
     columns: tuple[int, int],
     *,
     wrap: tuple[bool, bool],
-) -> Floats:
+) -> Float64Array:
     """Return one site's weight over a part of a map, by cubic B-splines: two smooth derivatives.
 
     Parameters
@@ -97,7 +96,7 @@ def interpolated(
     return np.asarray(down @ weights @ right.T)
 
 
-def _splines(knots: int, size: int, part: tuple[int, int], wrap: bool) -> Floats:
+def _splines(knots: int, size: int, part: tuple[int, int], wrap: bool) -> Float64Array:
     """Return the weight of each knot (columns) at each pixel (rows); rows sum to 1."""
     place = (np.arange(*part) + 0.5) * knots / size - 0.5
     whole = np.floor(place).astype(np.int64)

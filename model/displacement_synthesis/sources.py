@@ -13,12 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-Float32Array = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array, Int64Array
 
 MAX_SOURCE_PX = 150_000_000
 """Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
@@ -89,7 +87,7 @@ def leveled(
 
 def _checked(
     height: ArrayLike, valid: ArrayLike | None, name: str
-) -> tuple[NDArray[np.float64], Bools]:
+) -> tuple[Float64Array, BoolArray]:
     values = np.asarray(height, np.float64)
     if values.ndim != 2 or min(values.shape) < 2:
         raise SynthesisError(f"{name}: got shape {values.shape}, expected (H, W)")
@@ -107,7 +105,7 @@ def _checked(
     return values, known
 
 
-def filled(height: NDArray[np.floating], known: Bools) -> Float32Array:
+def filled(height: FloatArray, known: BoolArray) -> Float32Array:
     """Return heights with each hole bridged by means of what surrounds it, the nearest first."""
     values = np.where(known, height, 0.0).astype(np.float64)
     weight = known.astype(np.float64)
@@ -126,16 +124,16 @@ def filled(height: NDArray[np.floating], known: Bools) -> Float32Array:
 class Sources:
     """All patches of a site at all scales, in one flat array."""
 
-    table: Integers
+    table: Int64Array
     """(S, 5): first pixel in ``heights``, height, width, first entry in ``filled``, first pixel in
     ``turned``."""
-    level_first: Integers
+    level_first: Int64Array
     """(L + 1,): sources of scale l begin at level_first[l]."""
     heights: Float32Array
     """(N,) heights, um."""
     turned: Float32Array
     """(N,) the same with each source transposed."""
-    filled: NDArray[np.int32]
+    filled: Int32Array
     """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a height of their
     own."""
 
@@ -209,7 +207,7 @@ def _scaled_shape(shape: tuple[int, ...], zoom: float) -> tuple[int, int]:
     return max(1, int(shape[0] * zoom + 1e-9)), max(1, int(shape[1] * zoom + 1e-9))
 
 
-def _scaled(height: Float32Array, known: Bools, zoom: float) -> tuple[Float32Array, Bools]:
+def _scaled(height: Float32Array, known: BoolArray, zoom: float) -> tuple[Float32Array, BoolArray]:
     """Return heights with ``zoom`` times the pixels a side, and which of them were filled."""
     if abs(zoom - 1.0) < 1e-9:
         return height, ~known

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from model.arrays import Float64Array
 
 CHUNK = 512
 """Points whose sums stay in the cache while all waves pass over them."""
@@ -60,11 +60,28 @@ def _sum_of_waves(points: Any, waves: Any, phases: Any, amplitude: Any, out: Any
                 s = q * q
                 total[i] += q * (
                     6.283185307179586
-                    + s * (-41.34170224039975 + s * (81.60524927607504 + s * (
-                        -76.70585975306136 + s * (42.05869394489765 + s * (
-                            -15.094642576822984 + s * (3.8199525848482803
-                            - s * 0.7181223017785001))))))
-                )  # fmt: skip
+                    + s
+                    * (
+                        -41.34170224039975
+                        + s
+                        * (
+                            81.60524927607504
+                            + s
+                            * (
+                                -76.70585975306136
+                                + s
+                                * (
+                                    42.05869394489765
+                                    + s
+                                    * (
+                                        -15.094642576822984
+                                        + s * (3.8199525848482803 - s * 0.7181223017785001)
+                                    )
+                                )
+                            )
+                        )
+                    )
+                )
         for i in range(count):
             out[begin + i] = amplitude * total[i]
 
@@ -73,9 +90,9 @@ def _sum_of_waves(points: Any, waves: Any, phases: Any, amplitude: Any, out: Any
 class VolumeNoise:
     """Noise of a stated spectrum and variance; see :meth:`draw`."""
 
-    waves_per_mm: Floats
+    waves_per_mm: Float64Array
     """(M, 3) wave vectors."""
-    phases: Floats
+    phases: Float64Array
     """(M,) phases, in turns."""
     rms_um: float
     """Root mean square over all space, um."""
@@ -153,7 +170,7 @@ class VolumeNoise:
             slope=float(slope),
         )
 
-    def at(self, points_mm: ArrayLike) -> Floats:
+    def at(self, points_mm: ArrayLike) -> Float64Array:
         """Return the noise at places.
 
         Parameters
@@ -182,7 +199,7 @@ class VolumeNoise:
         _sum_of_waves(flat, self.waves_per_mm, self.phases, amplitude, out.reshape(-1))
         return out
 
-    def covariance(self, distance_mm: ArrayLike) -> Floats:
+    def covariance(self, distance_mm: ArrayLike) -> Float64Array:
         """Return the covariance of the noise at two places, over all draws.
 
         Parameters

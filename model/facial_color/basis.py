@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array, FloatArray
 from model.facial_color import coarse_maps, deviation_ratio, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING
 from model.facial_color.disc_statistics import DiscStatistics
@@ -19,9 +20,6 @@ from model.facial_color.state_maps import (
     check_name,
 )
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 TRANSFERS = ("ratio", "difference", "absolute")
 _LINES = 256
 """Rows and columns that the size of a map's texture is taken from."""
@@ -32,7 +30,7 @@ def fitted(
     states: Mapping[str, ArrayLike],
     *,
     radius_px: float,
-    valid: Mask | Mapping[str, Mask] | None,
+    valid: BoolArray | Mapping[str, BoolArray] | None,
     stderr: Mapping[str, ArrayLike],
     global_states: Iterable[str] | None,
     stored_size: int | None,
@@ -56,11 +54,19 @@ def fitted(
     mean, _ = cells.coarsen(own.mean, held)
     made = {
         name: _state(
-            images[name], base, own, held, masks[name], errors[name], errors[NEUTRAL],
-            radius_px=radius_px, cells=cells, texture_px=texture_px,
+            images[name],
+            base,
+            own,
+            held,
+            masks[name],
+            errors[name],
+            errors[NEUTRAL],
+            radius_px=radius_px,
+            cells=cells,
+            texture_px=texture_px,
         )
         for name in states
-    }  # fmt: skip
+    }
     listed = [n for n in GLOBAL_STATES if n in states] if global_states is None else global_states
     return RigMaps(
         neutral=np.where(held, base, base.dtype.type(0)),
@@ -74,13 +80,13 @@ def fitted(
 
 
 def _state(
-    image: NDArray[np.floating],
-    neutral: NDArray[np.floating],
+    image: FloatArray,
+    neutral: FloatArray,
     own: DiscStatistics,
-    held: Mask,
-    mask: Mask,
-    error: Floats,
-    neutral_error: Floats,
+    held: BoolArray,
+    mask: BoolArray,
+    error: Float64Array,
+    neutral_error: Float64Array,
     *,
     radius_px: float,
     cells: coarse_maps.Cells,
@@ -92,9 +98,10 @@ def _state(
     rest = own if alike else disc_statistics.measure(neutral, radius_px, valid=both)
     seen = disc_statistics.measure(image, radius_px, valid=both)
     total = disc_statistics.measure(
-        np.where(both, image, 0).astype(np.float64) + np.where(both, neutral, 0), radius_px,
+        np.where(both, image, 0).astype(np.float64) + np.where(both, neutral, 0),
+        radius_px,
         valid=both,
-    )  # fmt: skip
+    )
     where = held & seen.valid
     covariance = 0.5 * (total.deviation**2 - seen.deviation**2 - rest.deviation**2)
     product = seen.deviation * rest.deviation
@@ -121,11 +128,14 @@ def _state(
     shared = _mean_in_disc(error, radius_px, both)
     bias_stderr = np.sqrt(misfit**2 / draws + shared**2)
     stored = {}
-    few: Mask = np.ones(cells.stored, np.bool_)
+    few: BoolArray = np.ones(cells.stored, np.bool_)
     for name, full in (
-        ("scale", s), ("bias", bias), ("scale_stderr", ratio.stderr),
-        ("bias_stderr", bias_stderr), ("misfit", misfit),
-    ):  # fmt: skip
+        ("scale", s),
+        ("bias", bias),
+        ("scale_stderr", ratio.stderr),
+        ("bias_stderr", bias_stderr),
+        ("misfit", misfit),
+    ):
         stored[name], few = cells.coarsen(full, where)
     exact = bias + s * (neutral - own.mean)
     mean, _ = cells.coarsen(own.mean, where)
@@ -140,14 +150,16 @@ def _state(
     )
 
 
-def _mean_in_disc(error: Floats, radius_px: float, valid: Mask) -> Floats:
+def _mean_in_disc(error: Float64Array, radius_px: float, valid: BoolArray) -> Float64Array:
     if not error.any():
         return np.zeros(error.shape)
     found = disc_statistics.measure(error.astype(np.float32), radius_px, valid=valid)
     return np.where(found.valid, found.mean, 0.0)
 
 
-def _deviation_variance(stats: DiscStatistics, error: DiscStatistics, draws: Floats) -> Floats:
+def _deviation_variance(
+    stats: DiscStatistics, error: DiscStatistics, draws: Float64Array
+) -> Float64Array:
     """Return the variance of a measured deviation from the errors of the pixels it is of.
 
     An error e of the pixels adds up to e^2 to the square of a deviation, and 2 sigma e/sqrt(n)
@@ -161,7 +173,7 @@ def _deviation_variance(stats: DiscStatistics, error: DiscStatistics, draws: Flo
     return np.minimum(own, sigma**2) + (ROUNDING * np.where(stats.valid, stats.mean, 0.0)) ** 2
 
 
-def texture_area_px(base: Floats, valid: Mask) -> float:
+def texture_area_px(base: Float64Array, valid: BoolArray) -> float:
     """Return the area over which a texture repeats itself, px: the sum of its squared correlation.
 
     A disc of n pixels knows a deviation as well as n/area independent ones. The correlation is
@@ -202,7 +214,7 @@ def transferred(
     rig: RigMaps,
     neutral: ArrayLike,
     *,
-    valid: Mask | None,
+    valid: BoolArray | None,
     stderr: ArrayLike | None,
     transfer: str,
 ) -> RigMaps:
@@ -242,9 +254,11 @@ def transferred(
             maps["misfit"] = maps["misfit"] * np.abs(per)
         made[name] = StateMaps(
             **{field: np.where(both, values, 0.0) for field, values in maps.items()},
-            valid=both, prior=state.prior, storage_rms=state.storage_rms,
+            valid=both,
+            prior=state.prior,
+            storage_rms=state.storage_rms,
             storage_largest=state.storage_largest,
-        )  # fmt: skip
+        )
     return RigMaps(
         neutral=np.where(held, base, base.dtype.type(0)),
         valid=held,
@@ -256,7 +270,9 @@ def transferred(
     )
 
 
-def _resampled(values: Floats, valid: Mask, shape: tuple[int, int]) -> tuple[Floats, Mask]:
+def _resampled(
+    values: Float64Array, valid: BoolArray, shape: tuple[int, int]
+) -> tuple[Float64Array, BoolArray]:
     """Return a stored map at another size, and where it holds something."""
     if values.shape == shape:
         return values, valid
@@ -271,9 +287,7 @@ def _resampled(values: Floats, valid: Mask, shape: tuple[int, int]) -> tuple[Flo
     return np.where(valid, values, 0.0), valid
 
 
-def _image(
-    name: str, image: ArrayLike, shape: tuple[int, ...] | None = None
-) -> NDArray[np.floating]:
+def _image(name: str, image: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
     values = np.asarray(image)
     if values.dtype != np.float32:
         values = values.astype(np.float64)
@@ -285,8 +299,8 @@ def _image(
 
 
 def _masks(
-    valid: Mask | Mapping[str, Mask] | None, images: Mapping[str, NDArray[np.floating]]
-) -> dict[str, Mask]:
+    valid: BoolArray | Mapping[str, BoolArray] | None, images: Mapping[str, FloatArray]
+) -> dict[str, BoolArray]:
     given = valid if isinstance(valid, Mapping) else dict.fromkeys(images, valid)
     for name in given:
         if name not in images:
@@ -307,8 +321,8 @@ def _masks(
 
 
 def _errors(
-    stderr: Mapping[str, ArrayLike], images: Mapping[str, NDArray[np.floating]]
-) -> dict[str, Floats]:
+    stderr: Mapping[str, ArrayLike], images: Mapping[str, FloatArray]
+) -> dict[str, Float64Array]:
     for name in stderr:
         if name not in images:
             raise FacialColorError(f"stderr: {name!r} is none of the maps {', '.join(images)}")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Mask = NDArray[np.bool_]
+from model.arrays import BoolArray, Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class BloodErrors:
 
 
 def compare(
-    predicted: ArrayLike, truth: ArrayLike, neutral: ArrayLike, *, valid: Mask | None = None
+    predicted: ArrayLike, truth: ArrayLike, neutral: ArrayLike, *, valid: BoolArray | None = None
 ) -> BloodErrors:
     """Compare a predicted state with its truth, and with two ways to do without a rig.
 
@@ -68,7 +68,7 @@ def compare(
     power = float(n @ n)
     gain = float(t @ n) / power if power > 0.0 else 1.0
 
-    def rms(error: NDArray[np.float64]) -> float:
+    def rms(error: Float64Array) -> float:
         return float(np.sqrt(np.mean(error**2)))
 
     return BloodErrors(rms(h - t), rms(n - t), rms(gain * n - t), gain, int(h.size))

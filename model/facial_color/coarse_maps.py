@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from model.arrays import BoolArray, Float64Array
 
 
 class CoarseMapError(ValueError):
@@ -36,7 +34,7 @@ class Cells:
             if not 1 <= few <= full:
                 raise CoarseMapError(f"stored: got {self.stored}, expected 1 to {self.shape}")
 
-    def coarsen(self, values: Floats, valid: Mask) -> tuple[Floats, Mask]:
+    def coarsen(self, values: Float64Array, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
         """Return the means of the cells (h, w), 0 where none is, and where there is one.
 
         Parameters
@@ -54,7 +52,7 @@ class Cells:
         held = weight > 1e-9
         return np.where(held, about + total / np.where(held, weight, 1.0), 0.0), held
 
-    def refine(self, *cells: Floats, valid: Mask) -> tuple[Floats, ...]:
+    def refine(self, *cells: Float64Array, valid: BoolArray) -> tuple[Float64Array, ...]:
         """Return small maps at the size of the map; NaN where no valid cell is near.
 
         Parameters

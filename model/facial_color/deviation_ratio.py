@@ -21,10 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from model.arrays import BoolArray, Float64Array
 
 ROUNDING = float(np.finfo(np.float32).eps)
 """Relative error below which no map is trusted: that of the float32 it is stored in."""
@@ -34,15 +32,17 @@ ROUNDING = float(np.finfo(np.float32).eps)
 class Ratio:
     """Estimated ratios, arrays of the shape of what they were estimated from."""
 
-    value: Floats
+    value: Float64Array
     """Posterior mean, finite everywhere."""
-    stderr: Floats
+    stderr: Float64Array
     """Posterior standard deviation, at most ``prior``."""
     prior: float
     """rho: what was expected before a place was looked at, and its standard deviation."""
 
 
-def estimate(numerator: Floats, denominator: Floats, variance: Floats, held: Mask) -> Ratio:
+def estimate(
+    numerator: Float64Array, denominator: Float64Array, variance: Float64Array, held: BoolArray
+) -> Ratio:
     """Estimate numerator / denominator under the prior that the map itself gives.
 
     Parameters
@@ -77,7 +77,7 @@ def estimate(numerator: Floats, denominator: Floats, variance: Floats, held: Mas
     return Ratio(value, np.where(held, prior * np.sqrt(known), prior), prior)
 
 
-def overall(numerator: Floats, denominator: Floats) -> float:
+def overall(numerator: Float64Array, denominator: Float64Array) -> float:
     """Return the least-squares ratio over a map.
 
     1 where the denominator is 0 everywhere: nothing says that anything should change.

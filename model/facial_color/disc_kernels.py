@@ -96,9 +96,16 @@ def _disc_row(
         if a < reach and y - a - 1 >= 0 and y + a + 1 < rows:
             v = half[a + 1]
             _add_runs(
-                t, p[y - a], p[y + a], p[y - a - 1], p[y + a + 1],
-                width - w, width + w + 1, width - v, width + v + 1,
-            )  # fmt: skip
+                t,
+                p[y - a],
+                p[y + a],
+                p[y - a - 1],
+                p[y + a + 1],
+                width - w,
+                width + w + 1,
+                width - v,
+                width + v + 1,
+            )
             a += 2
             continue
         if y - a >= 0:
@@ -177,9 +184,17 @@ def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _finish(
-    s1: Any, s2: Any, whole: Any, about: Any, trusted: Any, blur1: Any, blur2: Any, unit: Any,
-    mean: Any, deviation: Any,
-) -> Any:  # fmt: skip
+    s1: Any,
+    s2: Any,
+    whole: Any,
+    about: Any,
+    trusted: Any,
+    blur1: Any,
+    blur2: Any,
+    unit: Any,
+    mean: Any,
+    deviation: Any,
+) -> Any:
     """Write mean and deviation of a row of whole discs; return how many need another look."""
     doubtful = 0
     per = 1.0 / whole
@@ -262,10 +277,29 @@ def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: An
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tile(
-    h: Any, valid: Any, masked: Any, half: Any, high: Any, inner: Any, whole: Any, trusted: Any,
-    y0: Any, y1: Any, x0: Any, x1: Any, p: Any, q: Any, nothing: Any, sums: Any, v: Any,
-    down: Any, squares_of: Any, mean: Any, deviation: Any, count: Any,
-) -> None:  # fmt: skip
+    h: Any,
+    valid: Any,
+    masked: Any,
+    half: Any,
+    high: Any,
+    inner: Any,
+    whole: Any,
+    trusted: Any,
+    y0: Any,
+    y1: Any,
+    x0: Any,
+    x1: Any,
+    p: Any,
+    q: Any,
+    nothing: Any,
+    sums: Any,
+    v: Any,
+    down: Any,
+    squares_of: Any,
+    mean: Any,
+    deviation: Any,
+    count: Any,
+) -> None:
     """Do the work of `disc_moments` for rows y0 to y1 and columns x0 to x1.
 
     Parameters
@@ -355,9 +389,17 @@ def _tile(
         if not partial:
             count[y, x0:x1] = whole
             doubtful = _finish(
-                s1, s2, np.float64(whole), about, trusted, blur1, blur2, unit,
-                mean[y, x0:x1], deviation[y, x0:x1],
-            )  # fmt: skip
+                s1,
+                s2,
+                np.float64(whole),
+                about,
+                trusted,
+                blur1,
+                blur2,
+                unit,
+                mean[y, x0:x1],
+                deviation[y, x0:x1],
+            )
             if doubtful == 0:
                 continue
         constant, level = False, np.float64(0.0)  # whether the disc to the left is, and its value
@@ -388,9 +430,20 @@ def _tile(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def disc_moments(
-    h: Any, valid: Any, masked: Any, half: Any, high: Any, inner: Any, tall: Any, wide: Any,
-    parts: Any, trusted: Any, mean: Any, deviation: Any, count: Any,
-) -> None:  # fmt: skip
+    h: Any,
+    valid: Any,
+    masked: Any,
+    half: Any,
+    high: Any,
+    inner: Any,
+    tall: Any,
+    wide: Any,
+    parts: Any,
+    trusted: Any,
+    mean: Any,
+    deviation: Any,
+    count: Any,
+) -> None:
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
     A tile takes the mean of all that its discs can see as the value to sum about, and sums in
@@ -437,7 +490,26 @@ def disc_moments(
         for tile in range(part * across * down // parts, (part + 1) * across * down // parts):
             y0, x0 = (tile // across) * tall, (tile % across) * wide
             _tile(
-                h, valid, masked, half, high, inner, whole, trusted, y0, min(rows, y0 + tall), x0,
-                min(columns, x0 + wide), p, q, nothing, sums, v, down_columns, squares, mean,
-                deviation, count,
-            )  # fmt: skip
+                h,
+                valid,
+                masked,
+                half,
+                high,
+                inner,
+                whole,
+                trusted,
+                y0,
+                min(rows, y0 + tall),
+                x0,
+                min(columns, x0 + wide),
+                p,
+                q,
+                nothing,
+                sums,
+                v,
+                down_columns,
+                squares,
+                mean,
+                deviation,
+                count,
+            )

@@ -15,9 +15,8 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
+from model.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from model.facial_color import disc_kernels
-
-Floats = NDArray[np.float64]
 
 TRUSTED: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
 """Relative error of a variance by running sums, by the type of the map, above which a disc is
@@ -37,20 +36,20 @@ class DiscStatisticsError(ValueError):
 class DiscStatistics:
     """What lies in a disc about each pixel, arrays of shape (..., H, W)."""
 
-    mean: Floats
+    mean: Float64Array
     """Mean of the valid pixels; NaN where the disc holds none."""
-    deviation: Floats
+    deviation: Float64Array
     """Standard deviation of the valid pixels, with 1/n; NaN where the disc holds none."""
-    count: NDArray[np.int32]
+    count: Int32Array
     """Valid pixels in the disc."""
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> BoolArray:
         """Where the disc holds a valid pixel."""
         return np.asarray(self.count > 0)
 
 
-def half_widths(radius_px: float, rows: int, columns: int) -> NDArray[np.int64]:
+def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
     """Return the half-width of the disc at each distance of a row from its centre, px.
 
     A pixel belongs to the disc when its centre does: ``||u|| <= r``.
@@ -89,9 +88,7 @@ def _only_read(values: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def measure(
-    h: ArrayLike, radius_px: float, *, valid: NDArray[np.bool_] | None = None
-) -> DiscStatistics:
+def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -> DiscStatistics:
     """Measure mean, deviation and number of valid pixels in a disc about each pixel.
 
     Parameters
@@ -151,9 +148,18 @@ def measure(
     for at in np.ndindex(h.shape[:-2]):
         mask = nothing if valid is None else np.ascontiguousarray(valid[at])
         disc_kernels.disc_moments(
-            _only_read(np.ascontiguousarray(h[at])), _only_read(mask.view(np.uint8)),
-            valid is not None, half, high, inner,
-            64 if radius_px <= 32.0 else 128, _WIDE, 4 * get_num_threads(), TRUSTED[h.dtype],
-            mean[at], deviation[at], count[at],
-        )  # fmt: skip
+            _only_read(np.ascontiguousarray(h[at])),
+            _only_read(mask.view(np.uint8)),
+            valid is not None,
+            half,
+            high,
+            inner,
+            64 if radius_px <= 32.0 else 128,
+            _WIDE,
+            4 * get_num_threads(),
+            TRUSTED[h.dtype],
+            mean[at],
+            deviation[at],
+            count[at],
+        )
     return DiscStatistics(mean, deviation, count)

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
 from model.skin import UNITS, SkinMap
@@ -24,28 +24,39 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
     """Return a rig's maps by name, and its document."""
     maps = {
         "hemoglobin": SkinMap(
-            _single(rig.neutral), _BLOOD, _single(rig.neutral_stderr), rig.valid,
+            _single(rig.neutral),
+            _BLOOD,
+            _single(rig.neutral_stderr),
+            rig.valid,
             "neutral state; linear volume fraction",
         ),
         f"bias_{NEUTRAL}": SkinMap(
-            _single(rig.neutral_mean), _BLOOD, None, rig.neutral_mean_valid,
+            _single(rig.neutral_mean),
+            _BLOOD,
+            None,
+            rig.neutral_mean_valid,
             "mean of the neutral state in a disc",
         ),
-    }  # fmt: skip
+    }
     states: dict[str, Any] = {}
     for name, state in rig.states.items():
         maps[f"scale_{name}"] = SkinMap(
-            _single(state.scale), "1", _single(state.scale_stderr), state.valid,
+            _single(state.scale),
+            "1",
+            _single(state.scale_stderr),
+            state.valid,
             "deviation in a disc over that of the neutral state",
-        )  # fmt: skip
+        )
         maps[f"bias_{name}"] = SkinMap(
-            _single(state.bias), _BLOOD, _single(state.bias_stderr), state.valid,
-            "mean in a disc",
-        )  # fmt: skip
+            _single(state.bias), _BLOOD, _single(state.bias_stderr), state.valid, "mean in a disc"
+        )
         maps[f"misfit_{name}"] = SkinMap(
-            _single(state.misfit), _BLOOD, None, state.valid,
+            _single(state.misfit),
+            _BLOOD,
+            None,
+            state.valid,
             "deviation in a disc of the measured state from scale and bias",
-        )  # fmt: skip
+        )
         states[name] = {
             "prior": state.prior,
             "storage_rms": state.storage_rms,
@@ -121,21 +132,21 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     )
 
 
-def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
+def _single(values: FloatArray) -> Float32Array:
     return values.astype(np.float32)
 
 
-def _double(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _double(values: Float32Array, valid: BoolArray) -> Float64Array:
     return np.where(valid, values, 0.0).astype(np.float64)
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     if skin_map.valid is None:
         return np.ones(skin_map.values.shape, np.bool_)
     return skin_map.valid
 
 
-def _stderr(skin_map: SkinMap) -> NDArray[np.float32]:
+def _stderr(skin_map: SkinMap) -> Float32Array:
     if skin_map.stderr is None:
         return np.zeros(skin_map.values.shape, np.float32)
     return skin_map.stderr

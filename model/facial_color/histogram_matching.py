@@ -13,21 +13,19 @@ from typing import Any
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array
 from model.facial_color.disc_statistics import DiscStatisticsError, half_widths
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HistogramMatch:
     """A neutral map with the local histograms of another."""
 
-    hemoglobin: Floats
+    hemoglobin: Float64Array
     """(H, W), in the unit of the maps; NaN outside ``valid``."""
-    valid: Mask
+    valid: BoolArray
     """Where the neutral map is valid and the target has a valid pixel in a window."""
 
 
@@ -36,8 +34,8 @@ def match(
     target: ArrayLike,
     radius_px: float,
     *,
-    valid: Mask | None = None,
-    valid_target: Mask | None = None,
+    valid: BoolArray | None = None,
+    valid_target: BoolArray | None = None,
     spacing_px: int | None = None,
 ) -> HistogramMatch:
     """Match the histograms in discs about the nodes of a grid, blended bilinearly between them.
@@ -96,8 +94,8 @@ def match_sliding(
     target: ArrayLike,
     radius_px: float,
     *,
-    valid: Mask | None = None,
-    valid_target: Mask | None = None,
+    valid: BoolArray | None = None,
+    valid_target: BoolArray | None = None,
 ) -> HistogramMatch:
     """Match the histograms in the disc about every single pixel: exact, and O(r^2) a pixel.
 
@@ -117,8 +115,8 @@ def match_sliding(
 
 
 def _checked(
-    neutral: ArrayLike, target: ArrayLike, valid: Mask | None, valid_target: Mask | None
-) -> tuple[Floats, Floats, Mask, Mask]:
+    neutral: ArrayLike, target: ArrayLike, valid: BoolArray | None, valid_target: BoolArray | None
+) -> tuple[Float64Array, Float64Array, BoolArray, BoolArray]:
     # copies: compiled loops are declared for arrays that may be written
     a, b = (np.array(x, np.float64, order="C") for x in (neutral, target))
     if a.ndim != 2 or not a.size or b.shape != a.shape:
@@ -177,8 +175,10 @@ def _at_share(ordered: Any, share: Any) -> Any:
 @njit(
     "void(float64[:, ::1], float64[:, ::1], boolean[:, ::1], boolean[:, ::1], int64[::1], int64, "
     "int64, float64[:, ::1], float64[:, ::1])",
-    cache=True, parallel=True, error_model="numpy",
-)  # fmt: skip
+    cache=True,
+    parallel=True,
+    error_model="numpy",
+)
 def _match_windows(
     a: Any, b: Any, va: Any, vb: Any, half: Any, spacing: Any, parity: Any, total: Any, weight: Any
 ) -> None:
@@ -219,8 +219,10 @@ def _match_windows(
 @njit(
     "void(float64[:, ::1], float64[:, ::1], boolean[:, ::1], boolean[:, ::1], int64[::1], "
     "float64[:, ::1])",
-    cache=True, parallel=True, error_model="numpy",
-)  # fmt: skip
+    cache=True,
+    parallel=True,
+    error_model="numpy",
+)
 def _match_pixels(a: Any, b: Any, va: Any, vb: Any, half: Any, out: Any) -> None:
     """Write what each pixel's own window makes of it, NaN where it is not valid or empty.
 

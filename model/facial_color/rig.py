@@ -16,23 +16,16 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array, FloatArray
 from model.facial_color import basis, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING
-from model.facial_color.state_maps import (
-    NEUTRAL,
-    FacialColorError,
-    Floats,
-    Mask,
-    RigMaps,
-)
+from model.facial_color.state_maps import NEUTRAL, FacialColorError, RigMaps
 from model.tissue_optics.layers import C_HD_MAX
-
-Image = NDArray[np.floating[Any]]
 
 STORED_SIZE: Final = 256
 """Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
@@ -45,8 +38,8 @@ _SUM_ERROR = 1e-6
 
 
 def local_statistics(
-    h: ArrayLike, radius_px: float, *, valid: Mask | None = None
-) -> tuple[Image, Image]:
+    h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation of a map in a disc about each pixel, eq. (1).
 
     Parameters
@@ -88,13 +81,13 @@ def local_statistics(
 class HemoglobinBlend:
     """A face's blood in a mixture of states, arrays (H, W)."""
 
-    hemoglobin: Image
+    hemoglobin: FloatArray
     """Volume fraction within the limits; NaN outside ``valid``."""
-    valid: Mask
+    valid: BoolArray
     """Where the neutral map and all states of the mixture are known."""
     clipped_fraction: float
     """Part of the valid pixels that lay outside the limits."""
-    stderr: Image
+    stderr: FloatArray
     """Standard error: of neutral map, scales, biases, and of what eq. (6) leaves out. Stated
     errors of the maps are taken as shared by a disc, which is the worst case for a bias."""
 
@@ -110,7 +103,7 @@ class HemoglobinRig(RigMaps):
         states: Mapping[str, ArrayLike],
         *,
         radius_px: float,
-        valid: Mask | Mapping[str, Mask] | None = None,
+        valid: BoolArray | Mapping[str, BoolArray] | None = None,
         stderr: Mapping[str, ArrayLike] | None = None,
         global_states: Iterable[str] | None = None,
         stored_size: int | None = STORED_SIZE,
@@ -168,7 +161,7 @@ class HemoglobinRig(RigMaps):
         return cls(**{field.name: getattr(maps, field.name) for field in fields(RigMaps)})
 
     @property
-    def base(self) -> Floats:
+    def base(self) -> Float64Array:
         """H_0 of eq. (4), (H, W): neutral map less its stored mean; NaN outside ``valid``.
 
         Since the stored mean is taken off, not the exact one, the neutral state comes back
@@ -178,14 +171,14 @@ class HemoglobinRig(RigMaps):
         return np.where(self.valid, self.neutral - mean, np.nan)
 
     @property
-    def scale(self) -> Mapping[str, Floats]:
+    def scale(self) -> Mapping[str, Float64Array]:
         """Stored scale maps by name, (h, w); 1 for the neutral state."""
         return {NEUTRAL: np.ones_like(self.neutral_mean)} | {
             name: state.scale for name, state in self.states.items()
         }
 
     @property
-    def bias(self) -> Mapping[str, Floats]:
+    def bias(self) -> Mapping[str, Float64Array]:
         """Stored bias maps by name, (h, w), volume fraction."""
         return {NEUTRAL: self.neutral_mean} | {
             name: state.bias for name, state in self.states.items()
@@ -229,7 +222,7 @@ class HemoglobinRig(RigMaps):
             )
         return {name: float(weight) for name, weight in weights.items()}
 
-    def blend(self, weights: Mapping[str, float], *, normalize: bool = False) -> Image:
+    def blend(self, weights: Mapping[str, float], *, normalize: bool = False) -> FloatArray:
         """Return the map of `evaluate`, (H, W), without its mask and errors."""
         return self.evaluate(weights, normalize=normalize).hemoglobin
 
@@ -314,7 +307,7 @@ class HemoglobinRig(RigMaps):
         self,
         neutral: ArrayLike,
         *,
-        valid: Mask | None = None,
+        valid: BoolArray | None = None,
         stderr: ArrayLike | None = None,
         transfer: Literal["ratio", "difference", "absolute"] = "ratio",
     ) -> HemoglobinRig:

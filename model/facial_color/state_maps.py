@@ -6,19 +6,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from model.arrays import BoolArray, Float64Array, FloatArray
 from model.facial_color.coarse_maps import Cells
-
-Image = NDArray[np.floating[Any]]
-Floats = NDArray[np.float64]
-
-
-Mask = NDArray[np.bool_]
-
 
 NEUTRAL: Final = "neutral"
 
@@ -38,18 +31,18 @@ class FacialColorError(ValueError):
 class StateMaps:
     """One state as the rig stores it: arrays (h, w), 0 outside ``valid``."""
 
-    scale: Floats
+    scale: Float64Array
     """sigma_i/sigma_n under the prior, eq. (5)."""
-    bias: Floats
+    bias: Float64Array
     """mu_i, volume fraction."""
-    scale_stderr: Floats
+    scale_stderr: Float64Array
     """Standard error of the scale."""
-    bias_stderr: Floats
+    bias_stderr: Float64Array
     """Standard error of the bias, volume fraction."""
-    misfit: Floats
+    misfit: Float64Array
     """Deviation of the measured state from scale and bias of the neutral map, within a disc,
     volume fraction: what the state's own pattern, misalignment and noise leave."""
-    valid: Mask
+    valid: BoolArray
     """Cells that hold something."""
     prior: float
     """Scale that was expected before a place was looked at: sigma_i/sigma_n of the whole map; of
@@ -82,13 +75,13 @@ def check_name(name: str) -> None:
 class RigMaps:
     """Maps of a hemoglobin rig, as measured or transferred."""
 
-    neutral: Image
+    neutral: FloatArray
     """Volume fraction in the neutral state, (H, W), float32 or float64; 0 outside ``valid``."""
-    valid: Mask
+    valid: BoolArray
     """(H, W)."""
-    neutral_stderr: Image
+    neutral_stderr: FloatArray
     """Standard error of the neutral map, (H, W); 0 where none was stated."""
-    neutral_mean: Floats
+    neutral_mean: Float64Array
     """mu_n as stored, (h, w), volume fraction; bias of the neutral state."""
     states: Mapping[str, StateMaps]
     """By name, all but the neutral."""
@@ -124,6 +117,6 @@ class RigMaps:
         return Cells((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
 
     @property
-    def neutral_mean_valid(self) -> Mask:
+    def neutral_mean_valid(self) -> BoolArray:
         """Cells of ``neutral_mean`` that hold something, (h, w)."""
         return self.cells.coarsen(np.zeros(self.neutral.shape), self.valid)[1]

@@ -31,19 +31,25 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 from model.microstructure import convolution_kernels as kernels
 from model.microstructure.map_windows import Window
 
 __all__ = [
-    "MAX_SIGMA_PX", "Border", "ConvolutionError", "LineKernels", "Sampling", "Window", "convolve",
-    "convolve_tiled", "reach_of", "tiles_of",
-]  # fmt: skip
+    "MAX_SIGMA_PX",
+    "Border",
+    "ConvolutionError",
+    "LineKernels",
+    "Sampling",
+    "Window",
+    "convolve",
+    "convolve_tiled",
+    "reach_of",
+    "tiles_of",
+]
 
-Float32 = NDArray[np.float32]
-Floating = NDArray[np.floating[Any]]
-Bools = NDArray[np.bool_]
 Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
 
@@ -78,9 +84,9 @@ class LineKernels:
         Standard deviation along the axis, px, >= 0.
     """
 
-    axis: Float32
-    alpha: Float32
-    sigma_px: Float32
+    axis: Float32Array
+    alpha: Float32Array
+    sigma_px: Float32Array
 
     @classmethod
     def of(
@@ -101,7 +107,7 @@ class LineKernels:
     def part(self, window: Window) -> LineKernels:
         """Return the kernels of a window within this one."""
 
-        def cut(values: Float32) -> Float32:
+        def cut(values: Float32Array) -> Float32Array:
             if values.shape[:2] == (1, 1):
                 return values
             return np.ascontiguousarray(values[window.rows, window.columns])
@@ -109,7 +115,7 @@ class LineKernels:
         return LineKernels(cut(self.axis), cut(self.alpha), cut(self.sigma_px))
 
 
-def _field(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float32:
+def _field(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float32Array:
     given = np.asarray(values, np.float32)
     if given.shape == shape:
         return np.ascontiguousarray(given)
@@ -143,9 +149,9 @@ def _settings(sampling: str, border: str) -> None:
         raise ConvolutionError(f'border: got {border!r}, expected "mirror" or "open"')
 
 
-def _usable(height: Floating, valid: ArrayLike | None) -> NDArray[np.uint8]:
+def _usable(height: FloatArray, valid: ArrayLike | None) -> UInt8Array:
     """Return distances to pixels that are not valid, empty where there are none."""
-    good: Bools = np.isfinite(height)
+    good: BoolArray = np.isfinite(height)
     if valid is not None:
         mask = np.asarray(valid)
         if mask.shape != height.shape or mask.dtype != np.bool_:
@@ -159,26 +165,33 @@ def _usable(height: Floating, valid: ArrayLike | None) -> NDArray[np.uint8]:
 
 
 def _pass(
-    source: Floating,
+    source: FloatArray,
     source_window: Window,
-    clear: NDArray[np.uint8],
+    clear: UInt8Array,
     lines: LineKernels,
     window: Window,
     shape: tuple[int, int],
     sampling: Sampling,
     border: Border,
-) -> Floating:
+) -> FloatArray:
     """Return one pass in a window of the map."""
     if lines.nothing:
         inner = window.within(source_window)
         return source[inner.rows, inner.columns]
     out = np.empty(window.shape, source.dtype)
     kernels.along_lines(
-        source, clear,
-        np.array([source_window.top, source_window.left]), np.array(shape),
-        lines.axis, lines.alpha, lines.sigma_px, np.array([window.top, window.left]),
-        _REACH[sampling], _BORDER[border], out,
-    )  # fmt: skip
+        source,
+        clear,
+        np.array([source_window.top, source_window.left]),
+        np.array(shape),
+        lines.axis,
+        lines.alpha,
+        lines.sigma_px,
+        np.array([window.top, window.left]),
+        _REACH[sampling],
+        _BORDER[border],
+        out,
+    )
     return out
 
 
@@ -194,7 +207,7 @@ def convolve(
     valid: ArrayLike | None = None,
     sampling: Sampling = "cubic",
     border: Border = "mirror",
-) -> Floating:
+) -> FloatArray:
     """Convolve a map along two axes in turn, with kernels that vary from pixel to pixel.
 
     Parameters
@@ -242,13 +255,13 @@ def convolve(
     for lines in (first, second):
         reach_of(lines, shape, sampling)
     single = given.dtype in (np.float16, np.float32)
-    source: Floating = np.ascontiguousarray(given, np.float32 if single else np.float64)
+    source: FloatArray = np.ascontiguousarray(given, np.float32 if single else np.float64)
     mask = _mask(valid, source.shape)
     if first.nothing and second.nothing:
         return source.copy()
     whole = Window(0, shape[0], 0, shape[1])
 
-    def convolved(at: tuple[int, ...]) -> Floating:
+    def convolved(at: tuple[int, ...]) -> FloatArray:
         clear = _usable(source[at], None if mask is None else mask[at])
         along_s = _pass(source[at], whole, clear, first, whole, shape, sampling, border)
         return _pass(along_s, whole, clear, second, whole, shape, sampling, border)
@@ -261,7 +274,7 @@ def convolve(
     return out
 
 
-def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
     """Return the mask of a stack of maps, given for each map or for all."""
     if valid is None:
         return None
@@ -294,7 +307,7 @@ def convolve_tiled(
     fields_at: Callable[[Window], tuple[LineKernels, LineKernels]],
     *,
     tile: int = 2048,
-    valid_at: Callable[[Window], Bools] | None = None,
+    valid_at: Callable[[Window], BoolArray] | None = None,
     sampling: Sampling = "cubic",
     border: Border = "mirror",
     finished: Collection[int] = (),

@@ -316,10 +316,19 @@ def along_lines(
                             dx, dy = side * i * ax, side * i * ay
                             bx, by = math.floor(dx), math.floor(dy)
                             value, there = _slow_sample(
-                                source, clear, top, left, rows, columns, border,
-                                gy + int(by), gx + int(bx),
-                                kind(dy - by), kind(dx - bx), finer,
-                            )  # fmt: skip
+                                source,
+                                clear,
+                                top,
+                                left,
+                                rows,
+                                columns,
+                                border,
+                                gy + int(by),
+                                gx + int(bx),
+                                kind(dy - by),
+                                kind(dx - bx),
+                                finer,
+                            )
                             pair += value
                             good = good and there
                         if good:

@@ -24,8 +24,9 @@ from importlib import resources
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array
 from model.microstructure.convolution import ConvolutionError, convolve, convolve_tiled
 from model.microstructure.convolution_kernels import TRUNCATE
 from model.microstructure.mesh_strain import MeshStrain, StrainError, strain
@@ -49,7 +50,6 @@ __all__ = [
     "strain",
 ]
 
-Floats: TypeAlias = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]
 """Slope and intercept of a line over the stretch ratio."""
 
@@ -66,7 +66,7 @@ class KernelTableError(ValueError):
     """A table of kernels that contradicts itself, or a stretch that it does not reach."""
 
 
-def gaussian_weights(sigma_px: float) -> Floats:
+def gaussian_weights(sigma_px: float) -> Float64Array:
     """Return the right half of the normalised discrete Gaussian, its centre first.
 
     The continuous Gaussian at whole pixels up to ``TRUNCATE`` sigmas, divided by its sum. Far
@@ -149,8 +149,10 @@ class KernelTable:
                 raise KernelTableError(f"alpha_lines: lines {number} and {number + 1} do not meet")
         if abs(self.unlimited_alpha(np.array([1.0]))[0]) > 1e-9:
             raise KernelTableError("alpha_lines: got alpha(1) != 0, expected the neutral kernel")
-        ends = {"sigma_compression_um": (low, min(high, 1.0)),
-                "sigma_stretch_um": (max(low, 1.0), high)}  # fmt: skip
+        ends = {
+            "sigma_compression_um": (low, min(high, 1.0)),
+            "sigma_stretch_um": (max(low, 1.0), high),
+        }
         for name, (first, last) in ends.items():
             line = getattr(self, name)
             if line is None:
@@ -162,7 +164,7 @@ class KernelTable:
             if first <= last and not (m * first + c > 0 and m * last + c > 0):
                 raise KernelTableError(f"{name}: got sigma <= 0 um within {first:g}...{last:g}")
 
-    def unlimited_alpha(self, r: Floats) -> Floats:
+    def unlimited_alpha(self, r: Float64Array) -> Float64Array:
         """Return the lines of alpha at stretch ratios r, not held within `ALPHA_LIMITS`."""
         line = (
             np.searchsorted(self.alpha_breaks, r) if self.alpha_breaks else np.zeros(r.shape, int)
@@ -184,7 +186,7 @@ class KernelTable:
             raise KernelTableError("table: got no line for sigma")
         return below, above
 
-    def inside(self, stretch: ArrayLike) -> NDArray[np.bool_]:
+    def inside(self, stretch: ArrayLike) -> BoolArray:
         """Return whether each stretch ratio lies in the fitted range."""
         r = np.asarray(stretch, np.float64)
         return (r >= self.stretch_range[0]) & (r <= self.stretch_range[1])
@@ -272,7 +274,7 @@ def kernel_parameters(
     table: KernelTable = FOREHEAD,
     *,
     extrapolate: Literal["hold", "formula", "refuse"] = "hold",
-) -> tuple[Floats, Floats]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the kernel that a stretch ratio asks for.
 
     Parameters

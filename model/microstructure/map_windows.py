@@ -32,13 +32,17 @@ class Window:
     def grown(self, by: int, shape: tuple[int, int]) -> Window:
         """Return the window with a margin, as far as the map goes."""
         return Window(
-            max(self.top - by, 0), min(self.bottom + by, shape[0]),
-            max(self.left - by, 0), min(self.right + by, shape[1]),
-        )  # fmt: skip
+            max(self.top - by, 0),
+            min(self.bottom + by, shape[0]),
+            max(self.left - by, 0),
+            min(self.right + by, shape[1]),
+        )
 
     def within(self, other: Window) -> Window:
         """Return the window counted from another's first pixel."""
         return Window(
-            self.top - other.top, self.bottom - other.top,
-            self.left - other.left, self.right - other.left,
-        )  # fmt: skip
+            self.top - other.top,
+            self.bottom - other.top,
+            self.left - other.left,
+            self.right - other.left,
+        )

@@ -30,12 +30,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array, Int64Array
 from model.microstructure import strain_kernels as kernels
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 class StrainError(ValueError):
@@ -74,23 +72,23 @@ class MeshStrain:
         Of the triangles: on the texture's other side than most around one of their vertices.
     """
 
-    r_s: Floats
-    r_t: Floats
-    axis_s: Floats
-    axis_t: Floats
-    uv_per_mm_s: Floats
-    uv_per_mm_t: Floats
-    isotropic: Bools
-    valid: Bools
-    tensor: Floats
-    uv_metric: Floats
-    place: NDArray[np.int64]
+    r_s: Float64Array
+    r_t: Float64Array
+    axis_s: Float64Array
+    axis_t: Float64Array
+    uv_per_mm_s: Float64Array
+    uv_per_mm_t: Float64Array
+    isotropic: BoolArray
+    valid: BoolArray
+    tensor: Float64Array
+    uv_metric: Float64Array
+    place: Int64Array
     degenerate_share: float
     uv_degenerate_share: float
     uv_turned_share: float
 
 
-def _numbers(name: str, values: ArrayLike, columns: int) -> Floats:
+def _numbers(name: str, values: ArrayLike, columns: int) -> Float64Array:
     given = np.ascontiguousarray(values, np.float64)
     if given.ndim != 2 or given.shape[1] != columns:
         raise StrainError(f"{name}: got shape {given.shape}, expected (V, {columns})")
@@ -99,7 +97,7 @@ def _numbers(name: str, values: ArrayLike, columns: int) -> Floats:
     return given
 
 
-def places_of(*positions: Floats) -> NDArray[np.int64]:
+def places_of(*positions: Float64Array) -> Int64Array:
     """Give vertices at the same positions, in every array, the same number.
 
     Parameters
@@ -183,11 +181,18 @@ def strain(
     ]
     share = np.bincount(triangle[0], minlength=4) / max(len(triangles), 1)
     return MeshStrain(
-        r_s=stretch[:, 0], r_t=stretch[:, 1],
-        axis_s=axes[0], axis_t=axes[1],
-        uv_per_mm_s=lengths[0], uv_per_mm_t=lengths[1],
-        isotropic=even, valid=valid, tensor=tensor, uv_metric=metric, place=place,
+        r_s=stretch[:, 0],
+        r_t=stretch[:, 1],
+        axis_s=axes[0],
+        axis_t=axes[1],
+        uv_per_mm_s=lengths[0],
+        uv_per_mm_t=lengths[1],
+        isotropic=even,
+        valid=valid,
+        tensor=tensor,
+        uv_metric=metric,
+        place=place,
         degenerate_share=float(share[kernels.DEGENERATE]),
         uv_degenerate_share=float(share[kernels.NO_TEXTURE]),
         uv_turned_share=float(share[kernels.TURNED]),
-    )  # fmt: skip
+    )

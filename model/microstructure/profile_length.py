@@ -22,13 +22,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 from scipy.optimize import brentq
 
+from model.arrays import Float64Array
 from model.microstructure.kernel_table import ALPHA_LIMITS, gaussian_weights
-
-Floats = NDArray[np.float64]
 
 FARTHEST_ALPHA = 1e3
 """Strengths beyond this are not sought: the profile has nothing at sigma's scale to sharpen."""
@@ -38,7 +37,7 @@ class ProfileError(ValueError):
     """A profile, a stretch or a kernel that no length can be told of."""
 
 
-def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Floats:
+def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Float64Array:
     """Return the length of the polygon through a profile's heights.
 
     Parameters
@@ -66,7 +65,7 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Floats:
     return np.asarray(np.hypot(np.diff(height, axis=-1), spacing_um).sum(axis=-1))
 
 
-def _heights(height_um: ArrayLike, spacing_um: float) -> Floats:
+def _heights(height_um: ArrayLike, spacing_um: float) -> Float64Array:
     height = np.asarray(height_um, np.float64)
     if height.ndim < 1 or height.shape[-1] < 2 or not np.isfinite(height).all():
         raise ProfileError(
@@ -77,7 +76,9 @@ def _heights(height_um: ArrayLike, spacing_um: float) -> Floats:
     return height
 
 
-def convolved(height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um: float) -> Floats:
+def convolved(
+    height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um: float
+) -> Float64Array:
     """Return profiles convolved with a kernel of eq. (6), mirrored at their ends.
 
     Parameters
@@ -102,7 +103,7 @@ def convolved(height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um
     return height + alpha * _change(height, sigma_um, spacing_um)
 
 
-def _change(height: Floats, sigma_um: float, spacing_um: float) -> Floats:
+def _change(height: Float64Array, sigma_um: float, spacing_um: float) -> Float64Array:
     """Return the blurred profile less itself: what one of alpha adds."""
     if not (math.isfinite(sigma_um) and sigma_um > 0):
         raise ProfileError(f"sigma_um: got {sigma_um}, expected a finite number above 0")
@@ -182,7 +183,7 @@ def length_change(
     )
 
 
-def _profile(height_um: ArrayLike, spacing_um: float, stretch: float) -> Floats:
+def _profile(height_um: ArrayLike, spacing_um: float, stretch: float) -> Float64Array:
     height = np.asarray(height_um, np.float64)
     if height.ndim != 1:
         raise ProfileError(f"height_um: got shape {height.shape}, expected (N,)")

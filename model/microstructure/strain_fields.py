@@ -14,14 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.arrays import BoolArray, Float32Array, FloatArray
 from model.microstructure import strain_kernels as kernels
 from model.microstructure.convolution import LineKernels
 from model.microstructure.kernel_table import ALPHA_LIMITS, FOREHEAD, KernelTable
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, StrainError
-
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 PAD_PX = 4
 """Pixels around islands that carry on their values, for samples between pixels."""
@@ -43,11 +41,11 @@ class TextureStrain:
         Centres that lie in a triangle, and those nearby that carry on its values.
     """
 
-    stretch: Float32
-    axes: Float32
-    px_per_mm: Float32
-    covered: Bools
-    padded: Bools
+    stretch: Float32Array
+    axes: Float32Array
+    px_per_mm: Float32Array
+    covered: BoolArray
+    padded: BoolArray
 
 
 def rasterize(
@@ -95,10 +93,20 @@ def rasterize(
     axes = np.zeros((*shape, 2, 2), np.float32)
     scale = np.zeros((*shape, 2), np.float32)
     kernels.fill_texture(
-        triangles, texture[:, 0] * width - 0.5, (1.0 - texture[:, 1]) * height - 0.5,
-        np.concatenate([strain.tensor, strain.uv_metric], axis=1), strain.valid,
-        around.top, around.left, float(width), float(height), state, stretch, axes, scale,
-    )  # fmt: skip
+        triangles,
+        texture[:, 0] * width - 0.5,
+        (1.0 - texture[:, 1]) * height - 0.5,
+        np.concatenate([strain.tensor, strain.uv_metric], axis=1),
+        strain.valid,
+        around.top,
+        around.left,
+        float(width),
+        float(height),
+        state,
+        stretch,
+        axes,
+        scale,
+    )
     for _ in range(pad_px):
         kernels.pad_once(state, state.copy(), stretch, axes, scale)
     inner = asked.within(around)
@@ -127,7 +135,7 @@ class KernelRegions:
     """
 
     tables: tuple[KernelTable, ...]
-    weights: NDArray[np.floating]
+    weights: FloatArray
 
     def __post_init__(self) -> None:
         """Refuse weights that do not fit the tables."""
@@ -138,7 +146,7 @@ class KernelRegions:
         if not (np.isfinite(self.weights).all() and (self.weights >= 0).all()):
             raise StrainError("weights: got NaN, infinity or a number below 0")
 
-    def shares_at(self, u: NDArray[np.floating], v: NDArray[np.floating]) -> Float32:
+    def shares_at(self, u: FloatArray, v: FloatArray) -> Float32Array:
         """Return shares at rows of v and columns of u, shape (N, len(v), len(u))."""
         _, height, width = self.weights.shape
         y0, y1, fy = _between((1.0 - np.asarray(v)) * height - 0.5, height)
@@ -150,7 +158,7 @@ class KernelRegions:
         found[0, total == 0.0] = 1.0
         return np.asarray(found / np.where(total > 0.0, total, 1.0), np.float32)
 
-    def table_at(self, uv: NDArray[np.floating]) -> NDArray[np.intp]:
+    def table_at(self, uv: FloatArray) -> NDArray[np.intp]:
         """Return the number of the table with the largest share at points, shape (V, 2)."""
         _, height, width = self.weights.shape
         y = np.clip(np.rint((1.0 - uv[:, 1]) * height - 0.5), 0, height - 1).astype(np.intp)
@@ -158,9 +166,7 @@ class KernelRegions:
         return np.asarray(np.argmax(self.weights[:, y, x], axis=0))
 
 
-def _between(
-    at: NDArray[np.floating], count: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Float32]:
+def _between(at: FloatArray, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Float32Array]:
     """Return the pixels before and after places, and how far between them they are."""
     held = np.clip(at, 0.0, count - 1.0)
     first = np.minimum(np.floor(held).astype(np.intp), max(count - 2, 0))
@@ -233,11 +239,17 @@ def line_kernels(
     alpha, sigma = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
     ends = table.stretch_range if extrapolate == "hold" else (0.0, math.inf)
     kernels.look_up(
-        strain.stretch, (strain.covered | strain.padded).astype(np.uint8),
-        np.asarray(table.alpha_breaks, np.float64), np.asarray(table.alpha_lines, np.float64),
-        1e-3 * np.asarray(table.sigma_lines_um(), np.float64), np.asarray(ends, np.float64),
-        np.asarray(ALPHA_LIMITS, np.float64), strain.px_per_mm, alpha, sigma,
-    )  # fmt: skip
+        strain.stretch,
+        (strain.covered | strain.padded).astype(np.uint8),
+        np.asarray(table.alpha_breaks, np.float64),
+        np.asarray(table.alpha_lines, np.float64),
+        1e-3 * np.asarray(table.sigma_lines_um(), np.float64),
+        np.asarray(ends, np.float64),
+        np.asarray(ALPHA_LIMITS, np.float64),
+        strain.px_per_mm,
+        alpha,
+        sigma,
+    )
     first, second = (
         LineKernels(np.ascontiguousarray(strain.axes[:, :, axis]), alpha[axis], sigma[axis])
         for axis in range(2)

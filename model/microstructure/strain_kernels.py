@@ -24,11 +24,7 @@ EMPTY, COVERED, PADDED = range(3)
 
 @njit(inline="always")
 def _cross(a, b):  # type: ignore[no-untyped-def]
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @njit(inline="always")
@@ -38,11 +34,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _edge(points, i, j):  # type: ignore[no-untyped-def]
-    return (
-        points[j, 0] - points[i, 0],
-        points[j, 1] - points[i, 1],
-        points[j, 2] - points[i, 2],
-    )
+    return (points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2])
 
 
 @njit(inline="always")
@@ -307,9 +299,20 @@ def vertex_strain(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def fill_texture(
-    faces: Any, x: Any, y: Any, values: Any, valid: Any, top: Any, left: Any,
-    width: Any, height: Any, state: Any, stretch: Any, axes: Any, scale: Any,
-) -> None:  # fmt: skip
+    faces: Any,
+    x: Any,
+    y: Any,
+    values: Any,
+    valid: Any,
+    top: Any,
+    left: Any,
+    width: Any,
+    height: Any,
+    state: Any,
+    stretch: Any,
+    axes: Any,
+    scale: Any,
+) -> None:
     """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
 
     The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
@@ -432,9 +435,17 @@ def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> No
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def look_up(
-    stretch: Any, state: Any, breaks: Any, alpha_lines: Any, sigma_lines: Any, ends: Any,
-    limits: Any, scale: Any, alpha: Any, sigma: Any,
-) -> None:  # fmt: skip
+    stretch: Any,
+    state: Any,
+    breaks: Any,
+    alpha_lines: Any,
+    sigma_lines: Any,
+    ends: Any,
+    limits: Any,
+    scale: Any,
+    alpha: Any,
+    sigma: Any,
+) -> None:
     """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
 
     Parameters

@@ -10,9 +10,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array, Int64Array
 
 _POINT = 1e-6  # cores below this part of the largest length are points
 _NEAR, _FAR = 3.0, 10.0  # centre distances over the sum of core radii at which fewer nodes do
@@ -23,7 +22,7 @@ _RINGS, _ANGLES = 48, 96
 @lru_cache(maxsize=4096)
 def distance_rule(
     radius_mm: float, core_mm: float, source_core_mm: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return distances and weights that average a radial profile over two cores.
 
     Parameters
@@ -78,8 +77,8 @@ def distance_rule(
 
 
 def distance_rules(
-    radii_mm: FloatArray, core_mm: float, source_core_mm: float
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    radii_mm: Float64Array, core_mm: float, source_core_mm: float
+) -> tuple[Int64Array, Float64Array, Float64Array]:
     """Return the rules of several radii after one another, as compiled loops take them.
 
     Parameters
@@ -117,7 +116,7 @@ def distance_rules(
     return starts, np.log(node), weight
 
 
-def _offsets(a: float, b: float) -> tuple[FloatArray, FloatArray]:
+def _offsets(a: float, b: float) -> tuple[Float64Array, Float64Array]:
     """Return the distribution of the length of the difference of points in concentric discs."""
     small, large = min(a, b), max(a, b)
     node, weight = np.polynomial.legendre.leggauss(_RINGS)
@@ -137,7 +136,7 @@ def _offsets(a: float, b: float) -> tuple[FloatArray, FloatArray]:
     return s[keep], (density * ds)[keep]
 
 
-def _shared_area(s: FloatArray, small: float, large: float) -> FloatArray:
+def _shared_area(s: Float64Array, small: float, large: float) -> Float64Array:
     """Return the area that two discs share whose centres are `s` apart."""
     square = (small + large - s) * (s + small - large) * (s - small + large) * (s + small + large)
     kite = np.sqrt(np.maximum(square, 0.0))
@@ -152,7 +151,7 @@ def _shared_area(s: FloatArray, small: float, large: float) -> FloatArray:
     )
 
 
-def _gauss(x: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+def _gauss(x: Float64Array, weight: Float64Array, count: int) -> tuple[Float64Array, Float64Array]:
     """Return the Gauss rule of a discrete measure by Stieltjes' recurrence (Golub, Welsch)."""
     total = weight.sum()
     diagonal, off = np.empty(count), np.empty(count)

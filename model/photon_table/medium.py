@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 
+from model.arrays import Float64Array
 from model.photon_table import kernels
 
-FloatArray = NDArray[np.float64]
 Collection = Literal["all", "fibre"]
 
 _MOMENTS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
@@ -30,11 +30,11 @@ class TableDomainError(ValueError):
 class Medium:
     """One (eta, g, collection) of the table, ready for `model.photon_table.kernels.evaluate`."""
 
-    coefficients: FloatArray
+    coefficients: Float64Array
     """B-spline coefficients of ln of the reduced reflectance, shape (radii, roots)."""
-    decay: FloatArray
+    decay: Float64Array
     """B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (roots,)."""
-    log_error: FloatArray
+    log_error: Float64Array
     """ln of the relative standard error at every other knot, shape (radii/2, roots/2)."""
 
 
@@ -76,7 +76,7 @@ def prepare(eta: float, g: float, collection: Collection) -> Medium:
     return medium
 
 
-def decay_coefficients(g: float) -> FloatArray:
+def decay_coefficients(g: float) -> Float64Array:
     """Return the B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (ROOT_COUNT,)."""
     root = kernels.ROOT_SCALE * np.expm1(kernels.ROOT_STEP * np.arange(kernels.ROOT_COUNT - 2))
     ratio = np.array([np.sqrt(3.0), *(asymptotic_decay(u * u, g) / u for u in root[1:])])
@@ -124,7 +124,7 @@ def asymptotic_decay(absorption_ratio: float, g: float) -> float:
     return float(1.0 / largest[0])
 
 
-def root_spline_matrix() -> FloatArray:
+def root_spline_matrix() -> Float64Array:
     """Return what makes B-spline coefficients over the roots from values at the knots and two 0s.
 
     The last two rows: no slope at sigma_a = 0 (reflectance is even in the root up to its cube),
@@ -146,7 +146,7 @@ def _stored() -> dict[str, NDArray[np.generic]]:
             return {name: arrays[name] for name in arrays.files}
 
 
-def _lagrange(name: str, nodes: NDArray[np.generic], value: float) -> FloatArray:
+def _lagrange(name: str, nodes: NDArray[np.generic], value: float) -> Float64Array:
     """Return the weights of the (up to) four nearest nodes for cubic interpolation."""
     x = nodes.astype(np.float64)
     if not x[0] - 1e-9 <= value <= x[-1] + 1e-9:

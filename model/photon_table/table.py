@@ -15,15 +15,14 @@ far away. tools/make_photon_table.py makes model/data/photon_table.npz and says 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
+from model.arrays import BoolArray, Float64Array
 from model.dipole.kienle_patterson import Slopes
 from model.photon_table import kernels
 from model.photon_table.disc_distances import distance_rules
 from model.photon_table.medium import Collection, TableDomainError, asymmetries, prepare
-
-FloatArray = NDArray[np.float64]
 
 __all__ = [
     "Slopes",
@@ -58,7 +57,7 @@ def reflectance(
     collection: Collection = "all",
     core_mm: float = 0.0,
     source_core_mm: float = 0.0,
-) -> FloatArray:
+) -> Float64Array:
     """Return the reflectance per area at a distance from the source.
 
     Parameters
@@ -192,7 +191,7 @@ def by_asymmetry(
     core_mm: float = 0.0,
     source_core_mm: float = 0.0,
     step: float = 0.05,
-) -> FloatArray:
+) -> Float64Array:
     """Return dR/dg, 1/mm^2, at constant sigma_s': a difference over 2 `step` (one-sided at ends).
 
     Other parameters and errors as :func:`reflectance`.
@@ -229,7 +228,7 @@ def relative_error(
     eta: float = 1.4,
     g: float = 0.8,
     collection: Collection = "all",
-) -> FloatArray:
+) -> Float64Array:
     """Return the standard error of the table itself over its value, broadcast.
 
     From the scatter of independent batches of photons; infinite outside the table and where no
@@ -267,7 +266,7 @@ def domain(
     eta: float = 1.4,
     g: float = 0.8,
     collection: Collection = "all",
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return where the table holds: r sigma_s', sigma_a/sigma_s' in range and its error <= 3 %.
 
     Examples
@@ -288,7 +287,7 @@ def domain(
     )
 
 
-def _not_negative(name: str, value: ArrayLike) -> FloatArray:
+def _not_negative(name: str, value: ArrayLike) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
     # only the ratio of absorption to scattering counts, and what is black beyond its range is 0
     most = np.finfo(np.float64).max if name == "sigma_a_per_mm" else LARGEST

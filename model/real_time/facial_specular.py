@@ -13,17 +13,16 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import Float64Array
 from model.brdf.microfacet import facet_density
-
-FloatArray = NDArray[np.float64]
 
 F0: Final = 0.028
 """Reflectance at normal incidence, of an index of 1.4."""
 
 
-def schlick(cosine: ArrayLike, f0: float = F0) -> FloatArray:
+def schlick(cosine: ArrayLike, f0: float = F0) -> Float64Array:
     """Return Schlick's approximation of Fresnel's reflectance.
 
     Parameters
@@ -43,13 +42,8 @@ def schlick(cosine: ArrayLike, f0: float = F0) -> FloatArray:
 
 
 def kelemen(
-    normal: ArrayLike,
-    to_light: ArrayLike,
-    to_eye: ArrayLike,
-    roughness: float,
-    *,
-    f0: float = F0,
-) -> FloatArray:
+    normal: ArrayLike, to_light: ArrayLike, to_eye: ArrayLike, roughness: float, *, f0: float = F0
+) -> Float64Array:
     """Return the BRDF, 1/sr; 0 where the light is behind the surface.
 
     Parameters

@@ -20,7 +20,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from model.arrays import BoolArray, Float64Array
+
 Texturing = Literal["post", "pre", "both"]
 
 POWERS: Final[dict[Texturing, tuple[float, float]]] = {
@@ -58,7 +59,7 @@ class Sampling:
     slant_limit: float = 4.0
 
     @property
-    def offsets(self) -> FloatArray:
+    def offsets(self) -> Float64Array:
         """Distances of the taps on one side, in standard deviations, (taps,)."""
         return self.reach * np.arange(1, self.taps + 1) / self.taps
 
@@ -85,7 +86,7 @@ def scatter(
     focal_px: float,
     width: ArrayLike = 1.0,
     sampling: Sampling | None = None,
-) -> FloatArray:
+) -> Float64Array:
     """Return light after it has spread.
 
     Parameters
@@ -149,7 +150,7 @@ def scatter(
     return out
 
 
-def narrowed(deviation_px: ArrayLike) -> FloatArray:
+def narrowed(deviation_px: ArrayLike) -> Float64Array:
     """Return the standard deviation to ask for so that interpolated taps give the one wanted.
 
     Interpolating between pixels blurs by itself: at a distance x beyond a pixel by x (1 - x) px^2.
@@ -173,8 +174,13 @@ def narrowed(deviation_px: ArrayLike) -> FloatArray:
 
 
 def _blurred(
-    light: FloatArray, z: FloatArray, sigma_mm: FloatArray, axis: int, focal: float, how: Sampling
-) -> FloatArray:
+    light: Float64Array,
+    z: Float64Array,
+    sigma_mm: Float64Array,
+    axis: int,
+    focal: float,
+    how: Sampling,
+) -> Float64Array:
     """Return one Gaussian along one axis."""
     if axis == 0:
         turned = _blurred(light.swapaxes(0, 1), z.T, sigma_mm.T, 1, focal, how)
@@ -200,7 +206,7 @@ def _blurred(
     return np.where(there[..., None], total / weight[..., None], 0.0)
 
 
-def _slant(z: FloatArray) -> FloatArray:
+def _slant(z: Float64Array) -> Float64Array:
     """Return the smaller change of depth to the neighbors that are there, mm, 0 beside none."""
     step = np.full((z.shape[0], z.shape[1] + 1), np.inf)
     both = (z[:, 1:] > 0.0) & (z[:, :-1] > 0.0)
@@ -212,8 +218,8 @@ def _slant(z: FloatArray) -> FloatArray:
 
 
 def _sampled(
-    light: FloatArray, there: NDArray[np.bool_], rows: NDArray[np.intp], at: FloatArray
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+    light: Float64Array, there: BoolArray, rows: NDArray[np.intp], at: Float64Array
+) -> tuple[Float64Array, BoolArray]:
     """Return light between columns, (H, W, 3), from the pixels that show a surface."""
     last = light.shape[1] - 1
     low = np.floor(at)

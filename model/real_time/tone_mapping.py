@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 SHOULDER: Final = 0.15
 LINEAR_STRENGTH: Final = 0.50
@@ -29,7 +29,7 @@ MOST_LIGHT: Final = 1e20
 """More is shown as this much: the curve is level there, and its squares overflow far beyond."""
 
 
-def srgb_encoded(linear: ArrayLike) -> FloatArray:
+def srgb_encoded(linear: ArrayLike) -> Float64Array:
     """Return linear sRGB as a display is sent it, any shape, in [0, 1].
 
     Parameters
@@ -46,7 +46,7 @@ def srgb_encoded(linear: ArrayLike) -> FloatArray:
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1.0 / 2.4) - 0.055)
 
 
-def filmic(linear: ArrayLike) -> FloatArray:
+def filmic(linear: ArrayLike) -> Float64Array:
     """Return Hable's filmic operator, still linear: 0 stays 0, 5.6 becomes 1.
 
     Parameters
@@ -63,7 +63,7 @@ def filmic(linear: ArrayLike) -> FloatArray:
     return np.asarray(_curve(x) / _curve(np.float64(LINEAR_WHITE)))
 
 
-def _curve(x: FloatArray | np.float64) -> FloatArray:
+def _curve(x: Float64Array | np.float64) -> Float64Array:
     A, B, C = SHOULDER, LINEAR_STRENGTH, LINEAR_ANGLE
     D, E, F = TOE_STRENGTH, TOE_NUMERATOR, TOE_DENOMINATOR
     return np.asarray((x * (A * x + C * B) + D * E) / (x * (A * x + B) + D * F) - E / F)

@@ -8,10 +8,4 @@ from model.texture_statistics.description import (
     statistics,
 )
 
-__all__ = [
-    "MatchedTexture",
-    "TextureStatistics",
-    "describe",
-    "match",
-    "statistics",
-]
+__all__ = ["MatchedTexture", "TextureStatistics", "describe", "match", "statistics"]

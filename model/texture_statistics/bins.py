@@ -8,11 +8,10 @@ Heeger, Bergen 1995, doi:10.1145/218380.218446, section 3.5 (decorrelated colors
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import Float64Array
 from model.texture_statistics.histograms import BINS
-
-Floats = NDArray[np.float64]
 
 OPPONENT = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
 """Brightness, red less green, yellow less blue: the axes where colors do not vary."""
@@ -20,7 +19,7 @@ OPPONENT /= np.linalg.norm(OPPONENT, axis=1, keepdims=True)
 _MARGIN = 0.05
 
 
-def principal_axes(covariance: Floats, unit: float) -> Floats:
+def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
     """Return eigenvectors as rows by falling variance, well defined without variance too.
 
     Parameters
@@ -55,7 +54,7 @@ def principal_axes(covariance: Floats, unit: float) -> Floats:
     return np.ascontiguousarray(axes * np.sign(largest)[:, None])
 
 
-def uneven_edges(quantiles: ArrayLike, unit: float) -> Floats:
+def uneven_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
     """Return 257 edges: half of the bins spread evenly, half by how often values occur.
 
     Parameters

@@ -19,18 +19,16 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array, FloatArray
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.histograms import Bins, Counted, distance
 from model.texture_statistics.masks import fill_smoothly, response_weights
 from model.texture_statistics.space import TextureError, TextureSpace, checked_image, weight_of
 from model.texture_statistics.steerable_pyramid import Responses, thread_count
 
-Floats = NDArray[np.float64]
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
-Weights = tuple[Array, tuple[Array, ...]] | None
+Weights = tuple[FloatArray, tuple[FloatArray, ...]] | None
 T = TypeVar("T")
 _SMALL = 128 * 128
 
@@ -39,14 +37,14 @@ _SMALL = 128 * 128
 class TextureStatistics:
     """The vector of one texture, and how far to trust it."""
 
-    vector: Floats
+    vector: Float64Array
     """(23808,) for RGB at full depth: shares of 256 bins, histogram after histogram."""
-    clipped: Floats
+    clipped: Float64Array
     """(C, responses): share of samples outside the space's edges, counted in the end bins."""
-    effective: Floats
+    effective: Float64Array
     """(C, responses): independent samples at most; neighbors are correlated."""
 
-    def stderr(self) -> Floats:
+    def stderr(self) -> Float64Array:
         """Return the least standard error of the vector: binomial, of `effective` samples."""
         h = self.vector.reshape(*self.effective.shape, -1)
         return np.sqrt(h * (1.0 - h) / self.effective[..., None]).reshape(-1)
@@ -56,22 +54,22 @@ class TextureStatistics:
 class MatchedTexture:
     """What matching made, and how it went."""
 
-    image: Array
+    image: FloatArray
     """As the image given; texels outside the mask or the region as they were."""
-    distances: Floats
+    distances: Float64Array
     """(iterations + 1, C, responses): how far the values of each response are from the target's, in
     spreads of the population (`model.texture_statistics.histograms.distance`): at the start, then
     after each iteration."""
-    clipped: Floats
+    clipped: Float64Array
     """(C, responses): share of the result's samples outside the space's edges."""
 
     @property
-    def before(self) -> Floats:
+    def before(self) -> Float64Array:
         """(C, responses): distances at the start, with noise added."""
         return self.distances[0]
 
     @property
-    def after(self) -> Floats:
+    def after(self) -> Float64Array:
         """(C, responses): distances of the result."""
         return self.distances[-1]
 
@@ -80,10 +78,10 @@ def describe(
     image: ArrayLike,
     *,
     space: TextureSpace | None = None,
-    valid: Mask | None = None,
+    valid: BoolArray | None = None,
     region: ArrayLike | None = None,
     workers: int | None = None,
-) -> Floats:
+) -> Float64Array:
     """Return the statistics of a texture as a row vector, (23808,) for RGB.
 
     The vector of `statistics`, with its parameters.
@@ -101,7 +99,7 @@ def statistics(
     image: ArrayLike,
     *,
     space: TextureSpace | None = None,
-    valid: Mask | None = None,
+    valid: BoolArray | None = None,
     region: ArrayLike | None = None,
     workers: int | None = None,
 ) -> TextureStatistics:
@@ -156,9 +154,9 @@ def match(
     space: TextureSpace | None = None,
     iterations: int = 5,
     noise: float = 0.0,
-    valid: Mask | None = None,
+    valid: BoolArray | None = None,
     region: ArrayLike | None = None,
-    target_valid: Mask | None = None,
+    target_valid: BoolArray | None = None,
     target_region: ArrayLike | None = None,
     start: Literal["image", "noise"] = "image",
     tolerance: float = 1e-4,
@@ -274,14 +272,14 @@ def match(
     return MatchedTexture(matched.reshape(np.shape(image)), distances, clipped)
 
 
-def _check_channels(colors: Array, space: TextureSpace) -> None:
+def _check_channels(colors: FloatArray, space: TextureSpace) -> None:
     if colors.shape[2] != space.channels:
         raise TextureError(
             f"image: got {colors.shape[2]} channels, expected {space.channels} as in the space"
         )
 
 
-def _weights(mask: Mask, region: ArrayLike | None, levels: int) -> Weights:
+def _weights(mask: BoolArray, region: ArrayLike | None, levels: int) -> Weights:
     """Return the weights of texels and samples; None: all count fully."""
     if region is not None:
         wanted = np.asarray(region)
@@ -297,7 +295,7 @@ def _weights(mask: Mask, region: ArrayLike | None, levels: int) -> Weights:
     return response_weights(mask, region, levels)
 
 
-def _analyze(channel: Array, space: TextureSpace, workers: int | None) -> Responses:
+def _analyze(channel: FloatArray, space: TextureSpace, workers: int | None) -> Responses:
     return steerable_pyramid.analyze(
         channel, levels=space.levels, orientations=space.orientations, workers=workers
     )
@@ -309,7 +307,7 @@ def _bins(space: TextureSpace, channel: int) -> list[Bins]:
 
 def _count(
     pool: ThreadPoolExecutor,
-    responses: tuple[Array, ...],
+    responses: tuple[FloatArray, ...],
     bins: list[Bins],
     space: TextureSpace,
     weights: Weights,
@@ -328,12 +326,12 @@ def _move(
     pyramid: Responses,
     counted: list[Counted],
     bins: list[Bins],
-    wanted: Floats,
-    far: Mask,
+    wanted: Float64Array,
+    far: BoolArray,
 ) -> None:
     """Match the responses of a pyramid in place; the first histogram of all is the image's."""
 
-    def one(r: int, response: Array) -> None:
+    def one(r: int, response: FloatArray) -> None:
         if far[r]:
             bins[r].match(response, counted[r], wanted[r], out=response)
 
@@ -347,7 +345,9 @@ def _each(
     return list((pool.map if large else map)(one, *items))
 
 
-def _blended(original: Array, new: Array, blend: Array, mask: Mask) -> Array:
+def _blended(
+    original: FloatArray, new: FloatArray, blend: FloatArray, mask: BoolArray
+) -> FloatArray:
     """Keep the original where nothing is to change, and continue the result past the mask."""
     if mask.all() and blend.min() >= 1.0:
         return new.astype(original.dtype, copy=False)
@@ -355,7 +355,7 @@ def _blended(original: Array, new: Array, blend: Array, mask: Mask) -> Array:
     return fill_smoothly(mixed[..., None], mask)[..., 0]
 
 
-def _moments(bins: Bins, shares: Floats) -> tuple[float, float]:
+def _moments(bins: Bins, shares: Float64Array) -> tuple[float, float]:
     """Return mean and standard deviation of a histogram."""
     middles = 0.5 * (bins.edges[1:] + bins.edges[:-1])
     mean = float(shares @ middles)

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from model.texture_statistics import histogram_kernels
-
-Floats = NDArray[np.float64]
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 BINS = 256
 """Bins of every histogram (Weyrich et al. 2006, section 10.2)."""
@@ -26,7 +23,7 @@ class HistogramError(ValueError):
 class Counted:
     """One histogram and what it was counted from."""
 
-    shares: Floats
+    shares: Float64Array
     """(256,), sums to 1."""
     below: float
     """Share of values below the edges; it is in the first bin."""
@@ -44,7 +41,7 @@ class Counted:
 class Bins:
     """256 bins, and a table that finds the bin of a value quickly."""
 
-    edges: Floats
+    edges: Float64Array
     """(257,), rising; a bin holds its lower edge."""
     scale: float
     least: NDArray[np.int16]
@@ -62,7 +59,7 @@ class Bins:
         histogram_kernels.bound_bins(e, BINS, scale, least, most)
         return cls(e, scale, least, most)
 
-    def count(self, values: Array, weights: Array | None = None) -> Counted:
+    def count(self, values: FloatArray, weights: FloatArray | None = None) -> Counted:
         """Count values (any shape), weighted or not.
 
         Examples
@@ -90,8 +87,13 @@ class Bins:
         )
 
     def match(
-        self, values: Array, source: Counted, target: Floats, *, out: Array | None = None
-    ) -> Array:
+        self,
+        values: FloatArray,
+        source: Counted,
+        target: Float64Array,
+        *,
+        out: FloatArray | None = None,
+    ) -> FloatArray:
         """Move values so that their histogram becomes the target's.
 
         Parameters
@@ -137,7 +139,7 @@ class Bins:
         return moved
 
 
-def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Floats:
+def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Float64Array:
     h = np.asarray(shares, np.float64)
     if h.ndim < 1 or not h.shape[-1] or (bins is not None and h.shape[-1] != bins):
         raise HistogramError(f"{name}: got shape {h.shape}, expected (..., {bins or BINS})")
@@ -149,7 +151,7 @@ def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Floa
     return h
 
 
-def cumulated(shares: ArrayLike) -> Floats:
+def cumulated(shares: ArrayLike) -> Float64Array:
     """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1.
 
     Raises
@@ -163,7 +165,7 @@ def cumulated(shares: ArrayLike) -> Floats:
     return np.asarray(np.minimum(run, 1.0))
 
 
-def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Floats:
+def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
     """Return how far values must move, on average, to make one histogram of another.
 
     Parameters
@@ -200,7 +202,7 @@ def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Floats:
     return np.asarray(moved / (e[..., 3 * quarter] - e[..., quarter]))
 
 
-def project_to_histograms(vectors: ArrayLike) -> Floats:
+def project_to_histograms(vectors: ArrayLike) -> Float64Array:
     """Return the nearest vectors (least squares) whose histograms are all valid.
 
     Parameters
@@ -242,24 +244,24 @@ def project_to_histograms(vectors: ArrayLike) -> Floats:
 class GroupHistograms:
     """Color histograms averaged over groups of images."""
 
-    edges: Floats
+    edges: Float64Array
     """(B + 1,), unit of the images."""
     names: tuple[str, ...]
     """The G groups."""
-    mean: Floats
+    mean: Float64Array
     """(G, channels, B): every image counts the same; each sums to 1."""
-    stderr: Floats
+    stderr: Float64Array
     """(G, channels, B): of the mean over the group; NaN in groups of one."""
-    members: NDArray[np.int64]
+    members: Int64Array
     """(G,)"""
-    clipped: Floats
+    clipped: Float64Array
     """(G, channels): share that lies outside the edges and was counted in the end bins."""
 
 
 def rgb_histograms(
     images: Sequence[ArrayLike],
     groups: Mapping[str, ArrayLike],
-    valid: Sequence[Mask | None] | None = None,
+    valid: Sequence[BoolArray | None] | None = None,
     *,
     reach: tuple[float, float] = (0.0, 1.0),
     bins: int = BINS,
@@ -323,6 +325,10 @@ def rgb_histograms(
         clipped.append(beyond[chosen].mean(axis=0))
         members.append(n)
     return GroupHistograms(
-        edges, tuple(groups), np.array(mean), np.array(stderr), np.array(members, np.int64),
+        edges,
+        tuple(groups),
+        np.array(mean),
+        np.array(stderr),
+        np.array(members, np.int64),
         np.array(clipped),
-    )  # fmt: skip
+    )

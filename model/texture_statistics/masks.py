@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import convolve1d
 
+from model.arrays import BoolArray, FloatArray
 from model.texture_statistics.steerable_pyramid import level_sizes
 
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 _BINOMIAL = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 
 
-def fill_smoothly(image: Array, valid: Mask) -> Array:
+def fill_smoothly(image: FloatArray, valid: BoolArray) -> FloatArray:
     """Continue a texture smoothly to where it is not valid, periodically.
 
     Means of 2 x 2 texels, level by level, until nothing is missing; then back with linear
@@ -56,13 +55,13 @@ def fill_smoothly(image: Array, valid: Mask) -> Array:
     return np.where(valid[..., None], image, filled).astype(image.dtype)
 
 
-def _halved(a: Array) -> Array:
+def _halved(a: FloatArray) -> FloatArray:
     """Add up 2 x 2 texels; a last odd row or column stands alone."""
     padded = np.pad(a, ((0, a.shape[0] % 2), (0, a.shape[1] % 2), (0, 0)))
     return np.asarray(padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
 
 
-def _doubled(a: Array, shape: tuple[int, int]) -> Array:
+def _doubled(a: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Interpolate linearly between the middles of 2 x 2 texels, periodically."""
     for axis in (0, 1):
         before = 0.75 * a + 0.25 * np.roll(a, 1, axis)
@@ -75,8 +74,8 @@ def _doubled(a: Array, shape: tuple[int, int]) -> Array:
 
 
 def response_weights(
-    valid: Mask, region: ArrayLike | None, levels: int
-) -> tuple[Array, tuple[Array, ...]]:
+    valid: BoolArray, region: ArrayLike | None, levels: int
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
     """Return the weight of every texel, and of every sample of every level and the low-pass.
 
     Parameters
@@ -106,7 +105,7 @@ def response_weights(
     return inside, tuple(samples)
 
 
-def _cell_means(texels: Array, size: tuple[int, int]) -> Array:
+def _cell_means(texels: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Average texels over the cells about the samples of a coarser, periodic grid."""
     found = texels
     for axis in (0, 1):

@@ -9,9 +9,17 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def split(
-    spectrum: Any, rows: Any, weight: Any, fy: Any, fx: Any, toward: Any, factor: Any,
-    out: Any, begin: int, end: int,
-) -> None:  # fmt: skip
+    spectrum: Any,
+    rows: Any,
+    weight: Any,
+    fy: Any,
+    fx: Any,
+    toward: Any,
+    factor: Any,
+    out: Any,
+    begin: int,
+    end: int,
+) -> None:
     """Cut the orientations of one level out of a spectrum.
 
     Parameters
@@ -44,9 +52,17 @@ def split(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merge(
-    bands: Any, rows: Any, weight: Any, fy: Any, fx: Any, toward: Any, factor: Any,
-    spectrum: Any, begin: int, end: int,
-) -> None:  # fmt: skip
+    bands: Any,
+    rows: Any,
+    weight: Any,
+    fy: Any,
+    fx: Any,
+    toward: Any,
+    factor: Any,
+    spectrum: Any,
+    begin: int,
+    end: int,
+) -> None:
     """Add the filtered orientations of one level to a spectrum: the adjoint of `split`.
 
     Parameters as of `split`; ``spectrum`` is added to, ``bands`` is read.

@@ -23,17 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array, FloatArray
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.bins import OPPONENT, principal_axes, uneven_edges
 from model.texture_statistics.histograms import BINS
 from model.texture_statistics.masks import fill_smoothly, response_weights
 from model.texture_statistics.steerable_pyramid import LEVELS, ORIENTATIONS
-
-Floats = NDArray[np.float64]
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 _QUANTILES = 2049
 
@@ -46,11 +43,11 @@ class TextureError(ValueError):
 class TextureSpace:
     """Color axes and bin edges; vectors of one space can be compared, averaged and edited."""
 
-    mean: Floats
+    mean: Float64Array
     """(C,): the population's mean color, unit of the images."""
-    axes: Floats
+    axes: Float64Array
     """(C, C): orthonormal rows, by falling variance; channel = axes @ (color - mean)."""
-    edges: Floats
+    edges: Float64Array
     """(C, responses, 257): rising; responses as in the vector, so 31 of them at full depth."""
     levels: int
     orientations: int
@@ -125,14 +122,14 @@ class TextureSpace:
         begin = (channel * len(names) + number) * BINS
         return slice(begin, begin + BINS)
 
-    def histograms(self, vector: ArrayLike) -> Floats:
+    def histograms(self, vector: ArrayLike) -> Float64Array:
         """Return vectors (..., n) as histograms (..., C, responses, 256)."""
         v = np.asarray(vector, np.float64)
         if not v.ndim or v.shape[-1] != self.size:
             raise TextureError(f"vector: got shape {v.shape}, expected (..., {self.size})")
         return v.reshape(*v.shape[:-1], self.channels, len(self.responses), BINS)
 
-    def check(self, vector: ArrayLike) -> Floats:
+    def check(self, vector: ArrayLike) -> Float64Array:
         """Return a vector as histograms (C, responses, 256) after checking that each is one.
 
         Raises
@@ -157,13 +154,13 @@ class TextureSpace:
             )
         return h
 
-    def to_channels(self, image: Array) -> Array:
+    def to_channels(self, image: FloatArray) -> FloatArray:
         """Return (C, H, W) decorrelated channels of an image (H, W, C), in its precision."""
         rows = image.reshape(-1, self.channels) - self.mean.astype(image.dtype)
         turned = self.axes.astype(image.dtype) @ rows.T
         return np.ascontiguousarray(turned).reshape(self.channels, *image.shape[:2])
 
-    def to_colors(self, channels: Array) -> Array:
+    def to_colors(self, channels: FloatArray) -> FloatArray:
         """Return the image (H, W, C) of decorrelated channels (C, H, W)."""
         rows = channels.reshape(self.channels, -1).T @ self.axes.astype(channels.dtype)
         return np.asarray(
@@ -198,7 +195,7 @@ class TextureSpace:
         cls,
         images: Sequence[ArrayLike],
         *,
-        valid: Sequence[Mask | None] | None = None,
+        valid: Sequence[BoolArray | None] | None = None,
         levels: int = LEVELS,
         orientations: int = ORIENTATIONS,
         workers: int | None = None,
@@ -257,10 +254,13 @@ class TextureSpace:
         spread = spread + (centers - mean).T @ (centers - mean) / count
         axes = principal_axes(spread, unit or 1.0)
         plain = cls(
-            mean, axes, np.tile(np.linspace(0.0, 1.0, BINS + 1),
-                                (len(mean), levels * orientations + 3, 1)),
-            levels, orientations, count,
-        )  # fmt: skip
+            mean,
+            axes,
+            np.tile(np.linspace(0.0, 1.0, BINS + 1), (len(mean), levels * orientations + 3, 1)),
+            levels,
+            orientations,
+            count,
+        )
         found = [
             _quantiles(plain, image, mask, workers)
             for image, mask in zip(images, masks, strict=True)
@@ -276,9 +276,12 @@ class TextureSpace:
         """Write the space as npz, exactly; ``path`` is used as it is."""
         with Path(path).open("wb") as file:
             np.savez_compressed(
-                file, mean=self.mean, axes=self.axes, edges=self.edges,
+                file,
+                mean=self.mean,
+                axes=self.axes,
+                edges=self.edges,
                 counts=np.array([self.levels, self.orientations, self.images]),
-            )  # fmt: skip
+            )
 
     @classmethod
     def load(cls, path: str | Path) -> TextureSpace:
@@ -292,7 +295,7 @@ class TextureSpace:
         return cls(mean, axes, edges, levels, orientations, images)
 
 
-def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[Array, Mask]:
+def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
     """Return an image as (H, W, C), float64 if it was and float32 if not, and its mask."""
     values = np.asarray(image)
     values = values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
@@ -318,8 +321,8 @@ def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[Array, Mas
 
 
 def _quantiles(
-    space: TextureSpace, image: ArrayLike, valid: Mask | None, workers: int | None
-) -> Array:
+    space: TextureSpace, image: ArrayLike, valid: BoolArray | None, workers: int | None
+) -> FloatArray:
     """Return even quantiles of the valid samples of all responses, (C, R, quantiles) float32."""
     colors, mask = checked_image(image, valid)
     weights = None if mask.all() else response_weights(mask, None, space.levels)
@@ -337,7 +340,9 @@ def _quantiles(
     return out
 
 
-def weight_of(weights: tuple[Array, tuple[Array, ...]], response: int, orientations: int) -> Array:
+def weight_of(
+    weights: tuple[FloatArray, tuple[FloatArray, ...]], response: int, orientations: int
+) -> FloatArray:
     """Return the weights of the samples of a response out of those of all levels."""
     texels, samples = weights
     return texels if response == 0 else samples[max(response - 2, 0) // orientations]

@@ -26,12 +26,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
+from model.arrays import Float64Array, FloatArray, Int64Array
 from model.texture_statistics import pyramid_kernels
 
-Array = NDArray[np.floating]
 LEVELS, ORIENTATIONS = 7, 4
 """Depth and filters a level (Weyrich et al. 2006, section 10.2)."""
 _CHUNK_ROWS = 128
@@ -47,12 +47,12 @@ class Responses:
 
     shape: tuple[int, int]
     """(H, W) of the image."""
-    high: Array
+    high: FloatArray
     """(H, W): what lies above the first level."""
-    bands: tuple[Array, ...]
+    bands: tuple[FloatArray, ...]
     """(K, h, w) a level, finest first. Orientation k answers to waves that run at the angle
     k pi / K from +x (columns) towards +y (down the rows)."""
-    low: Array
+    low: FloatArray
     """(h, w): what lies below the last level, the mean with it."""
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class Responses:
         if len(kinds) != 1 or not kinds <= {np.dtype(np.float32), np.dtype(np.float64)}:
             raise PyramidError(f"Responses: got {kinds}, expected all float32 or all float64")
 
-    def __iter__(self) -> Iterator[Array]:
+    def __iter__(self) -> Iterator[FloatArray]:
         """Give the responses one by one: high-pass, bands by level and orientation, low-pass."""
         yield self.high
         for band in self.bands:
@@ -79,20 +79,20 @@ class Responses:
 class _Level:
     """Where a level lies in the spectrum, and its filter."""
 
-    rows: NDArray[np.int64]
+    rows: Int64Array
     columns: int
     size: tuple[int, int]
-    fy: Array
-    fx: Array
-    weight: Array
+    fy: FloatArray
+    fx: FloatArray
+    weight: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Filters:
-    high: Array
+    high: FloatArray
     levels: tuple[_Level, ...]
     low: _Level
-    toward: Array
+    toward: FloatArray
     factor: Any
 
 
@@ -134,9 +134,7 @@ def analyze(
     True
     """
     values = np.asarray(image)
-    values = np.ascontiguousarray(
-        values, np.float64 if values.dtype == np.float64 else np.float32
-    )  # fmt: skip
+    values = np.ascontiguousarray(values, np.float64 if values.dtype == np.float64 else np.float32)
     if values.ndim != 2 or not values.size:
         raise PyramidError(f"image: got shape {values.shape}, expected (H, W), not empty")
     if levels < 1 or orientations < 1:
@@ -165,7 +163,7 @@ def analyze(
     )
 
 
-def synthesize(responses: Responses, *, workers: int | None = None) -> Array:
+def synthesize(responses: Responses, *, workers: int | None = None) -> FloatArray:
     """Put an image together from responses, edited or not.
 
     Parameters
@@ -185,7 +183,7 @@ def synthesize(responses: Responses, *, workers: int | None = None) -> Array:
     orientations = len(responses.bands[0])
     filters = _filters(shape, len(responses.bands), orientations, responses.high.dtype.str)
 
-    def forth(response: Array) -> Any:
+    def forth(response: FloatArray) -> Any:
         return fft.rfft2(response, norm="forward", workers=threads)
 
     spectrum = forth(responses.high)
@@ -200,7 +198,7 @@ def synthesize(responses: Responses, *, workers: int | None = None) -> Array:
     return _inverse(spectrum, shape, threads)
 
 
-def _inverse(spectra: Any, size: tuple[int, int], threads: int) -> Array:
+def _inverse(spectra: Any, size: tuple[int, int], threads: int) -> FloatArray:
     """Return the images of half spectra, which are overwritten."""
     columns = fft.ifft(spectra, axis=-2, norm="forward", workers=threads, overwrite_x=True)
     return np.asarray(fft.irfft(columns, n=size[1], axis=-1, norm="forward", workers=threads))
@@ -258,8 +256,9 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
     """Make the filters of an image size; they are the same for all images."""
     order = orientations - 1
     # the squares of cos^order at `orientations` angles sum to this over 1
-    level_gain = math.sqrt(4.0**order * math.factorial(order) ** 2
-                           / (orientations * math.factorial(2 * order)))  # fmt: skip
+    level_gain = math.sqrt(
+        4.0**order * math.factorial(order) ** 2 / (orientations * math.factorial(2 * order))
+    )
     angle = np.pi * np.arange(orientations) / orientations
     toward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     made = []
@@ -276,9 +275,12 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
     high = np.sin(0.5 * np.pi * np.clip(_log_radius(_place(shape, 0)) + 1.0, 0.0, 1.0))
     complex_kind = np.result_type(kind, np.complex64).type
     return _Filters(
-        high.astype(kind), tuple(made[:-1]), made[-1], toward.astype(kind),
+        high.astype(kind),
+        tuple(made[:-1]),
+        made[-1],
+        toward.astype(kind),
         complex_kind((-1j) ** order),
-    )  # fmt: skip
+    )
 
 
 def _place(shape: tuple[int, int], number: int) -> _Level:
@@ -291,7 +293,7 @@ def _place(shape: tuple[int, int], number: int) -> _Level:
     return _Level(cycles % shape[0], columns, size, fy, fx, np.empty(0))
 
 
-def _log_radius(level: _Level) -> NDArray[np.float64]:
+def _log_radius(level: _Level) -> Float64Array:
     """Return log2 of the radius, 0 at the Nyquist frequency of the image; -inf at the mean."""
     with np.errstate(divide="ignore"):
         return np.asarray(np.log2(np.hypot(level.fy[:, None], level.fx[None, :])))

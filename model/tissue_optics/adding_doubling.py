@@ -15,8 +15,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from model import fresnel
-
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 _SERIES_TERMS = 9  # cosh(1) to 1e-16
 _CHUNK = 2048  # layers per batch: a few MB
@@ -30,23 +29,23 @@ _OPAQUE = 1e-13  # transmittance at which a layer counts as semi-infinite
 class Quadrature:
     """Directions inside the medium and the surface's reflectance for them."""
 
-    mu: FloatArray
+    mu: Float64Array
     """Cosines, shape (n,), increasing; the last is 1, the direction of the collimated beam."""
-    weight: FloatArray
+    weight: Float64Array
     """Weights of the integral over mu from 0 to 1, shape (n,)."""
-    surface: FloatArray
+    surface: Float64Array
     """Fresnel reflectance of the surface from inside, shape (n,)."""
 
 
 def reflectance(
-    sigma_a_per_mm: FloatArray,
-    sigma_s_prime_per_mm: FloatArray,
-    thickness_mm: FloatArray,
+    sigma_a_per_mm: Float64Array,
+    sigma_s_prime_per_mm: Float64Array,
+    thickness_mm: Float64Array,
     *,
     eta: float = fresnel.ETA_SKIN,
     anisotropy: float | tuple[float, ...] = 0.0,
     directions: int = 12,
-) -> FloatArray:
+) -> Float64Array:
     """Return the diffuse reflectance of layer stacks for a beam at normal incidence.
 
     Parameters
@@ -102,9 +101,10 @@ def reflectance(
             f"{', '.join(map(str, shapes))}, expected one (n, layers)"
         )
     for name, values, most in (
-        ("sigma_a_per_mm", sigma_a_per_mm, False), ("thickness_mm", thickness_mm, True),
+        ("sigma_a_per_mm", sigma_a_per_mm, False),
+        ("thickness_mm", thickness_mm, True),
         ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
-    ):  # fmt: skip
+    ):
         if not np.all((values >= 0.0) & ((values < np.inf) | most)):
             raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
     layers = sigma_a_per_mm.shape[1]
@@ -113,7 +113,7 @@ def reflectance(
         raise ValueError(f"anisotropy: got {anisotropy}, expected in [0, 1)")
     stack = np.stack([sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm], axis=-1)
     stack = stack.reshape(stack.shape[0], 3 * layers)
-    below: FloatArray | None = None  # reflection matrices of what lies below, one a unique row
+    below: Float64Array | None = None  # reflection matrices of what lies below, one a unique row
     below_rows = np.zeros(stack.shape[0], dtype=np.intp)
     for layer in range(layers - 1, -1, -1):
         # Stacks that share their lower layers (a table's dermis) are computed once.
@@ -158,7 +158,7 @@ def quadrature(eta: float, directions: int) -> Quadrature:
     return Quadrature(mu, weight, surface)
 
 
-def _radau(count: int) -> tuple[FloatArray, FloatArray]:
+def _radau(count: int) -> tuple[Float64Array, Float64Array]:
     """Return nodes and weights on (0, 1] with a node at 1."""
     # Roots of (P_{n-1} + P_n)/(1 + x) on [-1, 1], which has its fixed node at -1, mirrored.
     p_before = np.zeros(count + 1)
@@ -172,7 +172,7 @@ def _radau(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _index_of(
-    stack: FloatArray, layer: int, layers: int, owner: NDArray[np.intp]
+    stack: Float64Array, layer: int, layers: int, owner: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     """Return, for the owners' rows, which unique row of the layers below each one stands on."""
     if layer == layers - 1:
@@ -182,11 +182,11 @@ def _index_of(
 
 
 def _layer(
-    properties: FloatArray,
+    properties: Float64Array,
     rule: Quadrature,
     anisotropy: float,
-    phase: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
+    phase: tuple[Float64Array, Float64Array],
+) -> tuple[Float64Array, Float64Array]:
     """Return the matrices (r, t) of homogeneous layers without surfaces, shape (n, m, m).
 
     `properties` holds sigma_a, sigma_s' and the thickness, shape (n, 3).
@@ -220,11 +220,11 @@ def _layer(
 
 
 def _thin_layer(
-    albedo: FloatArray,
-    tau: FloatArray,
+    albedo: Float64Array,
+    tau: Float64Array,
     rule: Quadrature,
-    phase: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
+    phase: tuple[Float64Array, Float64Array],
+) -> tuple[Float64Array, Float64Array]:
     """Solve the discrete transport equation exactly for layers of tau <= 2 mu_min.
 
     With S and D the sum and difference of downward and upward radiance, S' = -X D and D' = -Y S,
@@ -250,7 +250,7 @@ def _thin_layer(
 @lru_cache(maxsize=32)
 def _phase_matrices(
     eta: float, directions: int, anisotropy: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the sum and difference of forward and backward phase function, halved, (m, m).
 
     The Henyey-Greenstein function is averaged over azimuth by its whole Legendre series. What the
@@ -269,7 +269,7 @@ def _phase_matrices(
     return even + peak, odd + peak
 
 
-def _hyperbolic_series(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _hyperbolic_series(z: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return cosh(sqrt(z)) and sinh(sqrt(z))/sqrt(z) of matrices of norm about 1, by Horner."""
     identity = np.eye(z.shape[-1])
     cosh = np.broadcast_to(identity, z.shape)
@@ -280,18 +280,20 @@ def _hyperbolic_series(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     return cosh, sinh
 
 
-def _right_divide(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+def _right_divide(numerator: Float64Array, denominator: Float64Array) -> Float64Array:
     solved = np.linalg.solve(np.swapaxes(denominator, -1, -2), np.swapaxes(numerator, -1, -2))
     return np.swapaxes(solved, -1, -2)
 
 
-def _add(r: FloatArray, t: FloatArray, below: FloatArray) -> FloatArray:
+def _add(r: Float64Array, t: Float64Array, below: Float64Array) -> Float64Array:
     """Return the reflection matrix of layers (r, t) that lie on `below`."""
     identity = np.eye(r.shape[-1])
     return np.asarray(r + t @ np.linalg.solve(identity - below @ r, below @ t))
 
 
-def _escape(below: FloatArray, rows: NDArray[np.intp], rule: Quadrature, eta: float) -> FloatArray:
+def _escape(
+    below: Float64Array, rows: NDArray[np.intp], rule: Quadrature, eta: float
+) -> Float64Array:
     """Let a unit beam in through the surface and return what comes out again, per stack."""
     identity = np.eye(rule.mu.size)
     beam = below[:, :, -1:]  # upward radiance before the surface reflects any of it back

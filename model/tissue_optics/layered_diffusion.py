@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import fresnel
-
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 _FAINT_PER_MM = 1e-9  # extinction below which a layer is empty for every purpose here
 _FLAT = 1e-4  # kappa d below which a term's limit for kappa = 0 is reached to 1e-9
 
 
 def reflectance(
-    sigma_a_per_mm: FloatArray,
-    sigma_s_prime_per_mm: FloatArray,
-    thickness_mm: FloatArray,
+    sigma_a_per_mm: Float64Array,
+    sigma_s_prime_per_mm: Float64Array,
+    thickness_mm: Float64Array,
     *,
     eta: float = fresnel.ETA_SKIN,
-) -> FloatArray:
+) -> Float64Array:
     """Return the diffuse reflectance of layer stacks for a beam at normal incidence.
 
     Parameters
@@ -63,9 +61,10 @@ def reflectance(
     0.22
     """
     for name, values, endless in (
-        ("sigma_a_per_mm", sigma_a_per_mm, False), ("thickness_mm", thickness_mm, True),
+        ("sigma_a_per_mm", sigma_a_per_mm, False),
+        ("thickness_mm", thickness_mm, True),
         ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
-    ):  # fmt: skip
+    ):
         if not np.all((values >= 0.0) & ((values < np.inf) | endless)):
             raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
         if np.ndim(values) < 1 or np.shape(values)[-1] < 1:
@@ -94,14 +93,14 @@ def reflectance(
 
 
 def _cover(
-    draw: FloatArray,
-    give: FloatArray,
-    diffusion: FloatArray,
-    kappa: FloatArray,
-    sigma_t: FloatArray,
-    sigma_s_prime: FloatArray,
-    thickness: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+    draw: Float64Array,
+    give: Float64Array,
+    diffusion: Float64Array,
+    kappa: Float64Array,
+    sigma_t: Float64Array,
+    sigma_s_prime: Float64Array,
+    thickness: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
     """Lay one layer over an interface (draw, give) and return the new interface's values.
 
     With psi the solution of D psi'' = sigma_a psi that is 1 at the layer's top and meets the
@@ -131,8 +130,8 @@ def _cover(
 
 
 def _beam_integrals(
-    kappa: FloatArray, sigma_t: FloatArray, d: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    kappa: Float64Array, sigma_t: Float64Array, d: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Integrate exp(-sigma_t z) exp(-kappa z) and exp(-sigma_t z) exp(-kappa (2 d - z))."""
     total = kappa + sigma_t
     decaying = d * _unit_decay(total * d)
@@ -142,7 +141,7 @@ def _beam_integrals(
     return decaying, growing
 
 
-def _unit_decay(x: FloatArray) -> FloatArray:
+def _unit_decay(x: Float64Array) -> Float64Array:
     """Return (1 - exp(-x))/x for x >= 0, which is 1 at 0."""
     small = x < 1e-8
     return np.asarray(np.where(small, 1.0 - 0.5 * x, -np.expm1(-x) / np.where(small, 1.0, x)))

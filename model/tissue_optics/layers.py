@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import spectra
+from model.arrays import Float64Array
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, layered_diffusion
 
-FloatArray = NDArray[np.float64]
 Tier = Literal["adding_doubling", "diffusion"]
 
 # Jimenez et al. 2010, doi:10.1145/1866158.1866167: Table 1 and figure 9.
@@ -41,7 +41,7 @@ class TissueError(ValueError):
     """A chromophore or an optical property lies outside what tissue can be."""
 
 
-def blood_absorption(wavelength_nm: ArrayLike, *, oxygenation: float = OXYGENATION) -> FloatArray:
+def blood_absorption(wavelength_nm: ArrayLike, *, oxygenation: float = OXYGENATION) -> Float64Array:
     """Return the absorption of whole blood with 150 g/l of hemoglobin.
 
     Parameters
@@ -76,7 +76,7 @@ def skin_layers(
     beta_m: float = BETA_M,
     c_he: ArrayLike | None = None,
     oxygenation: float = OXYGENATION,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the optical properties of epidermis and dermis.
 
     Parameters
@@ -150,7 +150,7 @@ def two_layer_reflectance(
     tier: Tier = "adding_doubling",
     anisotropy: float = 0.0,
     directions: int | None = None,
-) -> FloatArray:
+) -> Float64Array:
     """Return the diffuse reflectance of skin: an epidermis of 0.25 mm on a deep dermis.
 
     Parameters
@@ -219,7 +219,7 @@ def layer_stack_reflectance(
     tier: Tier = "adding_doubling",
     anisotropy: float | tuple[float, ...] = 0.0,
     directions: int | None = None,
-) -> FloatArray:
+) -> Float64Array:
     """Return the diffuse reflectance of plane layers at normal incidence.
 
     Parameters
@@ -293,7 +293,7 @@ def layer_stack_reflectance(
 
 
 def _check_range(
-    name: str, values: FloatArray, low: float, high: float, *, open_end: bool = False
+    name: str, values: Float64Array, low: float, high: float, *, open_end: bool = False
 ) -> None:
     within = (values >= low) & ((values < high) if open_end else (values <= high))
     if not within.all():

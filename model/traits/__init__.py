@@ -2,8 +2,4 @@
 
 from model.traits.space import EditOutcome, TraitSpace, cosine
 
-__all__ = [
-    "EditOutcome",
-    "TraitSpace",
-    "cosine",
-]
+__all__ = ["EditOutcome", "TraitSpace", "cosine"]

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, Float64Array
 from model.traits import nonnegative_kernels
-
-FloatArray = NDArray[np.float64]
 
 TOLERANCE = 1e-5
 """What float32 leaves of a sum of one, and of a share of zero."""
@@ -30,15 +29,15 @@ class FeasibleError(ValueError):
 class Free:
     """Everything finite."""
 
-    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
         return np.asarray(np.isfinite(np.asarray(samples, np.float64)).all(axis=-1))
 
-    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+    def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
         """Return the samples (..., d) as they are."""
         return np.array(samples, np.float64)
 
-    def tangent(self, vector: ArrayLike) -> FloatArray:
+    def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: all of it."""
         return np.array(vector, np.float64)
 
@@ -51,13 +50,13 @@ class Free:
 class NonNegative:
     """Samples of shares that are at least 0."""
 
-    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
         s = np.asarray(samples, np.float64)
         scale = np.abs(s).max(axis=-1, initial=0.0, keepdims=True)
         return np.asarray((np.isfinite(s) & (s >= -TOLERANCE * scale)).all(axis=-1))
 
-    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+    def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
         """Return the nearest samples of the set.
 
         Parameters
@@ -83,7 +82,7 @@ class NonNegative:
             return np.maximum(s, 0.0)
         return nonnegative_kernels.nearest(metric, s.reshape(-1, s.shape[-1])).reshape(s.shape)
 
-    def tangent(self, vector: ArrayLike) -> FloatArray:
+    def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: all of it."""
         return np.array(vector, np.float64)
 
@@ -104,14 +103,14 @@ class Histograms:
         if self.block < 1:
             raise FeasibleError(f"block: got {self.block}, expected at least 1 bin")
 
-    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
         s = self._blocks(samples)
         with np.errstate(invalid="ignore"):
             good = (s >= -TOLERANCE) & (np.abs(s.sum(axis=-1, keepdims=True) - 1.0) <= TOLERANCE)
         return np.asarray(good.all(axis=(-1, -2)))
 
-    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+    def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
         """Return the nearest samples of the set, all bins counting the same.
 
         Parameters
@@ -144,7 +143,7 @@ class Histograms:
         found = np.maximum(s - np.take_along_axis(loss, last, axis=-1), 0.0)
         return found.reshape(np.shape(samples))
 
-    def tangent(self, vector: ArrayLike) -> FloatArray:
+    def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: each histogram keeps its sum."""
         s = self._blocks(vector)
         return np.asarray((s - s.mean(axis=-1, keepdims=True)).reshape(np.shape(vector)))
@@ -153,7 +152,7 @@ class Histograms:
         """Return what `from_document` reads."""
         return {"set": "histograms", "block": self.block}
 
-    def _blocks(self, samples: ArrayLike) -> FloatArray:
+    def _blocks(self, samples: ArrayLike) -> Float64Array:
         s = np.asarray(samples, np.float64)
         if not s.ndim or s.shape[-1] % self.block or not s.shape[-1]:
             raise FeasibleError(
@@ -180,7 +179,7 @@ def from_document(document: Mapping[str, Any]) -> FeasibleSet:
     )
 
 
-def smallest(samples: FloatArray) -> FeasibleSet:
+def smallest(samples: Float64Array) -> FeasibleSet:
     """Return the smallest set that holds samples (n, d): histograms of 256, non-negative, free.
 
     Examples

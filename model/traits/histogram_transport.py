@@ -13,9 +13,9 @@ Villani 2003, Topics in Optimal Transportation, section 2.2 (the line), doi:10.1
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from model.arrays import Float64Array
 
 LEVELS = 256
 """Quantiles of a histogram, at even shares (k + 1/2) / 256."""
@@ -25,12 +25,12 @@ class TransportError(ValueError):
     """Histograms, edges or changes that do not fit each other."""
 
 
-def shares() -> Floats:
+def shares() -> Float64Array:
     """Return the shares at which quantiles are taken, (256,)."""
     return (np.arange(LEVELS) + 0.5) / LEVELS
 
 
-def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Floats:
+def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
     """Return the quantiles of histograms whose bins are filled evenly.
 
     Parameters
@@ -60,7 +60,7 @@ def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Floats:
     return out.reshape(*np.shape(histograms)[:-1], LEVELS)
 
 
-def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Floats:
+def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float64Array:
     """Return edges stretched so far that nothing leaves them when quantiles change.
 
     Parameters
@@ -89,7 +89,7 @@ def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float
 
 def moved(
     histograms: ArrayLike, edges: ArrayLike, change: ArrayLike, *, onto: ArrayLike | None = None
-) -> Floats:
+) -> Float64Array:
     """Return histograms with what they count moved by a change of their quantiles.
 
     Parameters
@@ -134,7 +134,7 @@ def moved(
     return out.reshape(np.shape(histograms))
 
 
-def _change(histograms: ArrayLike, change: ArrayLike) -> Floats:
+def _change(histograms: ArrayLike, change: ArrayLike) -> Float64Array:
     shape = (*np.shape(histograms)[:-1], LEVELS)
     by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, LEVELS)
     if not np.isfinite(by).all():
@@ -142,7 +142,7 @@ def _change(histograms: ArrayLike, change: ArrayLike) -> Floats:
     return by
 
 
-def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Floats, Floats]:
+def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Float64Array, Float64Array]:
     given = np.asarray(histograms, np.float64)
     over = np.asarray(edges, np.float64)
     if given.ndim < 1 or over.shape != (*given.shape[:-1], given.shape[-1] + 1):
@@ -155,7 +155,7 @@ def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Floats, Floats]:
     return h, over.reshape(-1, given.shape[-1] + 1)
 
 
-def _rising(filled: Floats, place: Floats) -> tuple[Floats, Floats]:
+def _rising(filled: Float64Array, place: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Leave out what does not rise, so that an empty stretch has no quantiles in it.
 
     Of a run of equal shares its two ends count, the second a little later.

@@ -31,11 +31,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 from threadpoolctl import threadpool_limits
 
+from model.arrays import Float64Array, FloatArray
 from model.traits import nonnegative_kernels, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import TraitError
-
-FloatArray = NDArray[np.float64]
 
 WORTH = 0.05
 """A trait brings a lobe when that lowers the error of its edit by more than this share of it."""
@@ -68,11 +67,11 @@ class LobeEdit:
         Share of each trait's vector that the lobes cannot show.
     """
 
-    weights: NDArray[np.floating]
-    mix: FloatArray
-    moved: FloatArray
-    clipped: FloatArray
-    return_bound: FloatArray
+    weights: FloatArray
+    mix: Float64Array
+    moved: Float64Array
+    clipped: Float64Array
+    return_bound: Float64Array
     misfit: Mapping[str, float]
 
     @property
@@ -161,7 +160,7 @@ def edit_weights(
 
 def _checked(
     given: NDArray[np.generic], mix: ArrayLike, space: TraitSpace, materials: tuple[str, ...]
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     t, lobes = np.asarray(given, np.float64), np.array(mix, np.float64)
     d = len(space.center)
     if lobes.ndim != 2 or lobes.shape[1] != d or not (lobes >= 0.0).all():
@@ -180,7 +179,7 @@ def _checked(
     return t, lobes
 
 
-def _amount(name: str, amount: ArrayLike, count: int) -> FloatArray:
+def _amount(name: str, amount: ArrayLike, count: int) -> Float64Array:
     a = np.asarray(amount, np.float64)
     if a.shape not in ((), (count,)) or not np.isfinite(a).all():
         raise TraitError(
@@ -189,11 +188,13 @@ def _amount(name: str, amount: ArrayLike, count: int) -> FloatArray:
     return np.array(np.broadcast_to(a, (count,)))
 
 
-def _padded(t: FloatArray, count: int) -> FloatArray:
+def _padded(t: Float64Array, count: int) -> Float64Array:
     return np.pad(t, ((0, 0), (0, count - t.shape[1])))
 
 
-def _on_lobes(lobes: FloatArray, vector: FloatArray, metric: FloatArray | None) -> FloatArray:
+def _on_lobes(
+    lobes: Float64Array, vector: Float64Array, metric: Float64Array | None
+) -> Float64Array:
     """Return the signed shares of lobes that come nearest to a vector."""
     products = reduced_spaces.times_metric(lobes, metric)
     gram = products @ lobes.T
@@ -203,12 +204,12 @@ def _on_lobes(lobes: FloatArray, vector: FloatArray, metric: FloatArray | None) 
 
 
 def _with_lobe(
-    t: FloatArray,
-    lobes: FloatArray,
-    vector: FloatArray,
-    amount: FloatArray,
-    metric: FloatArray | None,
-) -> FloatArray:
+    t: Float64Array,
+    lobes: Float64Array,
+    vector: Float64Array,
+    amount: Float64Array,
+    metric: Float64Array | None,
+) -> Float64Array:
     """Return the lobes and, where it is worth it, one more for a trait."""
     mean = float(amount.mean())
     strength = float(np.sqrt(np.mean(amount**2)))
@@ -230,11 +231,11 @@ def _with_lobe(
 
 
 def _error(
-    t: FloatArray,
-    lobes: FloatArray,
-    vector: FloatArray,
-    amount: FloatArray,
-    metric: FloatArray | None,
+    t: Float64Array,
+    lobes: Float64Array,
+    vector: Float64Array,
+    amount: Float64Array,
+    metric: Float64Array | None,
 ) -> float:
     """Return the RMS length by which edits on some lobes miss what was asked."""
     z = _on_lobes(lobes, vector, metric)

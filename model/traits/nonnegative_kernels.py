@@ -10,9 +10,8 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
 
 DEPENDENT = 1e-12
 """A material whose part outside those in use is a smaller share of its square is not used."""
@@ -21,7 +20,7 @@ STOP = 1e-10
 ROWS = 512  # rows that share their working memory
 
 
-def nearest(gram: FloatArray, wanted: FloatArray) -> FloatArray:
+def nearest(gram: Float64Array, wanted: Float64Array) -> Float64Array:
     """Return the non-negative mixtures x that are nearest: least (x - t)' G (x - t).
 
     Parameters

@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import Float64Array
 from model.traits import nonnegative_kernels
 from model.traits.vectors import Trait, TraitError, exponent_of
 
-FloatArray = NDArray[np.float64]
 SpaceKind = Literal["pca", "nmf"]
 
 HALVINGS = 20
@@ -51,15 +51,15 @@ class Reduction:
     """
 
     kind: SpaceKind
-    center: FloatArray
-    basis: FloatArray
-    whole: FloatArray
-    scores: FloatArray
-    coordinates: FloatArray
+    center: Float64Array
+    basis: Float64Array
+    whole: Float64Array
+    scores: Float64Array
+    coordinates: Float64Array
     lost: float
 
 
-def check_metric(metric: ArrayLike | None, length: int) -> FloatArray | None:
+def check_metric(metric: ArrayLike | None, length: int) -> Float64Array | None:
     """Return a metric as float64; refuse one that is none of samples of this length."""
     if metric is None:
         return None
@@ -80,20 +80,20 @@ def check_metric(metric: ArrayLike | None, length: int) -> FloatArray | None:
     return np.asarray(0.5 * (g + g.T))
 
 
-def times_metric(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+def times_metric(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     """Return samples (..., d) times the metric."""
     if metric is None:
         return samples
     return np.asarray(samples * metric if metric.ndim == 1 else samples @ metric)
 
 
-def lengths(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+def lengths(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     """Return the lengths of samples (..., d) under the metric, (...)."""
     squared = np.sum(samples * times_metric(samples, metric), axis=-1)
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def framed(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+def framed(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     """Return samples (n, d) in a frame where the metric is the plain sum of squares."""
     if metric is None:
         return samples
@@ -104,11 +104,11 @@ def framed(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
 
 
 def principal(
-    samples: FloatArray,
+    samples: Float64Array,
     traits: Sequence[Trait],
     *,
     components: int | None,
-    metric: FloatArray | None,
+    metric: Float64Array | None,
     rng: np.random.Generator,
 ) -> Reduction:
     """Return the principal components of samples.
@@ -161,7 +161,7 @@ def principal(
     return Reduction("pca", center, basis, scores, held, scores[:, :kept].copy(), lost)
 
 
-def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Generator) -> int:
+def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Generator) -> int:
     """Return how many components make trait vectors that hold for other people.
 
     Parameters
@@ -183,9 +183,7 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
     is not, and loses a trait that is smaller than what people differ in anyway.
     """
     n, rank = scores.shape
-    used = [
-        t for t in traits if t.kind == "binary" and 2 <= t.members <= n - 2
-    ]  # fmt: skip
+    used = [t for t in traits if t.kind == "binary" and 2 <= t.members <= n - 2]
     most = min(n // 2 - 2, rank)
     if not used or most < 2 or not scores.any():
         return rank
@@ -219,7 +217,7 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
 
 
 def mixtures(
-    samples: FloatArray, basis: ArrayLike | None, *, metric: FloatArray | None
+    samples: Float64Array, basis: ArrayLike | None, *, metric: Float64Array | None
 ) -> Reduction:
     """Return samples as non-negative mixtures of a basis.
 
@@ -272,8 +270,8 @@ def mixtures(
 
 
 def mixture_coordinates(
-    samples: FloatArray, basis: FloatArray, metric: FloatArray | None
-) -> FloatArray:
+    samples: Float64Array, basis: Float64Array, metric: Float64Array | None
+) -> Float64Array:
     """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples.
 
     Both finite, each in any unit; what is narrower than double precision is widened.

@@ -18,16 +18,16 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
+from model.arrays import Float64Array, FloatArray
 from model.traits import feasible_sets, reduced_spaces
 from model.traits import vectors as trait_vectors
 from model.traits.feasible_sets import FeasibleSet
 from model.traits.reduced_spaces import Reduction, SpaceKind
 from model.traits.vectors import Contrast, Trait, TraitError, TraitVector
 
-FloatArray = NDArray[np.float64]
 Mode = Literal["linear", "convex"]
 Source = Literal["simulated", "measured"]
 
@@ -50,13 +50,13 @@ class EditOutcome:
         metric: a projection onto a convex set never moves points apart.
     """
 
-    sample: NDArray[np.floating]
-    moved: FloatArray
-    clipped: FloatArray
-    return_bound: FloatArray
+    sample: FloatArray
+    moved: Float64Array
+    clipped: Float64Array
+    return_bound: Float64Array
 
     @property
-    def share(self) -> FloatArray:
+    def share(self) -> Float64Array:
         """Share of the change that was not possible; 0 where nothing was asked for."""
         asked = np.where(self.moved > 0.0, self.moved, 1.0)
         return np.where(self.moved > 0.0, self.clipped / asked, 0.0)
@@ -89,11 +89,11 @@ class TraitSpace:
     """
 
     kind: SpaceKind
-    center: FloatArray
-    basis: FloatArray
+    center: Float64Array
+    basis: Float64Array
     traits: Mapping[str, TraitVector]
     feasible: FeasibleSet
-    metric: FloatArray | None
+    metric: Float64Array | None
     samples: int
     lost: float
     seed: int
@@ -223,7 +223,7 @@ class TraitSpace:
             raise TraitError(f"trait: got {name!r}, expected one of {', '.join(self.traits)}")
         return self.traits[name]
 
-    def mean_with(self, name: str) -> FloatArray:
+    def mean_with(self, name: str) -> Float64Array:
         """Return the mean sample of those with a binary trait, (d,), as far as the space holds it.
 
         The nearest sample of the feasible set, where the space is too small to hold the mean.
@@ -238,7 +238,7 @@ class TraitSpace:
         """Return the cosine between a trait's vector and a direction (d,), under the metric."""
         return cosine(self.trait(name).vector, direction, self.metric)
 
-    def coordinates(self, samples: ArrayLike) -> FloatArray:
+    def coordinates(self, samples: ArrayLike) -> Float64Array:
         """Return samples (..., d) in the reduced space, (..., K).
 
         From the center in principal components, else shares of the basis, at least 0.
@@ -252,14 +252,14 @@ class TraitSpace:
         found = reduced_spaces.mixture_coordinates(flat, self.basis, self.metric)
         return found.reshape(*s.shape[:-1], -1)
 
-    def reduced(self, samples: ArrayLike) -> FloatArray:
+    def reduced(self, samples: ArrayLike) -> Float64Array:
         """Return the part of samples (..., d) that the reduced space holds, (..., d)."""
         inside = self.coordinates(samples) @ self.basis
         return np.asarray(inside + self.center if self.kind == "pca" else inside)
 
     def edit(
         self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
-    ) -> NDArray[np.floating]:
+    ) -> FloatArray:
         """Return samples with more or less of some traits; see `outcome`.
 
         Examples
@@ -322,11 +322,11 @@ class TraitSpace:
         clipped = reduced_spaces.lengths(found - wanted, self.metric)
         return EditOutcome(found.astype(dtype), moved, clipped, clipped)
 
-    def _products(self) -> FloatArray | None:
+    def _products(self) -> Float64Array | None:
         """Return the metric where it joins several numbers; weights alone move no projection."""
         return self.metric if self.metric is not None and self.metric.ndim == 2 else None
 
-    def _mixed(self, s: FloatArray, amounts: Mapping[str, float]) -> FloatArray:
+    def _mixed(self, s: Float64Array, amounts: Mapping[str, float]) -> Float64Array:
         total = sum(amounts.values())
         if min(amounts.values(), default=0.0) < 0.0 or total > 1.0 + 1e-12:
             raise TraitError(
@@ -337,7 +337,7 @@ class TraitSpace:
             mixed = mixed + amount * self.mean_with(name)
         return np.asarray(mixed)
 
-    def _checked(self, samples: ArrayLike) -> FloatArray:
+    def _checked(self, samples: ArrayLike) -> Float64Array:
         s = np.asarray(samples, np.float64)
         if not s.ndim or s.shape[-1] != len(self.center) or not np.isfinite(s).all():
             raise TraitError(
@@ -346,7 +346,7 @@ class TraitSpace:
         return s
 
 
-def cosine(a: ArrayLike, b: ArrayLike, metric: FloatArray | None = None) -> float:
+def cosine(a: ArrayLike, b: ArrayLike, metric: Float64Array | None = None) -> float:
     """Return the cosine between two directions (d,) under a metric; 0 when one has no length.
 
     Examples
@@ -362,7 +362,7 @@ def cosine(a: ArrayLike, b: ArrayLike, metric: FloatArray | None = None) -> floa
 
 
 def _vectors(
-    x: FloatArray,
+    x: Float64Array,
     traits: tuple[Trait, ...],
     reduced: Reduction,
     inside: FeasibleSet,

@@ -19,11 +19,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from model.arrays import Float64Array
 from model.traits import feasible_sets, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import Confidence, TraitError, TraitVector
 
-FloatArray = NDArray[np.float64]
 Precision = Literal["float64", "float32", "float16", "int8"]
 Source = Literal["simulated", "measured"]
 
@@ -187,7 +187,7 @@ def _packed(
 ) -> dict[str, Any]:
     names = list(space.traits)
     found = list(space.traits.values())
-    values: dict[str, FloatArray] = {
+    values: dict[str, Float64Array] = {
         "center": space.center,
         "basis": space.basis,
         "vectors": np.array([t.vector for t in found]).reshape(len(found), -1),
@@ -287,7 +287,7 @@ def _unpacked(
     )
 
 
-def _encoded(key: str, values: FloatArray, precision: Precision) -> dict[str, NDArray[Any]]:
+def _encoded(key: str, values: Float64Array, precision: Precision) -> dict[str, NDArray[Any]]:
     if precision != "int8":
         return {key: values.astype(precision)}
     width = values.shape[-1]
@@ -299,7 +299,7 @@ def _encoded(key: str, values: FloatArray, precision: Precision) -> dict[str, ND
     return {key: steps.reshape(padded.shape)[..., :width], f"{key}/scale": scale[..., 0]}
 
 
-def _decoded(key: str, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:
+def _decoded(key: str, arrays: Mapping[str, NDArray[Any]]) -> Float64Array:
     values = arrays[key].astype(np.float64)
     scale = arrays.get(f"{key}/scale")
     if scale is None:

@@ -19,9 +19,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from model.arrays import Float64Array
+
 Kind = Literal["binary", "continuous"]
 Contrast = Literal["means", "regression"]
 
@@ -91,9 +92,9 @@ class TraitVector:
 
     name: str
     kind: Kind
-    vector: FloatArray
-    stderr: FloatArray
-    coordinates: FloatArray
+    vector: Float64Array
+    stderr: Float64Array
+    coordinates: Float64Array
     members: int
     others: int
     confidence: Confidence
@@ -127,9 +128,9 @@ class Trait:
 
     name: str
     kind: Kind
-    values: FloatArray
+    values: Float64Array
     """(n,); 0 and 1 for a binary trait, else in the trait's unit."""
-    contrast: FloatArray
+    contrast: Float64Array
     """(n,) weights of the samples in the trait's vector; they sum to 0."""
 
     @property
@@ -185,7 +186,7 @@ def traits_of(
         )
     if count < 2:
         raise TraitError(f"samples: got {count}, expected at least 2")
-    values: list[tuple[str, Kind, FloatArray]] = []
+    values: list[tuple[str, Kind, Float64Array]] = []
     for name, given in labels.items():
         values.append((name, "binary", _label(name, given, count)))
     for name, given in continuous.items():
@@ -195,8 +196,12 @@ def traits_of(
         found = [row / (row @ row) for row in rows]
     else:
         scale = np.array([np.std(v) for _, _, v in values])
-        design = np.column_stack([np.ones(count), *((v - v.mean()) / s for (_, _, v), s in
-                                                    zip(values, scale, strict=True))])  # fmt: skip
+        design = np.column_stack(
+            [
+                np.ones(count),
+                *((v - v.mean()) / s for (_, _, v), s in zip(values, scale, strict=True)),
+            ]
+        )
         if np.linalg.matrix_rank(design) < design.shape[1]:
             raise TraitError(
                 f"traits: {', '.join(name for name, _, _ in values)} of {count} people cannot be "
@@ -207,7 +212,7 @@ def traits_of(
     return tuple(Trait(name, kind, v, c) for (name, kind, v), c in zip(values, found, strict=True))
 
 
-def _label(name: str, given: ArrayLike, count: int) -> FloatArray:
+def _label(name: str, given: ArrayLike, count: int) -> Float64Array:
     label = np.asarray(given)
     if label.shape != (count,):
         raise TraitError(f"label {name!r}: got shape {label.shape}, expected ({count},)")
@@ -223,7 +228,7 @@ def _label(name: str, given: ArrayLike, count: int) -> FloatArray:
     return value
 
 
-def _value(name: str, given: ArrayLike, count: int) -> FloatArray:
+def _value(name: str, given: ArrayLike, count: int) -> Float64Array:
     value = np.asarray(given, np.float64)
     if value.shape != (count,):
         raise TraitError(f"{name}: got shape {value.shape}, expected ({count},)")
@@ -236,7 +241,7 @@ def _value(name: str, given: ArrayLike, count: int) -> FloatArray:
     return value
 
 
-def exponent_of(*values: FloatArray) -> int:
+def exponent_of(*values: Float64Array) -> int:
     """Return the power of two that scales numbers to sizes up to 1; 0 where all are 0.
 
     What does not depend on a unit is computed of ``numpy.ldexp(values, -exponent)``, exactly the
@@ -263,7 +268,7 @@ def exponent_of(*values: FloatArray) -> int:
     return int(np.frexp(largest)[1])
 
 
-def correlations(traits: tuple[Trait, ...]) -> FloatArray:
+def correlations(traits: tuple[Trait, ...]) -> Float64Array:
     """Return the correlations of the traits' values, (t, t)."""
     centered = np.array([t.values - t.values.mean() for t in traits])
     size = np.sqrt((centered**2).sum(axis=1, keepdims=True))
@@ -271,7 +276,9 @@ def correlations(traits: tuple[Trait, ...]) -> FloatArray:
     return np.asarray(centered @ centered.T)
 
 
-def residuals(trait: Trait, samples: FloatArray, *, beside: tuple[Trait, ...] = ()) -> FloatArray:
+def residuals(
+    trait: Trait, samples: Float64Array, *, beside: tuple[Trait, ...] = ()
+) -> Float64Array:
     """Return what the trait leaves of samples (n, d), and each one's leverage in a last column.
 
     Parameters
@@ -285,7 +292,7 @@ def residuals(trait: Trait, samples: FloatArray, *, beside: tuple[Trait, ...] = 
     return np.column_stack([left, np.minimum((q**2).sum(axis=1), 1.0)])
 
 
-def error_weights(trait: Trait, leverage: FloatArray, parameters: int) -> FloatArray:
+def error_weights(trait: Trait, leverage: Float64Array, parameters: int) -> Float64Array:
     """Return the weights of squared residuals in the vector's squared standard errors, (n,).
 
     One's own for people whom the trait's group leaves free (HC2); the mean of all others' for the
@@ -304,9 +311,9 @@ def error_weights(trait: Trait, leverage: FloatArray, parameters: int) -> FloatA
 
 def confidence(
     trait: Trait,
-    scores: FloatArray,
+    scores: Float64Array,
     *,
-    whole: FloatArray | None = None,
+    whole: Float64Array | None = None,
     beside: tuple[Trait, ...] = (),
     permutations: int = 999,
     resamples: int = 400,

@@ -11,13 +11,9 @@ Khronos Data Format Specification 1.3, chapters "S3TC" (BC1, BC3) and "RGTC" (BC
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Bytes: TypeAlias = NDArray[np.uint8]
+from model.arrays import Float64Array, FloatArray, Int64Array, UInt8Array
 
 SIDE = 4
 """Texels a side of a block."""
@@ -38,7 +34,7 @@ def blocks_of(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // SIDE), -(-shape[1] // SIDE)
 
 
-def encode_bc4(values: NDArray[np.floating]) -> Bytes:
+def encode_bc4(values: FloatArray) -> UInt8Array:
     """Encode one channel.
 
     Parameters
@@ -62,7 +58,7 @@ def encode_bc4(values: NDArray[np.floating]) -> Bytes:
     return np.concatenate(out).reshape(rows, columns, 8)
 
 
-def decode_bc4(blocks: Bytes, shape: tuple[int, int]) -> Floats:
+def decode_bc4(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
     """Return the channel (h, w) in [0, 1] that blocks hold, in either of the format's modes."""
     data = _checked(blocks, 8, shape).astype(np.int64)
     r0, r1 = data[..., 0], data[..., 1]
@@ -77,19 +73,19 @@ def decode_bc4(blocks: Bytes, shape: tuple[int, int]) -> Floats:
     return _joined(np.take_along_axis(palette, codes, axis=-1)[..., None], shape)[..., 0]
 
 
-def encode_bc5(values: NDArray[np.floating]) -> Bytes:
+def encode_bc5(values: FloatArray) -> UInt8Array:
     """Encode two channels (h, w, 2) in [0, 1], each as BC4: (ceil(h/4), ceil(w/4), 16)."""
     _channels(values, 2)
     return np.concatenate([encode_bc4(values[..., c]) for c in (0, 1)], axis=-1)
 
 
-def decode_bc5(blocks: Bytes, shape: tuple[int, int]) -> Floats:
+def decode_bc5(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
     """Return the two channels (h, w, 2) in [0, 1] that blocks hold."""
     data = _checked(blocks, 16, shape)
     return np.stack([decode_bc4(data[..., :8], shape), decode_bc4(data[..., 8:], shape)], axis=-1)
 
 
-def encode_bc1(colors: NDArray[np.floating]) -> Bytes:
+def encode_bc1(colors: FloatArray) -> UInt8Array:
     """Encode colors (h, w, 3) in [0, 1] without transparency: (ceil(h/4), ceil(w/4), 8)."""
     _channels(colors, 3)
     texels = _cut(colors)
@@ -99,7 +95,9 @@ def encode_bc1(colors: NDArray[np.floating]) -> Bytes:
     return np.concatenate(out).reshape(rows, columns, 8)
 
 
-def decode_bc1(blocks: Bytes, shape: tuple[int, int], *, always_four: bool = False) -> Floats:
+def decode_bc1(
+    blocks: UInt8Array, shape: tuple[int, int], *, always_four: bool = False
+) -> Float64Array:
     """Return the colors (h, w, 3) in [0, 1] that blocks hold.
 
     Parameters
@@ -122,13 +120,13 @@ def decode_bc1(blocks: Bytes, shape: tuple[int, int], *, always_four: bool = Fal
     return _joined(np.take_along_axis(palette, codes[..., None], axis=-2), shape)
 
 
-def encode_bc3(values: NDArray[np.floating]) -> Bytes:
+def encode_bc3(values: FloatArray) -> UInt8Array:
     """Encode four channels (h, w, 4) in [0, 1]: the last as BC4, then the others as BC1."""
     _channels(values, 4)
     return np.concatenate([encode_bc4(values[..., 3]), encode_bc1(values[..., :3])], axis=-1)
 
 
-def decode_bc3(blocks: Bytes, shape: tuple[int, int]) -> Floats:
+def decode_bc3(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
     """Return the four channels (h, w, 4) in [0, 1] that blocks hold."""
     data = _checked(blocks, 16, shape)
     last = decode_bc4(data[..., :8], shape)
@@ -136,7 +134,7 @@ def decode_bc3(blocks: Bytes, shape: tuple[int, int]) -> Floats:
     return np.concatenate([colors, last[..., None]], axis=-1)
 
 
-def _bc4_chunk(v: Floats) -> Bytes:
+def _bc4_chunk(v: Float64Array) -> UInt8Array:
     """Encode (n, 16) values in [0, 255]: ends from the range, by least squares, by single steps."""
     most, least = v.max(axis=1), v.min(axis=1)
     high, low = np.ceil(most), np.floor(least)
@@ -162,7 +160,9 @@ def _bc4_chunk(v: Floats) -> Bytes:
     return out
 
 
-def _bc4_steps(v: Floats, high: Floats, low: Floats) -> tuple[Floats, Floats]:
+def _bc4_steps(
+    v: Float64Array, high: Float64Array, low: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     width = high - low
     scale = np.divide(7.0, width, out=np.zeros_like(width), where=width > 0)
     steps = np.clip(np.rint((high[:, None] - v) * scale[:, None]), 0, 7)
@@ -171,8 +171,11 @@ def _bc4_steps(v: Floats, high: Floats, low: Floats) -> tuple[Floats, Floats]:
 
 
 def _better(
-    v: Floats, found: tuple[Floats, Floats, Floats, Floats], high: Floats, low: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
+    v: Float64Array,
+    found: tuple[Float64Array, Float64Array, Float64Array, Float64Array],
+    high: Float64Array,
+    low: Float64Array,
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     steps, error = _bc4_steps(v, high, low)
     win = error < found[3]
     return (
@@ -183,7 +186,7 @@ def _better(
     )
 
 
-def _least_squares_ends(v: Floats, part: Floats) -> tuple[Floats, Floats]:
+def _least_squares_ends(v: Float64Array, part: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return ends whose line fits best, given each texel's part of the second end."""
     axes = (slice(None), slice(None), *([None] * (v.ndim - 2)))
     p, q = (1.0 - part)[axes], part[axes]
@@ -199,7 +202,7 @@ def _least_squares_ends(v: Floats, part: Floats) -> tuple[Floats, Floats]:
     )
 
 
-def _bc1_chunk(v: Floats) -> Bytes:
+def _bc1_chunk(v: Float64Array) -> UInt8Array:
     """Encode (n, 16, 3) colors: ends on the principal axis, refined by least squares."""
     mean = v.mean(axis=1)
     about = v - mean[:, None]
@@ -207,7 +210,7 @@ def _bc1_chunk(v: Floats) -> Bytes:
     along = np.einsum("nki,ni->nk", about, axis)
     a = mean + along.max(axis=1)[:, None] * axis
     b = mean + along.min(axis=1)[:, None] * axis
-    best: tuple[NDArray[np.int64], ...] | None = None
+    best: tuple[Int64Array, ...] | None = None
     error = np.full(len(v), np.inf)
     for _ in range(FITS):
         ends = _to_565(a), _to_565(b)
@@ -219,9 +222,10 @@ def _bc1_chunk(v: Floats) -> Bytes:
             best = now
         else:
             best = (
-                np.where(win, now[0], best[0]), np.where(win, now[1], best[1]),
+                np.where(win, now[0], best[0]),
+                np.where(win, now[1], best[1]),
                 np.where(win[:, None], steps, best[2]),
-            )  # fmt: skip
+            )
         a, b = _least_squares_ends(v, best[2] / 3.0)
     assert best is not None  # noqa: S101
     first, second, steps = best
@@ -238,7 +242,9 @@ def _bc1_chunk(v: Floats) -> Bytes:
     return out
 
 
-def _bc1_steps(v: Floats, a: Floats, b: Floats) -> tuple[NDArray[np.int64], Floats]:
+def _bc1_steps(
+    v: Float64Array, a: Float64Array, b: Float64Array
+) -> tuple[Int64Array, Float64Array]:
     line = b - a
     length = (line * line).sum(axis=1)
     inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
@@ -248,17 +254,17 @@ def _bc1_steps(v: Floats, a: Floats, b: Floats) -> tuple[NDArray[np.int64], Floa
     return steps.astype(np.int64), ((shown - v) ** 2).sum(axis=(1, 2))
 
 
-def _to_565(colors: Floats) -> NDArray[np.int64]:
+def _to_565(colors: Float64Array) -> Int64Array:
     r, g, b = np.moveaxis(np.clip(np.rint(colors * [31, 63, 31]), 0, [31, 63, 31]), -1, 0)
     return (r.astype(np.int64) << 11) | (g.astype(np.int64) << 5) | b.astype(np.int64)
 
 
-def _from_565(packed: NDArray[np.int64]) -> Floats:
+def _from_565(packed: Int64Array) -> Float64Array:
     parts = np.stack([packed >> 11, (packed >> 5) & 63, packed & 31], axis=-1)
     return parts / np.array([31.0, 63.0, 31.0])
 
 
-def _cut(values: NDArray[np.floating]) -> Floats:
+def _cut(values: FloatArray) -> Float64Array:
     """Return blocks (rows, columns, 16, channels) of (h, w, channels), edges repeated."""
     v = np.asarray(values, np.float64)
     if v.ndim != 3 or 0 in v.shape:
@@ -272,18 +278,18 @@ def _cut(values: NDArray[np.floating]) -> Floats:
     return v.reshape(rows, columns, 16, channels)
 
 
-def _joined(texels: Floats, shape: tuple[int, int]) -> Floats:
+def _joined(texels: Float64Array, shape: tuple[int, int]) -> Float64Array:
     rows, columns, _, channels = texels.shape
     v = texels.reshape(rows, columns, SIDE, SIDE, channels).swapaxes(1, 2)
     return v.reshape(rows * SIDE, columns * SIDE, channels)[: shape[0], : shape[1]]
 
 
-def _channels(values: NDArray[np.floating], wanted: int) -> None:
+def _channels(values: FloatArray, wanted: int) -> None:
     if values.ndim != 3 or values.shape[2] != wanted:
         raise BlockError(f"texture: got shape {values.shape}, expected (h, w, {wanted})")
 
 
-def _checked(blocks: Bytes, size: int, shape: tuple[int, int]) -> Bytes:
+def _checked(blocks: UInt8Array, size: int, shape: tuple[int, int]) -> UInt8Array:
     data = np.asarray(blocks)
     expected = (*blocks_of(shape), size)
     if data.dtype != np.uint8 or data.shape != expected:

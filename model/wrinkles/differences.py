@@ -15,8 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import BoolArray, FloatArray
 from model.wrinkles import kernels
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
@@ -29,7 +30,6 @@ from model.wrinkles.expressions import (
     zone_sums,
 )
 from model.wrinkles.masks import Masks
-from model.wrinkles.partial_derivatives import Floating
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class NormalDifference:
         than 30 degrees are.
     """
 
-    values: Floating
-    valid: NDArray[np.bool_]
+    values: FloatArray
+    valid: BoolArray
     clamped_fraction: float
 
 
@@ -87,7 +87,7 @@ def combine(
     clamp: Clamp = "unit",
     table: Table = JIMENEZ2011,
     renormalize: bool = True,
-) -> Floating:
+) -> FloatArray:
     """Return base normals plus the difference, times the strength of its zones.
 
     Parameters
@@ -127,7 +127,7 @@ def combine(
     return out
 
 
-def _normals(name: str, values: ArrayLike) -> Floating:
+def _normals(name: str, values: ArrayLike) -> FloatArray:
     n = np.asarray(values)
     n = n if n.dtype in (np.float32, np.float64) else n.astype(np.float64)
     if n.ndim != 3 or n.shape[2] != 3 or 0 in n.shape:

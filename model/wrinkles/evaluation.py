@@ -15,8 +15,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.skin import SkinMap
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
@@ -29,7 +29,7 @@ from model.wrinkles.expressions import (
     clamped,
     zone_sums,
 )
-from model.wrinkles.partial_derivatives import Floating, Layer
+from model.wrinkles.partial_derivatives import Layer
 
 SCHEMA = "skinrig.wrinkles/1"
 FILE = "wrinkles.json"
@@ -54,10 +54,10 @@ class WrinkledNormals:
         largest of the layers' parts.
     """
 
-    normals: Floating
-    valid: NDArray[np.bool_]
-    zone_sums: tuple[NDArray[np.float64], ...]
-    zone_weights: tuple[NDArray[np.float64], ...]
+    normals: FloatArray
+    valid: BoolArray
+    zone_sums: tuple[Float64Array, ...]
+    zone_weights: tuple[Float64Array, ...]
     clamped_fraction: float
 
 
@@ -82,11 +82,11 @@ class WrinkleModel:
         weight that nothing determined.
     """
 
-    base: Floating
+    base: FloatArray
     layers: tuple[Layer, ...]
     clamp: Clamp = "unit"
-    valid: NDArray[np.bool_] | None = None
-    base_stderr: Floating | None = None
+    valid: BoolArray | None = None
+    base_stderr: FloatArray | None = None
     weight_stderr: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: NO_ERRORS)
 
     def __post_init__(self) -> None:
@@ -165,8 +165,13 @@ class WrinkleModel:
             name: [value if math.isfinite(value) else None for value in row]
             for name, row in self.weight_stderr.items()
         }
-        document = {"schema": SCHEMA, "frame": FRAME, "clamp": self.clamp, "layers": layers,
-                    "weight_stderr": errors}  # fmt: skip
+        document = {
+            "schema": SCHEMA,
+            "frame": FRAME,
+            "clamp": self.clamp,
+            "layers": layers,
+            "weight_stderr": errors,
+        }
         return maps, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
@@ -193,9 +198,13 @@ class WrinkleModel:
             }
             base = _named(maps, "wrinkle_base")
             return cls(
-                base.values[..., :2], layers, given["clamp"], base.valid,
-                None if base.stderr is None else base.stderr[..., :2], errors,
-            )  # fmt: skip
+                base.values[..., :2],
+                layers,
+                given["clamp"],
+                base.valid,
+                None if base.stderr is None else base.stderr[..., :2],
+                errors,
+            )
         except WrinkleError:
             raise
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -203,9 +212,9 @@ class WrinkleModel:
 
 
 def _map(
-    derivatives: Floating, stderr: Floating | None, valid: NDArray[np.bool_] | None, what: str
+    derivatives: FloatArray, stderr: FloatArray | None, valid: BoolArray | None, what: str
 ) -> SkinMap:
-    def three(values: Floating) -> NDArray[np.float32]:
+    def three(values: FloatArray) -> Float32Array:
         padding = ((0, 0), (0, 0), (0, 1))
         return np.pad(np.asarray(values, np.float32), padding)
 

@@ -19,9 +19,10 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats: TypeAlias = NDArray[np.float64]
+from model.arrays import Float64Array
+
 Clamp: TypeAlias = Literal["unit", "signed"]
 
 CLAMPS: Mapping[str, tuple[float, float]] = MappingProxyType(
@@ -91,7 +92,7 @@ class ExpressionTable:
         object.__setattr__(self, "zones", zones)
         object.__setattr__(self, "rows", MappingProxyType(rows))
 
-    def row(self, expression: str) -> Floats:
+    def row(self, expression: str) -> Float64Array:
         """Return the weights of one expression, (Z,)."""
         if expression not in self.rows:
             near = difflib.get_close_matches(expression, self.rows, n=1)
@@ -163,7 +164,7 @@ def as_table(table: Table) -> ExpressionTable:
     return ExpressionTable(JIMENEZ2011.zones, {n: tuple(row) for n, row in table.items()})
 
 
-def zone_sums(weights: Weights, table: Table = JIMENEZ2011) -> Floats:
+def zone_sums(weights: Weights, table: Table = JIMENEZ2011) -> Float64Array:
     """Return each zone's sum over blend shapes, before any clamp.
 
     Parameters
@@ -197,7 +198,7 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011) -> Floats:
     return sums
 
 
-def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Floats:
+def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
     """Return sums held in the range of `CLAMPS`; where it changes them is for the caller to say.
 
     Examples

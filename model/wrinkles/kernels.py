@@ -32,8 +32,9 @@ def threads_for(pixels: int) -> Iterator[None]:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add(total: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any,
-        a_part: Any) -> None:  # fmt: skip
+def add(
+    total: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any, a_part: Any
+) -> None:
     """Add a wrinkle map times its strength to derivatives in place.
 
     Parameters
@@ -59,8 +60,17 @@ def add(total: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: 
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add_and_normalize(base: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any,
-                      a_part: Any, normals: Any) -> None:  # fmt: skip
+def add_and_normalize(
+    base: Any,
+    wx: Any,
+    wy: Any,
+    w_rows: Any,
+    w_part: Any,
+    a: Any,
+    a_rows: Any,
+    a_part: Any,
+    normals: Any,
+) -> None:
     """Write unit normals of the base's derivatives plus a wrinkle map times its strength.
 
     Parameters as of :func:`add`; `normals` (H, W, 3) is written, 0 where a derivative is not
@@ -85,8 +95,19 @@ def add_and_normalize(base: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: 
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add_difference(base: Any, dx: Any, dy: Any, dz: Any, d_rows: Any, d_part: Any, a: Any,
-                   a_rows: Any, a_part: Any, renormalize: Any, normals: Any) -> None:  # fmt: skip
+def add_difference(
+    base: Any,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    d_rows: Any,
+    d_part: Any,
+    a: Any,
+    a_rows: Any,
+    a_part: Any,
+    renormalize: Any,
+    normals: Any,
+) -> None:
     """Write normals of a base (H, W, 3) plus a difference of normals times its strength.
 
     Parameters as of :func:`add`, with three planes of the difference; `renormalize` is 0 or 1.

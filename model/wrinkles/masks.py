@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from model.arrays import FloatArray
 from model.wrinkles.expressions import WrinkleError
 
-Floating: TypeAlias = NDArray[np.floating]
-Masks: TypeAlias = Floating | Sequence[Floating]
+Masks: TypeAlias = FloatArray | Sequence[FloatArray]
 
 
-def mask_stack(masks: Masks) -> Floating:
+def mask_stack(masks: Masks) -> FloatArray:
     """Return masks as (Z, h, w), from that or from RGBA textures (h, w, 4), four zones each.
 
     Parameters
@@ -43,7 +43,7 @@ def mask_stack(masks: Masks) -> Floating:
     return stack
 
 
-def mask_textures(masks: Masks) -> Floating:
+def mask_textures(masks: Masks) -> FloatArray:
     """Return masks as RGBA textures (T, h, w, 4), four zones each; unused channels are 0.
 
     Examples
@@ -58,7 +58,7 @@ def mask_textures(masks: Masks) -> Floating:
     return np.ascontiguousarray(np.moveaxis(out, 1, 3))
 
 
-def zone_strength(masks: Floating, sums: Floating) -> Floating:
+def zone_strength(masks: FloatArray, sums: FloatArray) -> FloatArray:
     """Return masks (Z, h, w) summed with their zones' weights (Z,): (h, w), float64.
 
     Bilinear reading is linear, so that one map is read instead of as many as there are zones.
@@ -73,7 +73,7 @@ def zone_strength(masks: Floating, sums: Floating) -> Floating:
     return np.tensordot(sums, masks.astype(np.float64, copy=False), axes=1)
 
 
-def real_array(values: ArrayLike) -> Floating:
+def real_array(values: ArrayLike) -> FloatArray:
     """Return float32 arrays as they are, half as float32, and everything else as float64."""
     given = np.asarray(values)
     if given.dtype in (np.float16, np.float32):

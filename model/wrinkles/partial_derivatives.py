@@ -22,12 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
+from model.arrays import BoolArray, FloatArray
 from model.wrinkles import kernels
 from model.wrinkles.expressions import (
     CLAMPS,
@@ -41,17 +42,31 @@ from model.wrinkles.expressions import (
 )
 from model.wrinkles.masks import Masks, mask_stack, mask_textures, real_array, zone_strength
 
-Floating: TypeAlias = NDArray[np.floating]
-
 ZONES = JIMENEZ2011.zones
 LIMIT = 1.0
 """Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
 
 __all__ = [
-    "CLAMPS", "JIMENEZ2011", "LIMIT", "ZONES", "Encoding", "Layer", "Masks", "WrinkleError",
-    "combine", "combine_layers", "decode", "encode", "encoding_report", "from_unit", "mask_stack",
-    "mask_textures", "to_unit", "widened", "zone_strength",
-]  # fmt: skip
+    "CLAMPS",
+    "JIMENEZ2011",
+    "LIMIT",
+    "ZONES",
+    "Encoding",
+    "Layer",
+    "Masks",
+    "WrinkleError",
+    "combine",
+    "combine_layers",
+    "decode",
+    "encode",
+    "encoding_report",
+    "from_unit",
+    "mask_stack",
+    "mask_textures",
+    "to_unit",
+    "widened",
+    "zone_strength",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +85,13 @@ class Encoding:
         Of the valid pixels; 0 where there is none.
     """
 
-    derivatives: Floating
-    valid: NDArray[np.bool_]
-    clamped: NDArray[np.bool_]
+    derivatives: FloatArray
+    valid: BoolArray
+    clamped: BoolArray
     clamped_fraction: float
 
 
-def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> Floating:
+def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> FloatArray:
     """Return partial derivatives of tangent-space normals.
 
     Parameters
@@ -133,7 +148,7 @@ def encoding_report(normals: ArrayLike, *, limit: float | None = LIMIT) -> Encod
     return Encoding(d, valid, beyond, share)
 
 
-def decode(derivatives: ArrayLike) -> Floating:
+def decode(derivatives: ArrayLike) -> FloatArray:
     """Return unit normals of partial derivatives.
 
     Parameters
@@ -161,7 +176,7 @@ def decode(derivatives: ArrayLike) -> Floating:
     return out
 
 
-def _decoded_huge(d: Floating) -> Floating:
+def _decoded_huge(d: FloatArray) -> FloatArray:
     good = np.asarray(np.isfinite(d).all(axis=-1))
     d = np.where(good[:, None], d, 0.0)
     scale = np.maximum(np.abs(d).max(axis=-1, keepdims=True), d.dtype.type(1.0))
@@ -170,7 +185,7 @@ def _decoded_huge(d: Floating) -> Floating:
     return np.where(good[:, None], n, 0.0)
 
 
-def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> Floating:
+def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> FloatArray:
     """Return derivatives in [-limit, limit] as texture values in [0, 1]; 0 becomes 0.5."""
     d = real_array(derivatives)
     if not np.isfinite(d).all() or (d.size and float(np.abs(d).max()) > limit):
@@ -181,7 +196,7 @@ def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> Floating:
     return d * d.dtype.type(0.5 / limit) + d.dtype.type(0.5)
 
 
-def from_unit(values: ArrayLike, *, limit: float = LIMIT) -> Floating:
+def from_unit(values: ArrayLike, *, limit: float = LIMIT) -> FloatArray:
     """Return the derivatives that texture values in [0, 1] stand for (listing 1.1)."""
     t = real_array(values)
     return (t * t.dtype.type(2.0) - t.dtype.type(1.0)) * t.dtype.type(limit)
@@ -206,11 +221,11 @@ class Layer:
         Where `wrinkle` was measured; elsewhere it is 0. None: everywhere.
     """
 
-    wrinkle: Floating
-    masks: Floating
+    wrinkle: FloatArray
+    masks: FloatArray
     table: Table = JIMENEZ2011
-    stderr: Floating | None = None
-    valid: NDArray[np.bool_] | None = None
+    stderr: FloatArray | None = None
+    valid: BoolArray | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of other shapes or with NaN."""
@@ -231,7 +246,7 @@ def combine(
     *,
     clamp: Clamp = "unit",
     table: Table = JIMENEZ2011,
-) -> Floating:
+) -> FloatArray:
     """Return the normals of a base map with wrinkles: listing 1.1.
 
     Parameters
@@ -290,12 +305,8 @@ def combine(
 
 
 def combine_layers(
-    base: ArrayLike,
-    layers: Sequence[Layer],
-    weights: Weights,
-    *,
-    clamp: Clamp = "unit",
-) -> Floating:
+    base: ArrayLike, layers: Sequence[Layer], weights: Weights, *, clamp: Clamp = "unit"
+) -> FloatArray:
     """Return the normals of a base map with several wrinkle maps, such as one of a lemon pose.
 
     Parameters
@@ -335,7 +346,7 @@ def combine_layers(
     raise AssertionError("a last layer returns")
 
 
-def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
+def widened(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
     """Return what the kernels read of a texture: planes with the base's columns, rows' taps.
 
     Parameters
@@ -356,7 +367,7 @@ def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, 
     return (*np.ascontiguousarray(wide, dtype), first, part.astype(dtype))
 
 
-def _derivatives(name: str, values: ArrayLike) -> Floating:
+def _derivatives(name: str, values: ArrayLike) -> FloatArray:
     """Return maps of derivatives as they are, and those of normals encoded."""
     d = real_array(values)
     if d.ndim < 3 or d.shape[-1] not in (2, 3) or 0 in d.shape[-3:]:
@@ -366,7 +377,7 @@ def _derivatives(name: str, values: ArrayLike) -> Floating:
     return encode(d, limit=None) if d.shape[-1] == 3 else d
 
 
-def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
+def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> FloatArray:
     d = real_array(values)
     if d.ndim != 3 or d.shape[2] != 2 or 0 in d.shape:
         hint = "; encode normals first" if d.ndim == 3 and d.shape[2] == 3 else ""

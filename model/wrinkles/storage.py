@@ -22,14 +22,14 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import metrics
+from model.arrays import BoolArray, FloatArray
 from model.texture_resampling import resampled
 from model.wrinkles import block_compression as blocks
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import Clamp, Weights, WrinkleError
-from model.wrinkles.partial_derivatives import Floating, Layer
+from model.wrinkles.partial_derivatives import Layer
 
 MapEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc5"]
 MaskEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc3"]
@@ -142,7 +142,7 @@ def paper_footprint() -> Footprint:
     return footprint((WRINKLE_SIDE, WRINKLE_SIDE), (MASK_SIDE, MASK_SIDE))
 
 
-def stored_map(derivatives: Floating, encoding: MapEncoding) -> Floating:
+def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     """Return derivatives as they come back from a texture.
 
     Parameters
@@ -172,7 +172,7 @@ def stored_map(derivatives: Floating, encoding: MapEncoding) -> Floating:
     return d.astype(np.float32)
 
 
-def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> Floating:
+def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
     """Return masks (Z, h, w), float32, as they come back from RGBA textures.
 
     "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
@@ -207,7 +207,7 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> Floating:
     return stack.astype(np.float32)
 
 
-def _eight_bits(values: NDArray[np.floating]) -> Floating:
+def _eight_bits(values: FloatArray) -> FloatArray:
     return np.rint(values * 255.0) / 255.0
 
 
@@ -237,18 +237,21 @@ class StorageRow:
 
 
 def storage_table(
-    base: Floating,
+    base: FloatArray,
     layer: Layer,
     weights: Weights,
     *,
     sides: Sequence[int] = (2048, 1024, 512, 256, 128, 64),
     mask_side: int | None = None,
     encodings: Sequence[tuple[MapEncoding, MaskEncoding]] = (
-        ("float32", "float32"), ("float16", "float16"), ("unit8", "unit8"), ("bc5", "bc3"),
+        ("float32", "float32"),
+        ("float16", "float16"),
+        ("unit8", "unit8"),
+        ("bc5", "bc3"),
     ),
     clamp: Clamp = "unit",
-    valid: NDArray[np.bool_] | None = None,
-) -> tuple[StorageRow, ...]:  # fmt: skip
+    valid: BoolArray | None = None,
+) -> tuple[StorageRow, ...]:
     """Store a layer at several sizes and encodings, and compare the normals with its own.
 
     Parameters
@@ -287,8 +290,9 @@ def storage_table(
             stored = Layer(stored_map(small, maps_as), stored_masks(masks, masks_as), layer.table)
             shown = wrinkles.combine_layers(whole, [stored], weights, clamp=clamp)
             mean, high = normal_error_deg(shown, reference, valid)
-            size = footprint((side, side), mask_shape, maps=maps_as, masks=masks_as,
-                             zones=len(masks))  # fmt: skip
+            size = footprint(
+                (side, side), mask_shape, maps=maps_as, masks=masks_as, zones=len(masks)
+            )
             rows.append(
                 StorageRow(side, mask_shape[0], maps_as, masks_as, size.total_bytes, mean, high)
             )
@@ -296,7 +300,7 @@ def storage_table(
 
 
 def normal_error_deg(
-    normals: Floating, reference: Floating, valid: NDArray[np.bool_] | None = None
+    normals: FloatArray, reference: FloatArray, valid: BoolArray | None = None
 ) -> tuple[float, float]:
     """Return mean and 99th percentile of the angle between two maps of normals, degrees.
 

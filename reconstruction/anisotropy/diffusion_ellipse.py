@@ -11,14 +11,10 @@ Any (l, u, v) is an ellipse, and none is singular at the circle, u = v = 0.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
 from reconstruction.anisotropy.direction_harmonics import AXIAL, ODD, HarmonicFit
-
-Floats: TypeAlias = NDArray[np.float64]
+from reconstruction.arrays import BoolArray, Float64Array
 
 MEAN_DIRECTIONS = 360
 """Directions over which sigma_tr is averaged; exact to rounding up to ratios of 25."""
@@ -29,7 +25,9 @@ SETTLED = 1e-11
 """Of the parameters' steps."""
 
 
-def relative_sigma_tr(angle_rad: Floats, uv: Floats) -> tuple[Floats, Floats]:
+def relative_sigma_tr(
+    angle_rad: Float64Array, uv: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return sigma_tr over the geometric mean of its extremes, and its derivatives.
 
     Parameters
@@ -60,14 +58,14 @@ def relative_sigma_tr(angle_rad: Floats, uv: Floats) -> tuple[Floats, Floats]:
     return values, np.stack([by_u, by_v], axis=-1)
 
 
-def all_directions() -> Floats:
+def all_directions() -> Float64Array:
     """Return directions that go evenly over all axes, rad, (`MEAN_DIRECTIONS`,)."""
     return np.asarray(np.arange(MEAN_DIRECTIONS) * (np.pi / MEAN_DIRECTIONS))
 
 
 def fit(
-    angle_rad: Floats, values: Floats, weight: Floats, start: HarmonicFit
-) -> tuple[Floats, Floats, Floats]:
+    angle_rad: Float64Array, values: Float64Array, weight: Float64Array, start: HarmonicFit
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Fit ellipses, with the first harmonic as a factor ``1 + a cos theta + b sin theta``.
 
     Levenberg-Marquardt, from the linear fit of harmonics.
@@ -137,8 +135,8 @@ def fit(
 
 
 def _linearized(
-    angle_rad: Floats, y: Floats, p: Floats, free: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
+    angle_rad: Float64Array, y: Float64Array, p: Float64Array, free: BoolArray
+) -> tuple[Float64Array, Float64Array]:
     """Return residuals (B, N) and the model's derivatives (B, N, 5), 0 by what is not free."""
     shape, by_uv = relative_sigma_tr(angle_rad, p[:, 1:3])
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
@@ -158,7 +156,7 @@ def _linearized(
     return y - model, derivatives * free[:, None, :]
 
 
-def mean_over_directions(parameters: Floats) -> tuple[Floats, Floats]:
+def mean_over_directions(parameters: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return sigma_tr averaged over all directions (B,), and its derivatives by l, u, v (B, 3)."""
     shape, by_uv = relative_sigma_tr(all_directions(), parameters[:, 1:3])
     size = np.exp(0.5 * parameters[:, 0])

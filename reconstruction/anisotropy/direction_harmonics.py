@@ -12,14 +12,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 CONSTANT, ODD, AXIAL = slice(0, 1), slice(1, 3), slice(3, 5)
 """Columns of `design`."""
@@ -37,7 +34,7 @@ DIRECTIONS_PER_OUTLIER = 8
 """One of so many directions may be left out as an outlier."""
 
 
-def design(angle_rad: Floats) -> Floats:
+def design(angle_rad: Float64Array) -> Float64Array:
     """Return the columns ``1, cos theta, sin theta, cos 2 theta, sin 2 theta``, (N, 5)."""
     return np.stack(
         [
@@ -51,7 +48,7 @@ def design(angle_rad: Floats) -> Floats:
     )
 
 
-def different_directions(angle_rad: Floats, used: Bools) -> NDArray[np.int64]:
+def different_directions(angle_rad: Float64Array, used: BoolArray) -> Int64Array:
     """Return how many different directions of a turn are used, (B,); to a millionth of a turn."""
     turns = np.round(np.mod(angle_rad / math.tau, 1.0) * 1e6).astype(np.int64) % 1_000_000
     same = turns == np.unique(turns)[:, None]
@@ -79,17 +76,17 @@ class HarmonicFit:
         than `dof`; 0 where that leaves fewer than 2.
     """
 
-    coefficients: Floats
-    told: Bools
-    odd: Bools
-    residual: Floats
-    axial_power: Floats
-    odd_power: Floats
-    dof: NDArray[np.int64]
-    studentized: Floats
+    coefficients: Float64Array
+    told: BoolArray
+    odd: BoolArray
+    residual: Float64Array
+    axial_power: Float64Array
+    odd_power: Float64Array
+    dof: Int64Array
+    studentized: Float64Array
 
 
-def fit(angle_rad: Floats, values: Floats, weight: Floats) -> HarmonicFit:
+def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> HarmonicFit:
     """Fit the harmonics that the directions tell.
 
     Parameters
@@ -154,7 +151,9 @@ def fit(angle_rad: Floats, values: Floats, weight: Floats) -> HarmonicFit:
     return HarmonicFit(coefficients, told, odd, residual, axial, first, dof, studentized)
 
 
-def without_outliers(angle_rad: Floats, values: Floats, weight: Floats) -> tuple[Floats, Bools]:
+def without_outliers(
+    angle_rad: Float64Array, values: Float64Array, weight: Float64Array
+) -> tuple[Float64Array, BoolArray]:
     """Return the weights with those of outliers set to 0, and which ones these are, (N, B).
 
     One at a time the direction of largest deleted residual is left out, while that is less likely
@@ -181,7 +180,7 @@ def without_outliers(angle_rad: Floats, values: Floats, weight: Floats) -> tuple
     return kept, outlier
 
 
-def log_tail(power: Floats, residual: Floats, dof: NDArray[np.int64]) -> Floats:
+def log_tail(power: Float64Array, residual: Float64Array, dof: Int64Array) -> Float64Array:
     """Return log P that two coefficients explain so much, in errors that the residuals tell.
 
     Examples

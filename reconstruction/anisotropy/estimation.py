@@ -36,9 +36,8 @@ from reconstruction.anisotropy.plane_vectors import (
     quadratic_form,
     within_period,
 )
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 Errors: TypeAlias = Literal["relative", "absolute"]
 
 FAR = 300
@@ -91,26 +90,26 @@ class Anisotropy:
         As of :func:`estimate`.
     """
 
-    ratio: Floats
-    ratio_stderr: Floats
-    axis_rad: Floats
-    axis_stderr_rad: Floats
-    p_value: Floats
-    log10_p: Floats
-    mean_per_mm: Floats
-    mean_stderr_per_mm: Floats
-    tilt: Floats
-    tilt_stderr: Floats
-    tilt_rad: Floats
-    tilt_p_value: Floats
-    chi2: Floats
-    dof: NDArray[np.int64]
-    used: Bools
-    outlier: Bools
-    valid: Bools
+    ratio: Float64Array
+    ratio_stderr: Float64Array
+    axis_rad: Float64Array
+    axis_stderr_rad: Float64Array
+    p_value: Float64Array
+    log10_p: Float64Array
+    mean_per_mm: Float64Array
+    mean_stderr_per_mm: Float64Array
+    tilt: Float64Array
+    tilt_stderr: Float64Array
+    tilt_rad: Float64Array
+    tilt_p_value: Float64Array
+    chi2: Float64Array
+    dof: Int64Array
+    used: BoolArray
+    outlier: BoolArray
+    valid: BoolArray
     reason: NDArray[np.str_]
-    parameters: Floats
-    covariance: Floats
+    parameters: Float64Array
+    covariance: Float64Array
     errors: Errors
 
 
@@ -225,7 +224,7 @@ def estimate(
     ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
     told, odd = linear.told, linear.odd
 
-    def shaped(found: NDArray[Any], otherwise: float, where: Bools = told) -> NDArray[Any]:
+    def shaped(found: NDArray[Any], otherwise: float, where: BoolArray = told) -> NDArray[Any]:
         kept = where.reshape(-1, *[1] * (found.ndim - 1))
         return np.where(kept, found, otherwise).reshape((*shape, *found.shape[1:]))
 
@@ -260,7 +259,7 @@ def _checked(
     stderr_per_mm: ArrayLike | None,
     valid: ArrayLike | None,
     errors: Errors,
-) -> tuple[Floats, Floats, Floats, Bools, tuple[int, ...]]:
+) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray, tuple[int, ...]]:
     """Return angles (N,), values, standard errors and what counts (N, B), and the shape of B."""
     angle = np.asarray(angle_rad, np.float64)
     given = np.asarray(sigma_tr_per_mm, np.float64)
@@ -277,7 +276,7 @@ def _checked(
         raise AnisotropyError(
             f"angle_rad: got {several} different directions, expected {LEAST_DIRECTIONS} or more"
         )
-    stderr: Floats = np.zeros_like(given)
+    stderr: Float64Array = np.zeros_like(given)
     if stderr_per_mm is not None:
         stderr = np.asarray(stderr_per_mm, np.float64)
     good = np.ones(given.shape, bool) if valid is None else np.array(valid, bool)
@@ -298,13 +297,13 @@ def _checked(
     return angle, values, np.where(whole, 1.0, stderr), good, shape
 
 
-def _far_exponent(largest: Floats) -> NDArray[np.int64]:
+def _far_exponent(largest: Float64Array) -> Int64Array:
     """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
     exponent = np.frexp(largest)[1].astype(np.int64)
     return np.where((largest > 0) & (np.abs(exponent) > FAR), exponent, 0)
 
 
-def _reasons(angle: Floats, used: Bools, told: Bools) -> NDArray[np.str_]:
+def _reasons(angle: Float64Array, used: BoolArray, told: BoolArray) -> NDArray[np.str_]:
     several = direction_harmonics.different_directions(angle, used)
     return np.array(
         [

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from reconstruction.anisotropy import diffusion_ellipse
 from reconstruction.anisotropy.estimation import Anisotropy, AnisotropyError
-
-Floats: TypeAlias = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +27,11 @@ class OneDirectionBias:
         Root mean square over all directions: what a head set down at random is off.
     """
 
-    bias: Floats
-    stderr: Floats
-    lowest: Floats
-    highest: Floats
-    rms: Floats
+    bias: Float64Array
+    stderr: Float64Array
+    lowest: Float64Array
+    highest: Float64Array
+    rms: Float64Array
 
 
 def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionBias:

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-Floats: TypeAlias = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 UNKNOWN_AXIS_RAD = math.pi / math.sqrt(12.0)
 """Standard deviation of an axis that may point anywhere."""
 
 
-def quadratic_form(vectors: Floats, matrices: Floats) -> Floats:
+def quadratic_form(vectors: Float64Array, matrices: Float64Array) -> Float64Array:
     """Return v' M v of vectors (B, n) and covariances (B, n, n): at least 0, (B,)."""
     return np.maximum(np.einsum("bi,bij,bj->b", vectors, matrices, vectors), 0.0)
 
 
-def length_and_errors(pair: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats]:
+def length_and_errors(
+    pair: Float64Array, covariance: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the length of vectors, and their standard errors along and across themselves.
 
     Parameters
@@ -51,7 +51,7 @@ def length_and_errors(pair: Floats, covariance: Floats) -> tuple[Floats, Floats,
     )
 
 
-def within_period(angle: Floats, period: float) -> Floats:
+def within_period(angle: Float64Array, period: float) -> Float64Array:
     """Return angles within [0, period), in their unit; what rounds up to the period is 0.
 
     Examples
@@ -63,7 +63,7 @@ def within_period(angle: Floats, period: float) -> Floats:
     return np.where(within >= period, 0.0, within)
 
 
-def axis_stderr(h: Floats, across: Floats) -> Floats:
+def axis_stderr(h: Float64Array, across: Float64Array) -> Float64Array:
     """Return the standard error of half the direction of a vector with normal errors, rad.
 
     From the mean resultant length of the direction of a vector of length h with standard error

@@ -7,16 +7,15 @@ What is wrong with a fibre in all directions cancels, and so does coupling
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import photon_table
 from reconstruction.anisotropy import profile_comparison
 from reconstruction.anisotropy.estimation import Anisotropy, AnisotropyError, Errors, estimate
-
-Floats: TypeAlias = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 
 def estimate_from_profiles(
@@ -103,7 +102,7 @@ def estimate_from_profiles(
         raise AnisotropyError(f"floor: got {floor}, expected 0 or above, finite")
     if errors == "absolute" and variance is None:
         raise AnisotropyError('variance: got none, expected one for "absolute" errors')
-    of_each: Floats = np.zeros_like(profiles)
+    of_each: Float64Array = np.zeros_like(profiles)
     if variance is not None:
         of_each = np.asarray(variance, np.float64)
     good = np.ones(profiles.shape, bool) if valid is None else np.array(valid, bool)
@@ -125,11 +124,19 @@ def estimate_from_profiles(
             f"{np.shape(sigma_s_prime_per_mm)}, expected {shape}"
         ) from error
 
-    def table(absorption: Floats, scattering: Floats) -> tuple[Floats, Floats]:
+    def table(
+        absorption: Float64Array, scattering: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         found = photon_table.derivatives(
-            r, absorption, scattering, eta=eta, g=g, collection=collection, core_mm=core_mm,
+            r,
+            absorption,
+            scattering,
+            eta=eta,
+            g=g,
+            collection=collection,
+            core_mm=core_mm,
             source_core_mm=source_core_mm,
-        )  # fmt: skip
+        )
         return found.reflectance_per_mm2, found.by_sigma_s_prime
 
     rows = (angle.size, -1, r.size)
@@ -142,6 +149,11 @@ def estimate_from_profiles(
     stderr = sigma_tr * 0.5 * s / (a + s) * np.where(told, found.stderr, 1.0)
     back = (angle.size, *shape)
     return estimate(
-        angle, sigma_tr.reshape(back), stderr.reshape(back), valid=told.reshape(back),
-        errors=errors, outliers=outliers, log_ratio_error=profile_comparison.MODEL_ERROR,
-    )  # fmt: skip
+        angle,
+        sigma_tr.reshape(back),
+        stderr.reshape(back),
+        valid=told.reshape(back),
+        errors=errors,
+        outliers=outliers,
+        log_ratio_error=profile_comparison.MODEL_ERROR,
+    )

@@ -20,11 +20,10 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
-Table: TypeAlias = Callable[[Floats, Floats], tuple[Floats, Floats]]
+from reconstruction.arrays import BoolArray, Float64Array
+
+Table: TypeAlias = Callable[[Float64Array, Float64Array], tuple[Float64Array, Float64Array]]
 """sigma_a (B, 1, 1) and sigma_s' (B, N, 1) to T and dT / d sigma_s', (B, N, F)."""
 
 LEAST_FIBRES = 6
@@ -60,19 +59,19 @@ class ProfileComparison:
         Fibres that count.
     """
 
-    log_scattering: Floats
-    stderr: Floats
-    coupling: Floats
-    valid: Bools
-    used: Bools
+    log_scattering: Float64Array
+    stderr: Float64Array
+    coupling: Float64Array
+    valid: BoolArray
+    used: BoolArray
 
 
 def compare(
-    readings: Floats,
-    variance: Floats,
-    valid: Bools,
-    sigma_a_per_mm: Floats,
-    sigma_s_prime_per_mm: Floats,
+    readings: Float64Array,
+    variance: Float64Array,
+    valid: BoolArray,
+    sigma_a_per_mm: Float64Array,
+    sigma_s_prime_per_mm: Float64Array,
     table: Table,
     *,
     floor: float,
@@ -99,8 +98,8 @@ def compare(
     a = np.where(known, sigma_a_per_mm, 1.0)[:, None, None]
     s = np.where(known, sigma_s_prime_per_mm, 1.0)[:, None, None]
     good = valid.transpose(1, 0, 2)
-    y: Floats = np.where(good, readings.transpose(1, 0, 2), 0.0)
-    v: Floats = np.where(good, variance.transpose(1, 0, 2), 0.0)
+    y: Float64Array = np.where(good, readings.transpose(1, 0, 2), 0.0)
+    v: Float64Array = np.where(good, variance.transpose(1, 0, 2), 0.0)
     series, n, _ = y.shape
     count = np.maximum(good.sum(axis=1), 1)
     m = y.sum(axis=1) / count

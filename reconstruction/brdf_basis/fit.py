@@ -22,15 +22,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
 from model.brdf.tables import BrdfBasis
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import boundary_kernels
-
-FloatArray = NDArray[np.float64]
 
 LEAST_COSINE = 0.1
 """Samples whose light or view is nearer to the horizon are not used."""
@@ -61,12 +60,12 @@ class SurfaceSamples:
         Samples to use: finite, light and view at least 0.1 (cosine) above the horizon.
     """
 
-    value: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    light_dir: NDArray[np.float32]
-    view_dir: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    value: Float32Array
+    variance: Float32Array
+    light_dir: Float32Array
+    view_dir: Float32Array
+    normals: Float32Array
+    valid: BoolArray
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -103,10 +102,10 @@ class BasisWeights:
         False where no sample could be used.
     """
 
-    weights: FloatArray
-    residual: FloatArray
-    stderr: FloatArray
-    valid: NDArray[np.bool_]
+    weights: Float64Array
+    residual: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
 
 
 def surface_samples(
@@ -219,15 +218,24 @@ def fit_weights(
     points = len(samples.value)
     weights = np.zeros((points, basis.size))
     residual, stderr = fit_points(
-        basis.table, basis.size, basis.kinship(),
-        *(np.ascontiguousarray(a, dtype=np.float32) for a in (
-            samples.value, samples.variance, samples.light_dir, samples.view_dir, samples.normals,
-        )),
+        basis.table,
+        basis.size,
+        basis.kinship(),
+        *(
+            np.ascontiguousarray(a, dtype=np.float32)
+            for a in (
+                samples.value,
+                samples.variance,
+                samples.light_dir,
+                samples.view_dir,
+                samples.normals,
+            )
+        ),
         np.ascontiguousarray(samples.valid),
         REWEIGHTINGS if compress == "cbrt" else 0,
         BLOCK,
         weights,
-    )  # fmt: skip
+    )
     return BasisWeights(weights, residual, stderr, np.isfinite(residual))
 
 
@@ -237,7 +245,7 @@ def evaluate(
     light_dir: ArrayLike,
     view_dir: ArrayLike,
     normal: ArrayLike,
-) -> FloatArray:
+) -> Float64Array:
     """Return the mixtures' BRDF, 1/sr, without the cosine; nothing multiplies it by F_r again.
 
     Parameters
@@ -257,12 +265,8 @@ def evaluate(
 
 
 def reduce(
-    weights: BasisWeights | ArrayLike,
-    rank: int,
-    *,
-    basis: BrdfBasis | None = None,
-    seed: int = 0,
-) -> tuple[FloatArray, FloatArray, float]:
+    weights: BasisWeights | ArrayLike, rank: int, *, basis: BrdfBasis | None = None, seed: int = 0
+) -> tuple[Float64Array, Float64Array, float]:
     """Factor mixtures into fewer, non-negative ones common to all points.
 
     Parameters
@@ -316,7 +320,7 @@ def reduce(
     return found, mix, float(np.sqrt(max(squared[0], 0.0) / squared[1]))
 
 
-def _factor(model: NMF, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]:
     with warnings.catch_warnings():
         # A factorization stopped early is a valid one, a little worse; its error says how good.
         warnings.simplefilter("ignore", ConvergenceWarning)
@@ -351,7 +355,7 @@ def lit_sphere(
     *,
     light_dir: ArrayLike = (0.5, 0.5, 0.70710678),
     size_px: int = 128,
-) -> FloatArray:
+) -> Float64Array:
     """Return the lobe of one mixture on a sphere seen from +z, far away.
 
     Parameters

@@ -9,18 +9,19 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
+
+from reconstruction.arrays import Float32Array, Float64Array
 
 _HALF_PI = 0.5 * math.pi
 
 
 def evaluate(
-    table: NDArray[np.float32],
-    weights: NDArray[np.float64],
-    light_dir: NDArray[np.float32],
-    view_dir: NDArray[np.float32],
-    normals: NDArray[np.float64],
-) -> NDArray[np.float32]:
+    table: Float32Array,
+    weights: Float64Array,
+    light_dir: Float32Array,
+    view_dir: Float32Array,
+    normals: Float64Array,
+) -> Float32Array:
     """Return each point's mixture for each of its samples.
 
     Parameters

@@ -280,9 +280,29 @@ def _misfit(column, x, size, target, count, residual):  # type: ignore[no-untype
 
 @njit(nogil=True)
 def _solve(  # type: ignore[no-untyped-def]
-    rows, value, weight, count, materials, kinship, working, size, x,
-    column, gram, rhs, low, active, trial, refused, square, pull, root, target, residual, force,
-):  # fmt: skip
+    rows,
+    value,
+    weight,
+    count,
+    materials,
+    kinship,
+    working,
+    size,
+    x,
+    column,
+    gram,
+    rhs,
+    low,
+    active,
+    trial,
+    refused,
+    square,
+    pull,
+    root,
+    target,
+    residual,
+    force,
+):
     """Solve one weighted problem from a working set; return the new set's size."""
     for i in range(count):
         root[i] = math.sqrt(weight[i])
@@ -372,16 +392,22 @@ def _reweigh(value, variance, model, count, weight, scatter):  # type: ignore[no
 
 @njit(
     types.UniTuple(types.Array(float64, 1, "C"), 2)(
-        types.Array(float32, 4, "C", readonly=True), int64,
+        types.Array(float32, 4, "C", readonly=True),
+        int64,
         types.Array(float64, 2, "C", readonly=True),
-        types.Array(float32, 2, "C", readonly=True), types.Array(float32, 2, "C", readonly=True),
-        types.Array(float32, 3, "C", readonly=True), types.Array(float32, 3, "C", readonly=True),
-        types.Array(float32, 2, "C", readonly=True), types.Array(boolean, 2, "C", readonly=True),
-        int64, int64, types.Array(float64, 2, "C"),
+        types.Array(float32, 2, "C", readonly=True),
+        types.Array(float32, 2, "C", readonly=True),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 2, "C", readonly=True),
+        types.Array(boolean, 2, "C", readonly=True),
+        int64,
+        int64,
+        types.Array(float64, 2, "C"),
     ),
     parallel=True,
     cache=True,
-)  # fmt: skip
+)
 def fit_points(  # type: ignore[no-untyped-def]
     table,
     materials,
@@ -470,10 +496,29 @@ def fit_points(  # type: ignore[no-untyped-def]
             size = kept
             x[:] = 0.0
             size = _solve(
-                rows, y, weight, count, materials, kinship, working, size, x,
-                column, gram, rhs, low, active, trial, refused, square, pull, root, target,
-                residual, force,
-            )  # fmt: skip
+                rows,
+                y,
+                weight,
+                count,
+                materials,
+                kinship,
+                working,
+                size,
+                x,
+                column,
+                gram,
+                rhs,
+                low,
+                active,
+                trial,
+                refused,
+                square,
+                pull,
+                root,
+                target,
+                residual,
+                force,
+            )
             scatter = 1e-3 * top / (9.0 * max(top, 1e-60) ** (2.0 / 3.0))
             for _ in range(reweightings):
                 for i in range(count):
@@ -481,10 +526,29 @@ def fit_points(  # type: ignore[no-untyped-def]
                 scatter = _reweigh(y, var, model, count, weight, scatter)
                 _squares(rows, weight, count, square)
                 size = _solve(
-                    rows, y, weight, count, materials, kinship, working, size, x,
-                    column, gram, rhs, low, active, trial, refused, square, pull, root, target,
-                    residual, force,
-                )  # fmt: skip
+                    rows,
+                    y,
+                    weight,
+                    count,
+                    materials,
+                    kinship,
+                    working,
+                    size,
+                    x,
+                    column,
+                    gram,
+                    rhs,
+                    low,
+                    active,
+                    trial,
+                    refused,
+                    square,
+                    pull,
+                    root,
+                    target,
+                    residual,
+                    force,
+                )
             misfit = 0.0
             total = 0.0
             power = 0.0

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.brdf.tables import BrdfBasis
 from model.traits.reduced_spaces import mixture_coordinates
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import fit as brdf_basis
 
-FloatArray = NDArray[np.float64]
 Method = Literal["shares", "brdf"]
 
 RANKS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
@@ -63,10 +63,10 @@ class SpaceCurve:
     """
 
     ranks: tuple[int, ...]
-    error: FloatArray
-    held_out: FloatArray
-    held_out_stderr: FloatArray
-    mixes: tuple[FloatArray, ...]
+    error: Float64Array
+    held_out: Float64Array
+    held_out_stderr: Float64Array
+    mixes: tuple[Float64Array, ...]
     points: int
     held_out_points: int
     left_out: tuple[tuple[int, str], ...]
@@ -90,12 +90,12 @@ class SpaceCurve:
             raise SpaceError(f"most: got {most}, expected at least {self.ranks[0]}")
         return self.ranks[brdf_basis.plateau(self.error[among], share=share) - 1]
 
-    def normalized(self) -> FloatArray:
+    def normalized(self) -> Float64Array:
         """Return the errors over that of the first rank, (R,): several curves on one scale."""
         return self.error / self.error[0] if self.error[0] > 0.0 else np.zeros_like(self.error)
 
 
-def usable(weights: ArrayLike, basis: BrdfBasis) -> NDArray[np.bool_]:
+def usable(weights: ArrayLike, basis: BrdfBasis) -> BoolArray:
     """Return which points' mixtures are held down by their samples, (P,).
 
     A lobe so narrow that no pair of light and view met it can have any share: mixtures of more
@@ -179,7 +179,7 @@ def curve(
         raise SpaceError(f"groups: got shape {whose.shape}, expected {(len(others),)}")
     errors: list[float] = []
     outside, spread = [], []
-    mixes: list[FloatArray] = []
+    mixes: list[Float64Array] = []
     for rank in made:
         mix = brdf_basis.reduce(shares, rank, basis=basis, seed=seed)[1]
         if method == "brdf":
@@ -192,14 +192,20 @@ def curve(
         outside.append(found)
         spread.append(deviation)
     return SpaceCurve(
-        tuple(made), np.array(errors), np.array(outside), np.array(spread), tuple(mixes),
-        len(shares), len(others), left_out,
-    )  # fmt: skip
+        tuple(made),
+        np.array(errors),
+        np.array(outside),
+        np.array(spread),
+        tuple(mixes),
+        len(shares),
+        len(others),
+        left_out,
+    )
 
 
 def refine(
     weights: ArrayLike, mix: ArrayLike, basis: BrdfBasis, *, sweeps: int = SWEEPS
-) -> FloatArray:
+) -> Float64Array:
     """Lower the BRDFs' error of common mixtures, shares and mixtures in turn.
 
     Parameters
@@ -245,7 +251,7 @@ def refine(
     return np.where(size > 0.0, rows / np.where(size > 0.0, size, 1.0), even)
 
 
-def _descend(values: FloatArray, wanted: FloatArray, square: FloatArray) -> None:
+def _descend(values: Float64Array, wanted: Float64Array, square: Float64Array) -> None:
     """Lower x A x' - 2 b x' of each row x, one column after the other, in place; x >= 0."""
     for k in np.flatnonzero(np.diag(square) > 0.0):
         step = (wanted[:, k] - values @ square[:, k]) / square[k, k]
@@ -268,13 +274,13 @@ def repeatability(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> floa
     return float(np.sqrt(0.5 * _squares(a - b, gram).sum() / size))
 
 
-def metric(basis: BrdfBasis) -> FloatArray:
+def metric(basis: BrdfBasis) -> Float64Array:
     """Return the products of the materials' BRDFs, (K, K), nodes counting by solid angle."""
     strength = basis.strength()
     return basis.kinship() * np.outer(strength, strength)
 
 
-def _checked(weights: ArrayLike, basis: BrdfBasis) -> FloatArray:
+def _checked(weights: ArrayLike, basis: BrdfBasis) -> Float64Array:
     values = np.asarray(weights, dtype=np.float64)
     good = values.ndim == 2 and values.shape[1] == basis.size
     if not good or not np.all((values >= 0.0) & (values < np.inf)):
@@ -285,16 +291,16 @@ def _checked(weights: ArrayLike, basis: BrdfBasis) -> FloatArray:
     return values
 
 
-def _squares(rows: FloatArray, gram: FloatArray) -> FloatArray:
+def _squares(rows: Float64Array, gram: Float64Array) -> Float64Array:
     return np.maximum(np.einsum("pk,pk->p", rows @ gram, rows), 0.0)
 
 
-def _error(shares: FloatArray, mix: FloatArray, gram: FloatArray) -> float:
+def _error(shares: Float64Array, mix: Float64Array, gram: Float64Array) -> float:
     gap = shares - mixture_coordinates(shares, mix, gram) @ mix
     return float(np.sqrt(_squares(gap, gram).sum() / _squares(shares, gram).sum()))
 
 
-def _grown(shares: FloatArray, mix: FloatArray, rank: int, gram: FloatArray) -> FloatArray:
+def _grown(shares: Float64Array, mix: Float64Array, rank: int, gram: Float64Array) -> Float64Array:
     """Add the points that mixtures make worst, one after the other, until there are enough."""
     while len(mix) < rank:
         gap = shares - mixture_coordinates(shares, mix, gram) @ mix
@@ -304,7 +310,7 @@ def _grown(shares: FloatArray, mix: FloatArray, rank: int, gram: FloatArray) -> 
 
 
 def _of_groups(
-    shares: FloatArray, whose: NDArray[np.generic], mix: FloatArray, gram: FloatArray
+    shares: Float64Array, whose: NDArray[np.generic], mix: Float64Array, gram: Float64Array
 ) -> tuple[float, float]:
     """Return the error of points and its standard error by leaving out one group after another."""
     if not np.any(shares):

@@ -20,12 +20,11 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.chromophores.inversion import ChromophoreError
 from reconstruction.chromophores.posterior import WeighedChromophores
-
-Floats = NDArray[np.float32]
 
 DARKER: Final = 0.1
 """Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more
@@ -45,7 +44,7 @@ _BAND: Final = 128
 
 def darker_than_around(
     colors: ArrayLike, *, variance: ArrayLike | None = None, valid: ArrayLike | None = None
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return where skin is darker than the median of its surroundings.
 
     Parameters
@@ -108,9 +107,7 @@ def darker_than_around(
         return np.asarray(_median_around(log_light, good) - log_light > least)
 
 
-def lighter_by_itself(
-    by_face: WeighedChromophores, alone: WeighedChromophores
-) -> NDArray[np.bool_]:
+def lighter_by_itself(by_face: WeighedChromophores, alone: WeighedChromophores) -> BoolArray:
     """Return where a pixel alone has less melanin than by its face, outside its 68 % interval.
 
     Parameters
@@ -182,7 +179,7 @@ def either(
     )
 
 
-def _median_around(values: Floats, good: NDArray[np.bool_]) -> Floats:
+def _median_around(values: Float32Array, good: BoolArray) -> Float32Array:
     """Return the median of the good pixels in the square around each pixel, NaN without any."""
     if not good.any():
         return np.full(values.shape, np.nan, dtype=np.float32)
@@ -202,7 +199,7 @@ def _median_around(values: Floats, good: NDArray[np.bool_]) -> Floats:
     return whole[: values.shape[0], : values.shape[1]]
 
 
-def _by_blocks(values: Floats, block: int) -> Floats:
+def _by_blocks(values: Float32Array, block: int) -> Float32Array:
     """Return the median of each block's numbers, NaN where it has none."""
     if block == 1:
         return values
@@ -213,7 +210,7 @@ def _by_blocks(values: Floats, block: int) -> Floats:
     return _medians(cut.reshape(rows * columns, -1)).reshape(rows, columns)
 
 
-def _medians(values: Floats) -> Floats:
+def _medians(values: Float32Array) -> Float32Array:
     """Return medians along the last axis (n, m) without NaN, in a part of `nanmedian`'s time."""
     ordered = np.sort(values, axis=-1)  # NaN last
     count = np.isfinite(ordered).sum(axis=-1)

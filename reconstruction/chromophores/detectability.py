@@ -7,21 +7,22 @@ large and drops the others: what is kept is then far too high, with errors that 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
+
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 NEIGHBORHOOD_PX = 15
 LIMIT = 0.5
 
 
 def detectable(
-    estimate: NDArray[np.floating],
-    stderr: NDArray[np.floating],
-    valid: NDArray[np.bool_],
+    estimate: FloatArray,
+    stderr: FloatArray,
+    valid: BoolArray,
     *,
     size_px: int = NEIGHBORHOOD_PX,
     limit: float = LIMIT,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return where the mean standard error around is small against the mean estimate around.
 
     Parameters
@@ -50,7 +51,7 @@ def detectable(
         raise ValueError(f"size_px: got {size_px}, expected an odd number of 1 or more")
     good = valid & np.isfinite(estimate) & np.isfinite(stderr)
 
-    def total(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    def total(values: FloatArray) -> Float64Array:
         kept = np.where(good, values, 0.0).astype(np.float64)
         return np.asarray(ndimage.uniform_filter(kept, size_px, mode="constant"))
 

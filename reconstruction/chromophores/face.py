@@ -10,9 +10,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
+from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
@@ -20,8 +21,6 @@ from reconstruction.chromophores.face_distribution import FaceDistribution, fit,
 from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import LOWEST, evaluate
-
-Floats = NDArray[np.float64]
 
 PIXELS: Final = 1500
 """Evenly spread over the face: its mean is known to a thirtieth of its spread by them, less than
@@ -116,20 +115,31 @@ def of_colors(
     plane = np.log(evaluate(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
 
     def fitted(
-        light: float, color: Floats, begin: FaceDistribution | None = None
+        light: float, color: Float64Array, begin: FaceDistribution | None = None
     ) -> FaceDistribution:
         from reconstruction.chromophores import face_kernels as kernels  # compiled when imported
 
         shape = (len(colors), rows, BLOOD_PLACES // _SUMMED)
         probability = np.zeros(shape, dtype=np.float32)
         kernels.plane_probability(
-            np.log(colors) + color, weights, mean, plane, -2.0 * np.log(prior.density),
-            prior.low + light, prior.step, _SUMMED, probability,
-        )  # fmt: skip
+            np.log(colors) + color,
+            weights,
+            mean,
+            plane,
+            -2.0 * np.log(prior.density),
+            prior.low + light,
+            prior.step,
+            _SUMMED,
+            probability,
+        )
         return fit(
-            probability, log_melanin, blood.reshape(-1, _SUMMED).mean(axis=1),
-            melanin_ends=melanin_ends, blood_ends=(LOWEST, 1.0), begin=begin,
-        )  # fmt: skip
+            probability,
+            log_melanin,
+            blood.reshape(-1, _SUMMED).mean(axis=1),
+            melanin_ends=melanin_ends,
+            blood_ends=(LOWEST, 1.0),
+            begin=begin,
+        )
 
     still = np.zeros(3)
     usual = fitted(0.0, still)
@@ -170,7 +180,7 @@ def _sampled(
     variance: ArrayLike | None,
     model_error: ArrayLike | None,
     valid: ArrayLike | None,
-) -> tuple[NDArray[np.float32], Floats, Floats]:
+) -> tuple[Float32Array, Float64Array, Float64Array]:
     """Return colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3) of some pixels."""
     colors = np.asarray(rgb, dtype=np.float32)
     if colors.ndim == 0 or colors.shape[-1] != 3:
@@ -195,7 +205,7 @@ def _sampled(
     return chosen, noise, errors if errors.ndim == 2 else errors.reshape(-1, 3, 3)[places]
 
 
-def _weights(relative: Floats, errors: Floats) -> tuple[Floats, Floats]:
+def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return weights of color, brightness projected out, and those of the mean that tells light."""
     total = (relative + RESOLVED**2)[:, :, None] * np.eye(3) + errors
     weights = np.linalg.inv(without_brightness(total))
@@ -205,7 +215,7 @@ def _weights(relative: Floats, errors: Floats) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(weights), np.ascontiguousarray(row / whole[:, None])
 
 
-def _independent(covariance: ArrayLike | None) -> list[Floats]:
+def _independent(covariance: ArrayLike | None) -> list[Float64Array]:
     """Return vectors whose outer products sum up to a covariance."""
     if covariance is None:
         return []

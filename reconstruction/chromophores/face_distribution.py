@@ -20,15 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
-Floats = NDArray[np.float64]
-Probability = NDArray[np.floating[Any]]
+from reconstruction.arrays import Float64Array, FloatArray
 
 UNEXPECTED: Final = 0.01
 """Least part of the skin that follows no distribution at all, as of the light
@@ -93,7 +91,7 @@ class Bell:
         whole = math.sqrt(2.0 * math.pi) * width * max(float(inside), 1e-12)
         return (self.high - self.low) / whole
 
-    def relative_density(self, at: Floats) -> Floats:
+    def relative_density(self, at: Float64Array) -> Float64Array:
         """Return the density of a pixel's value over that of any value alike, at values (n,).
 
         Examples
@@ -106,7 +104,7 @@ class Bell:
         bell = self.height * np.exp(-0.5 * np.square((at - self.mean) / self.width))
         return np.asarray((1.0 - self.unexpected) * bell + self.unexpected)
 
-    def of_cells(self, edges: Floats) -> Floats:
+    def of_cells(self, edges: Float64Array) -> Float64Array:
         """Return the means of `relative_density` between ascending edges (n + 1,), shape (n,).
 
         A cell may be wider than the bell.
@@ -128,9 +126,9 @@ class FaceDistribution:
 
 
 def fit(
-    probability: Probability,
-    log_melanin: Floats,
-    blood: Floats,
+    probability: FloatArray,
+    log_melanin: Float64Array,
+    blood: Float64Array,
     *,
     melanin_ends: tuple[float, float],
     blood_ends: tuple[float, float],
@@ -184,22 +182,24 @@ def fit(
         np.concatenate([[1.5 * at[0] - 0.5 * at[1]], at + 0.5 * (at[1] - at[0])]) for at in places
     ]
 
-    def bells(unknowns: Floats) -> tuple[Bell, Bell]:
+    def bells(unknowns: Float64Array) -> tuple[Bell, Bell]:
         unknowns = unknowns * _SCALE
         first, second = (
             Bell(
-                float(unknowns[3 * k]), math.exp(unknowns[3 * k + 1]),
-                math.exp(unknowns[3 * k + 2]), *ends[k],
+                float(unknowns[3 * k]),
+                math.exp(unknowns[3 * k + 1]),
+                math.exp(unknowns[3 * k + 2]),
+                *ends[k],
             )
             for k in range(2)
-        )  # fmt: skip
+        )
         return first, second
 
-    def densities(unknowns: Floats) -> tuple[Floats, Floats]:
+    def densities(unknowns: Float64Array) -> tuple[Float64Array, Float64Array]:
         first, second = bells(unknowns)
         return first.of_cells(edges[0]), second.of_cells(edges[1])
 
-    def misfit(unknowns: Floats) -> tuple[float, Floats]:
+    def misfit(unknowns: Float64Array) -> tuple[float, Float64Array]:
         """Return -log likelihood of a pixel on the mean, and its gradient."""
         of_melanin, of_blood = densities(unknowns)
         both = np.outer(of_melanin, of_blood).astype(np.float32).reshape(-1)
@@ -234,10 +234,13 @@ def fit(
     ]
     low, high = np.array(bounds).T / _SCALE
     found = minimize(
-        misfit, np.clip(np.ravel(start) / _SCALE, low, high), jac=True, method="L-BFGS-B",
+        misfit,
+        np.clip(np.ravel(start) / _SCALE, low, high),
+        jac=True,
+        method="L-BFGS-B",
         bounds=np.stack([low, high], axis=1),
         options={"maxiter": _ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
-    )  # fmt: skip
+    )
     return FaceDistribution(*bells(found.x))
 
 

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.start import LOWEST, Start, evaluate, start_for
 
-Floats = NDArray[np.float64]
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Shading = Literal["known"] | ArrayLike | None
 
 RELATIVE_NOISE = 0.01
@@ -37,35 +35,35 @@ class ChromophoreError(ValueError):
 class ChromophoreMaps:
     """Result of the chromophore fit; every map has the pixels' shape."""
 
-    melanin: Map
+    melanin: Float32Array
     """Volume fraction of melanin in the epidermis, 3e-5 to 0.5; NaN where the input is unusable."""
-    hemoglobin: Map
+    hemoglobin: Float32Array
     """Volume fraction of blood in the dermis, 2e-5 to 0.32; NaN where the input is unusable."""
-    shading: Map
+    shading: Float32Array
     """Factor between the table's color and the pixel: fitted when free, else as given, times the
     most probable factor where the model error has a part common to the channels."""
-    stderr_melanin: Map
+    stderr_melanin: Float32Array
     """Standard error of `melanin`: Fisher information of noise and model error together."""
-    stderr_hemoglobin: Map
+    stderr_hemoglobin: Float32Array
     """Standard error of `hemoglobin`."""
-    residual: Map
+    residual: Float32Array
     """Root of the weighted square sum of what the fit leaves, in standard errors. With the shading
     free three unknowns fit three channels: it is 0 unless the color lies outside the table."""
-    valid: Mask
+    valid: BoolArray
     """Usable input, converged, and not `outside`."""
-    gamut_distance: Map
+    gamut_distance: Float32Array
     """How far the nearest color of the table is: root mean square relative difference."""
-    outside: Mask
+    outside: BoolArray
     """The color does not belong to the table: more than 4 standard errors and 2 percent away."""
-    melanin_identifiable: Mask
+    melanin_identifiable: BoolArray
     """The standard error is within the limit and no second solution exists."""
-    hemoglobin_identifiable: Mask
+    hemoglobin_identifiable: BoolArray
     """The same for hemoglobin."""
-    ambiguous: Mask
+    ambiguous: BoolArray
     """Darker skin under more light has the same color, with the shading free."""
 
     @property
-    def identifiable(self) -> Mask:
+    def identifiable(self) -> BoolArray:
         """Pixels where both chromophores can be told."""
         return np.asarray(self.melanin_identifiable & self.hemoglobin_identifiable)
 
@@ -183,26 +181,26 @@ def invert(
 class Identifiability:
     """What a camera under a light can tell: Cramer-Rao bounds over the table."""
 
-    c_m: Floats
+    c_m: Float64Array
     """Volume fractions of melanin, shape (n,)."""
-    c_hd: Floats
+    c_hd: Float64Array
     """Volume fractions of dermal blood, shape (n,)."""
-    stderr_melanin: Floats
+    stderr_melanin: Float64Array
     """Smallest possible relative standard error of melanin, shape (n, n): [c_m, c_hd]."""
-    stderr_hemoglobin: Floats
+    stderr_hemoglobin: Float64Array
     """The same of hemoglobin."""
-    ambiguous: Mask
+    ambiguous: BoolArray
     """Another pair of chromophores has the same color (with the shading free)."""
     limit: float
     """Relative standard error up to which a chromophore counts as identifiable."""
 
     @property
-    def melanin_identifiable(self) -> Mask:
+    def melanin_identifiable(self) -> BoolArray:
         """Where melanin can be told."""
         return np.asarray((self.stderr_melanin <= self.limit) & ~self.ambiguous)
 
     @property
-    def hemoglobin_identifiable(self) -> Mask:
+    def hemoglobin_identifiable(self) -> BoolArray:
         """Where hemoglobin can be told."""
         return np.asarray((self.stderr_hemoglobin <= self.limit) & ~self.ambiguous)
 
@@ -211,7 +209,7 @@ def identifiability(
     table: ColorTable,
     *,
     shading: Literal["known"] | float | None = None,
-    variance: ArrayLike | Callable[[Floats], ArrayLike] | None = None,
+    variance: ArrayLike | Callable[[Float64Array], ArrayLike] | None = None,
     model_error: ArrayLike | None = None,
     shading_max: float | None = None,
     limit: float = IDENTIFIABLE,
@@ -279,7 +277,7 @@ def identifiability(
     )
 
 
-def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floats:
+def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Float64Array:
     """Return the (3, 3) covariance of relative errors that `invert` adds to the noise.
 
     Parameters
@@ -309,7 +307,7 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
     return np.asarray(covariance + floor * np.eye(3))
 
 
-def without_brightness(covariance: Floats) -> Floats:
+def without_brightness(covariance: Float64Array) -> Float64Array:
     """Add an error common to the channels to a covariance whose weights will leave it out anyway.
 
     A covariance of colors without brightness has none, and its inverse would lose all digits.
@@ -323,7 +321,9 @@ def without_brightness(covariance: Floats) -> Floats:
     return np.asarray(covariance + common[..., None, None])
 
 
-def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Floats:
+def _weights(
+    relative_variance: Float64Array, covariance: Float64Array, *, free: bool
+) -> Float64Array:
     """Return the inverse covariance of relative errors, with a free shading projected out."""
     total = relative_variance[..., None] * np.eye(3) + covariance
     weights = np.linalg.inv(total)
@@ -336,8 +336,8 @@ def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Fl
 
 
 def _second_solution(
-    start: Start, color: Floats, gradient: Floats, shading_max: float | None
-) -> Mask:
+    start: Start, color: Float64Array, gradient: Float64Array, shading_max: float | None
+) -> BoolArray:
     """Return where skin seen with a shading of 1 has its color from other chromophores too."""
     log_color = np.log(color)
     place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
@@ -350,7 +350,7 @@ def _second_solution(
     return np.asarray((facing <= 0.0) | darker)
 
 
-def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Map]:
+def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Array]:
     if shading is None:
         return True, np.ones(1, dtype=np.float32)
     if isinstance(shading, str):
@@ -368,7 +368,7 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Map]:
     return False, np.ascontiguousarray(known).reshape(-1)
 
 
-def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Map:
+def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Array:
     if variance is None:
         return np.zeros((1, 3), dtype=np.float32)
     values = np.asarray(variance, dtype=np.float32)
@@ -383,7 +383,7 @@ def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Map:
     return np.ascontiguousarray(values).reshape(-1, 3)
 
 
-def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     if valid is None:
         return np.ones(1, dtype=np.bool_)
     usable = np.asarray(valid)
@@ -394,5 +394,5 @@ def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
     return np.ascontiguousarray(usable).reshape(-1)
 
 
-def _cells(table: ColorTable) -> NDArray[np.float32]:
+def _cells(table: ColorTable) -> Float32Array:
     return np.ascontiguousarray(table.cells, dtype=np.float32)

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.color_table import ColorTable
+from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.start import LOWEST, evaluate
-
-Floats = NDArray[np.float64]
 
 LINES = 49
 """Values of melanin at which there is a line."""
@@ -30,11 +28,11 @@ MELANIN_AXIS = np.linspace(float(LOWEST), 1.0, (LINES - 1) * PER_LINE + 1)
 class Lines:
     """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
 
-    log_rgb: Floats
+    log_rgb: Float64Array
     """Natural logarithm of the color over that of a white tile."""
-    by_a: Floats
+    by_a: Float64Array
     """Derivative by the fraction of the melanin axis."""
-    by_b: Floats
+    by_b: Float64Array
     """Derivative by the fraction of the blood axis."""
 
 

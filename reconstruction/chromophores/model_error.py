@@ -24,13 +24,12 @@ from importlib import resources
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 FILE = "data/chromophore_model_error.json"
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.floating[Any]]
 
 SMOOTH: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
 """Fourth differences, 1 at the middle: what is cubic over 5 pixels leaves nothing."""
@@ -44,9 +43,9 @@ _BAND_PIXELS: Final = 1 << 16
 class ColorErrors:
     """Terms of the relative error of a pixel's color."""
 
-    transport: Floats
+    transport: Float64Array
     """(3, 3): covariance of what every pixel has."""
-    fine: Floats
+    fine: Float64Array
     """(3, 3): covariance over the mean square of fine structure."""
     bounced: float
     """Standard deviation of the light from other skin, over the light and reflectance of a pixel;
@@ -66,7 +65,7 @@ class Histogram:
 
 
 @lru_cache(maxsize=1)
-def load() -> NDArray[np.float64]:
+def load() -> Float64Array:
     """Return the covariance of log color that the model leaves unexplained, (3, 3), of all pixels.
 
     For where there is no picture to tell fine structure by; elsewhere `of_picture` knows more. Of
@@ -89,12 +88,8 @@ def color_errors() -> ColorErrors:
 
 
 def of_picture(
-    rgb: Image,
-    variance: Image,
-    valid: NDArray[np.bool_],
-    *,
-    errors: ColorErrors | None = None,
-) -> Floats:
+    rgb: FloatArray, variance: FloatArray, valid: BoolArray, *, errors: ColorErrors | None = None
+) -> Float64Array:
     """Return the covariance of each pixel's relative error beside noise, (H, W, 3, 3).
 
     Parameters
@@ -146,8 +141,8 @@ def _with_rim(rows: slice, rim: int, height: int) -> tuple[slice, slice]:
 
 
 def usable_pixels(
-    rgb: Image, valid: NDArray[np.bool_], variance: Image | None = None
-) -> NDArray[np.bool_]:
+    rgb: FloatArray, valid: BoolArray, variance: FloatArray | None = None
+) -> BoolArray:
     """Return where a picture has a color that has a logarithm, and known noise, (H, W).
 
     Parameters
@@ -163,7 +158,7 @@ def usable_pixels(
     return np.asarray(good)
 
 
-def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Floats:
+def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> Float64Array:
     """Return the mean square of log color's fourth differences around each pixel, (H, W).
 
     Parameters
@@ -204,8 +199,8 @@ def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Flo
 
 
 def _squared_differences(
-    rgb: Image, variance: Image, valid: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
+    rgb: FloatArray, variance: FloatArray, valid: BoolArray
+) -> tuple[Float64Array, Float64Array]:
     """Return the sum of log color's squared fourth differences over both axes, and how many."""
     safe = np.where(valid[..., None], rgb, 1.0).astype(np.float64)
     log_rgb = np.log(safe)

@@ -13,9 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
@@ -30,9 +31,6 @@ from reconstruction.chromophores.lines import MELANIN_AXIS, lines_of
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import LOWEST
 
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
 FINEST = 2e-4
 """Least relative error of a color that is told apart: smaller noise is taken for this much, with
 which melanin is known to some 0.3 percent."""
@@ -44,25 +42,25 @@ _BAND_PIXELS = 1 << 16
 class WeighedChromophores:
     """Medians and 68 % reaches; every map has the pixels' shape."""
 
-    melanin: Map
+    melanin: Float32Array
     """Volume fraction of melanin in the epidermis: the median; NaN where the input is unusable."""
-    hemoglobin: Map
+    hemoglobin: Float32Array
     """Volume fraction of blood in the dermis: the median; NaN where the input is unusable."""
-    shading: Map
+    shading: Float32Array
     """Light on the pixel over that on a white tile: the mean of its logarithm, as a factor."""
-    stderr_melanin: Map
+    stderr_melanin: Float32Array
     """Distance from `melanin` within which 68.3 % of the probability lies; of a normal
     distribution it is the standard deviation."""
-    stderr_hemoglobin: Map
+    stderr_hemoglobin: Float32Array
     """The same of `hemoglobin`."""
-    residual: Map
+    residual: Float32Array
     """Root of the weighted square sum of what the best color leaves, in standard errors."""
-    gamut_distance: Map
+    gamut_distance: Float32Array
     """How far the nearest color of the table is: root mean square relative difference."""
-    outside: Mask
+    outside: BoolArray
     """The color does not belong to the table, see `reconstruction.chromophores`: by the usual model
     error, or by the pixel's own."""
-    valid: Mask
+    valid: BoolArray
     """Usable input, and not `outside`."""
 
 
@@ -173,9 +171,7 @@ def weigh(
     )
 
 
-def _of_face(
-    face: FaceDistribution | None, table: ColorTable
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _of_face(face: FaceDistribution | None, table: ColorTable) -> tuple[Float64Array, Float64Array]:
     """Return the kernel's -2 log probability of melanin, and its four numbers of blood."""
     if face is None:
         return np.zeros(MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
@@ -192,7 +188,7 @@ _UPPER = np.triu_indices(3)
 
 def _covariances(
     model_error: ArrayLike | None, shape: tuple[int, ...], default_noise: bool
-) -> tuple[ArrayLike | None, NDArray[np.float64]]:
+) -> tuple[ArrayLike | None, Float64Array]:
     """Return the usual model error, and the upper triangles that pixels are weighed by, (m, 6).
 
     A rough fit by the usual one only finds where to begin.

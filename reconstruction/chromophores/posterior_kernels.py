@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
-from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.chromophores.lines import LINES, NODES, PER_LINE
 from reconstruction.chromophores.start import LOWEST
 
@@ -61,14 +61,7 @@ STEPS_TO_REACH = 20
 """Halvings of the distance that holds one sigma's probability."""
 WITHIN = 0.682689492137086
 """Probability within one standard error of a normal distribution."""
-MAPS = (
-    "melanin",
-    "hemoglobin",
-    "shading",
-    "stderr_melanin",
-    "stderr_hemoglobin",
-    "residual",
-)
+MAPS = ("melanin", "hemoglobin", "shading", "stderr_melanin", "stderr_hemoglobin", "residual")
 
 _LOW = float(LOWEST)
 _STEP_A = (1.0 - _LOW) / (LINES - 1)
@@ -76,42 +69,40 @@ _STEP_B = (1.0 - _LOW) / (NODES - 1)
 _ROOM = (LINES - 1) * FEWEST + FINE
 _FAST = {"contract"}
 
-Floats = NDArray[np.float64]
-
 
 class _Ridge(NamedTuple):
     """What is found on each line, (LINES,) each: the ridge, where blood fits the color best."""
 
-    cost: Floats
+    cost: Float64Array
     """-2 log of the likelihood and of the face's blood there."""
-    slope: Floats
+    slope: Float64Array
     """Its derivative by the fraction of the melanin axis, along the ridge."""
-    shade: Floats
+    shade: Float64Array
     """Log shading."""
-    face_cost: Floats
+    face_cost: Float64Array
     """The face's part of the cost."""
-    blood: Floats
-    blood_slope: Floats
-    second: Floats
+    blood: Float64Array
+    blood_slope: Float64Array
+    second: Float64Array
     """Blood of another place on the line that matters, else that of the ridge."""
-    spread: Floats
+    spread: Float64Array
     """Standard deviation of blood by the curvature."""
-    pull: Floats
+    pull: Float64Array
     """Step that would be left where an end of the axis holds the ridge; else 0."""
 
 
 class _Beside(NamedTuple):
     """How probability spreads over blood on each line, across the ridge."""
 
-    across: Floats
+    across: Float64Array
     """(LINES, ACROSS): probability of each place, relative to the ridge's."""
-    low: Floats
+    low: Float64Array
     """(LINES,): where the first place begins."""
-    width: Floats
+    width: Float64Array
     """(LINES,): of a place."""
-    wide: NDArray[np.bool_]
+    wide: BoolArray
     """(LINES,): the curvature says little, see `WIDE`."""
-    coarse: Floats
+    coarse: Float64Array
     """(COARSE,): costs on one wide line."""
 
 
@@ -333,8 +324,13 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
                 if better > 0.0:
                     second[k] = after if better < FAR else o_after
                     found, after, least, more, t, held = (
-                        other, o_after, o_least, o_more, o_t, o_held
-                    )  # fmt: skip
+                        other,
+                        o_after,
+                        o_least,
+                        o_more,
+                        o_t,
+                        o_held,
+                    )
                 elif better > -FAR:
                     second[k] = o_after
             _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
@@ -487,9 +483,8 @@ def _sum_up(  # type: ignore[no-untyped-def]
                 b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
                 if not (wide[k] or wide[k + 1]):
                     bent, _ = _hermite(
-                        blood[k], blood[k + 1], blood_slope[k], blood_slope[k + 1], x,
-                        _STEP_A,
-                    )  # fmt: skip
+                        blood[k], blood[k + 1], blood_slope[k], blood_slope[k + 1], x, _STEP_A
+                    )
                     b += bent - (1.0 - x) * blood[k] - x * blood[k + 1]
                 width = across_width[k] + x * (across_width[k + 1] - across_width[k])
                 place, size = (b - b_low) * per_b, width * per_b
@@ -566,13 +561,23 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     light = prior, prior_low, prior_step
     for task in prange((pixels + block - 1) // block):
         ridge = _Ridge(
-            np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES),
-            np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES),
-        )  # fmt: skip
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES),
+        )
         beside = _Beside(
-            np.empty((LINES, ACROSS)), np.empty(LINES), np.empty(LINES),
-            np.empty(LINES, dtype=np.bool_), np.empty(COARSE),
-        )  # fmt: skip
+            np.empty((LINES, ACROSS)),
+            np.empty(LINES),
+            np.empty(LINES),
+            np.empty(LINES, dtype=np.bool_),
+            np.empty(COARSE),
+        )
         between = np.empty(LINES - 1)
         edges_a, total_a = np.empty(_ROOM + LINES), np.empty(_ROOM + LINES)
         edges_b, total_b = np.empty(BINS + 1), np.empty(BINS + 1)
@@ -591,9 +596,17 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside
             )
             count, mean_shade, per_b = _sum_up(
-                ridge, beside, between, lowest, light, melanin_of_face, ends[0], b_low, b_high,
+                ridge,
+                beside,
+                between,
+                lowest,
+                light,
+                melanin_of_face,
+                ends[0],
+                b_low,
+                b_high,
                 (edges_a, total_a, bins),
-            )  # fmt: skip
+            )
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
             for m in range(BINS):
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3

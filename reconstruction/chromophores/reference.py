@@ -9,22 +9,20 @@ it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from model.color_table import ColorTable
+from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import LOWEST, evaluate, start_for
-
-Floats = NDArray[np.float64]
 
 _STEPS = 200
 
 
 def fit(
-    rgb: Floats, table: ColorTable, weights: Floats, *, free_shading: bool
-) -> tuple[Floats, Floats, Floats, Floats]:
+    rgb: Float64Array, table: ColorTable, weights: Float64Array, *, free_shading: bool
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Fit all pixels by bounded Levenberg-Marquardt.
 
     Parameters
@@ -75,8 +73,8 @@ def fit(
 
 
 def _linearise(
-    rgb: Floats, table: ColorTable, x: Floats, free_shading: bool
-) -> tuple[Floats, Floats, Floats]:
+    rgb: Float64Array, table: ColorTable, x: Float64Array, free_shading: bool
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return shading, relative residuals and the color's relative derivatives at x."""
     color, by_a, by_b = evaluate(table, x[:, 0], x[:, 1])
     residual = np.log(rgb / color)
@@ -88,19 +86,19 @@ def _linearise(
     return shading, residual, np.stack([by_a / color, by_b / color], axis=-1)
 
 
-def _square(residual: Floats, weights: Floats) -> Floats:
+def _square(residual: Float64Array, weights: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("nc,ncd,nd->n", residual, weights, residual))
 
 
 def weigh(
-    rgb: Floats,
+    rgb: Float64Array,
     table: ColorTable,
-    covariance: Floats,
+    covariance: Float64Array,
     prior: ShadingPrior,
     *,
     face: FaceDistribution | None = None,
     size: tuple[int, int] = (1200, 500),
-) -> Floats:
+) -> Float64Array:
     """Sum the probability of one pixel's chromophores over a dense plane of their cube roots.
 
     Parameters
@@ -144,7 +142,7 @@ def weigh(
     )
 
 
-def _median_and_reach(edges: Floats, density: Floats) -> tuple[float, float]:
+def _median_and_reach(edges: Float64Array, density: Float64Array) -> tuple[float, float]:
     below = np.concatenate([[0.0], np.cumsum(density)]) / density.sum()
     center = float(np.interp(0.5, below, edges))
 

@@ -11,11 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Float64Array
 from reconstruction.chromophores import model_error
-
-Floats = NDArray[np.float64]
 
 SOFTNESS = 0.1
 """Spread of log shading that is added to the measured one: a face 5 % of its distance off the
@@ -47,7 +46,7 @@ class ShadingPrior:
 
     low: float
     step: float
-    density: Floats
+    density: Float64Array
 
     def __post_init__(self) -> None:
         """Refuse what is no density."""
@@ -63,7 +62,7 @@ class ShadingPrior:
         object.__setattr__(self, "density", density)
 
     @property
-    def nodes(self) -> Floats:
+    def nodes(self) -> Float64Array:
         """Log shading of the nodes, (n,)."""
         return np.asarray(self.low + self.step * np.arange(self.density.size), dtype=np.float64)
 
@@ -161,5 +160,5 @@ def of_faces(*, softness: float = SOFTNESS) -> ShadingPrior:
     return from_samples(found.low, found.step, found.counts, softness=softness)
 
 
-def _normal(away: Floats, spread: float) -> Floats:
+def _normal(away: Float64Array, spread: float) -> Float64Array:
     return np.exp(-0.5 * (away / spread) ** 2) / (math.sqrt(2.0 * math.pi) * spread)

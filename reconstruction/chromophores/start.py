@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import linprog
 from scipy.spatial import cKDTree
 
 from model.color_table import ColorTable
-
-FloatArray = NDArray[np.float64]
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 LOWEST = 0.04
 """Smallest fraction of an axis that is fitted: 6.4e-5 of the largest volume fraction."""
@@ -35,13 +33,13 @@ _POLISH_STEPS = 3
 class Start:
     """The turned table: from a projected log color to fractions of the table's axes."""
 
-    projection: FloatArray
+    projection: Float64Array
     """Shape (2, 4): rows take (log R, log G, log B, 1) to grid units."""
-    axes: NDArray[np.float32]
+    axes: Float32Array
     """Shape (GRID, GRID, 2): fractions of the melanin and the blood axis, in [LOWEST, 1]."""
-    twin_log: NDArray[np.float32]
+    twin_log: Float32Array
     """Shape (GRID, GRID): largest mean log RGB of a second solution, -inf where there is none."""
-    normal: FloatArray
+    normal: Float64Array
     """Shape (3,): unit direction in log RGB that is projected away."""
     side: float
     """Sign of the surface's side, seen along `normal`, that `axes` lie on."""
@@ -83,8 +81,8 @@ def start_for(table: ColorTable, free_shading: bool) -> Start:
 
 
 def evaluate(
-    table: ColorTable, a: FloatArray, b: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    table: ColorTable, a: Float64Array, b: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the color and its derivatives by the fractions a and b of the table's axes."""
     last = table.size - 1
     i, j = a * last, b * last
@@ -95,14 +93,14 @@ def evaluate(
     inner = ((cell[..., 3, :] * x + cell[..., 2, :]) * x + cell[..., 1, :]) * x + cell[..., 0, :]
     inner_x = (3.0 * cell[..., 3, :] * x + 2.0 * cell[..., 2, :]) * x + cell[..., 1, :]
 
-    def along(c: FloatArray) -> FloatArray:
+    def along(c: Float64Array) -> Float64Array:
         return ((c[..., 3] * y + c[..., 2]) * y + c[..., 1]) * y + c[..., 0]
 
     by_y = (3.0 * inner[..., 3] * y + 2.0 * inner[..., 2]) * y + inner[..., 1]
     return along(inner), last * along(inner_x), last * by_y
 
 
-def _unfolding_direction(across: FloatArray) -> FloatArray:
+def _unfolding_direction(across: Float64Array) -> Float64Array:
     """Return the unit vector most clearly on one side of all the surface's tangent planes."""
     facets = across[::8, ::8].reshape(-1, 3)
     facets = facets / np.linalg.norm(facets, axis=1, keepdims=True)
@@ -116,7 +114,7 @@ def _unfolding_direction(across: FloatArray) -> FloatArray:
     return direction / np.linalg.norm(direction)
 
 
-def _light_side(facing: FloatArray) -> NDArray[np.bool_]:
+def _light_side(facing: Float64Array) -> BoolArray:
     """Return the samples that melanin reaches without a fold, around light skin with some blood.
 
     Behind the first fold may lie a second one, where skin is dark and faces as light skin does.
@@ -128,7 +126,7 @@ def _light_side(facing: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
 
 
-def _plane(log_rgb: FloatArray, normal: FloatArray) -> FloatArray:
+def _plane(log_rgb: Float64Array, normal: Float64Array) -> Float64Array:
     """Return two unit vectors across `normal`, along the principal axes of the colors."""
     flat = log_rgb - np.outer(log_rgb @ normal, normal)
     flat = flat - flat.mean(axis=0)
@@ -140,11 +138,11 @@ def _plane(log_rgb: FloatArray, normal: FloatArray) -> FloatArray:
 
 def _polish(
     table: ColorTable,
-    axes: FloatArray,
-    nodes: FloatArray,
-    projection: FloatArray,
-    offset: FloatArray,
-) -> FloatArray:
+    axes: Float64Array,
+    nodes: Float64Array,
+    projection: Float64Array,
+    offset: Float64Array,
+) -> Float64Array:
     """Move the fractions towards their node's projected color by a few careful Newton steps."""
     best = axes.copy()
     best_miss = np.full(len(axes), np.inf)
@@ -170,8 +168,8 @@ def _polish(
 
 
 def _twin_grid(
-    log_rgb: FloatArray, projection: FloatArray, offset: FloatArray
-) -> NDArray[np.float32]:
+    log_rgb: Float64Array, projection: Float64Array, offset: Float64Array
+) -> Float32Array:
     """Return, per grid cell, the mean log RGB of the lightest second solution."""
     grid = np.full((GRID, GRID), -np.inf)
     place = np.rint(log_rgb @ projection.T + offset).astype(np.intp)

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from model import color_table, spectra
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-
-Floats = NDArray[np.float32]
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 
 MAX_SAMPLES = 20_000
 """Pixels that the components are found from; the maps are then made for all."""
@@ -42,13 +40,13 @@ class PigmentMaps:
         unit length.
     """
 
-    melanin: Floats
-    hemoglobin: Floats
-    valid: NDArray[np.bool_]
-    axes: NDArray[np.float64]
+    melanin: Float32Array
+    hemoglobin: Float32Array
+    valid: BoolArray
+    axes: Float64Array
 
 
-def tsumura_ica(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> PigmentMaps:
+def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
     """Unmix skin colors into two independent pigments.
 
     Parameters
@@ -124,13 +122,13 @@ _BASIS /= np.linalg.norm(_BASIS, axis=1, keepdims=True)
 """Two unit vectors across (1, 1, 1): density without brightness."""
 
 
-def _plane(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane(vector: Float64Array) -> Float64Array:
     inside = _BASIS @ vector
     return np.asarray(inside / np.linalg.norm(inside))
 
 
 @cache
-def _pigments() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pigments() -> tuple[Float64Array, Float64Array]:
     """How density grows with melanin and with blood in middling skin under daylight, (3,) each."""
     table = color_table.build(spectra.LINEAR_SRGB, "D65", size=32, anisotropy=ANISOTROPY_SKIN)
     growth = -table.jacobian(0.04, 0.03) / table.lookup(0.04, 0.03)[:, None]

@@ -20,16 +20,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
 
 from model.texture_statistics.masks import fill_smoothly
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_field
 from reconstruction.correspondence.landmark_field import LandmarkField, LandmarkFieldError
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 Point = tuple[float, float, float]
 
 RADIUS_MM: Final = 90.0
@@ -62,7 +60,7 @@ class Cylinder:
 
     tip_mm: Point
 
-    def unroll(self, position_mm: ArrayLike) -> Floats:
+    def unroll(self, position_mm: ArrayLike) -> Float64Array:
         """Return (u, v), mm: arc to the right of the nose's tip as seen, and height above it.
 
         Parameters
@@ -99,7 +97,7 @@ class CommonFrame:
     """
 
     names: tuple[str, ...]
-    landmarks_mm: Floats
+    landmarks_mm: Float64Array
     center_mm: tuple[float, float]
     side_mm: float
     size: int
@@ -125,19 +123,19 @@ class CommonFrame:
         """Side of a pixel."""
         return self.side_mm / self.size
 
-    def pixel(self, uv_mm: ArrayLike) -> Floats:
+    def pixel(self, uv_mm: ArrayLike) -> Float64Array:
         """Return (column, row) of places in the map, (..., 2); pixel (0, 0) is centred at 0, 0."""
         uv = (np.asarray(uv_mm, np.float64) - self.center_mm) / self.pixel_mm
         middle = 0.5 * (self.size - 1)
         return np.stack([middle + uv[..., 0], middle - uv[..., 1]], axis=-1)
 
-    def grid_mm(self) -> Floats:
+    def grid_mm(self) -> Float64Array:
         """Return (u, v) of each pixel, (N, N, 2), row 0 at the top."""
         along = (np.arange(self.size) - 0.5 * (self.size - 1)) * self.pixel_mm
         u, v = np.meshgrid(along + self.center_mm[0], self.center_mm[1] - along)
         return np.stack([u, v], axis=-1)
 
-    def landmark(self, name: str) -> Floats:
+    def landmark(self, name: str) -> Float64Array:
         """Return where a landmark lies, (2,), mm."""
         if name not in self.names:
             raise ParameterizationError(
@@ -199,7 +197,7 @@ class Correspondence:
     cylinder: Cylinder
     field: LandmarkField | None = None
 
-    def at(self, position_mm: ArrayLike) -> tuple[Floats, Floats]:
+    def at(self, position_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return common (u, v) of points, (..., 2), and their standard error, (...), mm.
 
         Parameters
@@ -244,12 +242,14 @@ class Chart:
     """
 
     size: int
-    place_px: NDArray[np.float64]
-    on_surface: Bools
-    outermost: Bools
-    stderr_mm: Image
+    place_px: Float64Array
+    on_surface: BoolArray
+    outermost: BoolArray
+    stderr_mm: Float32Array
 
-    def gather(self, texture: ArrayLike, valid: ArrayLike | None = None) -> tuple[Image, Bools]:
+    def gather(
+        self, texture: ArrayLike, valid: ArrayLike | None = None
+    ) -> tuple[Float32Array, BoolArray]:
         """Average a texture into the common map.
 
         Parameters
@@ -280,7 +280,7 @@ class Chart:
         filled = fill_smoothly(mean, known).astype(np.float32)
         return filled if image.ndim == 3 else filled[..., 0], near
 
-    def read(self, common: ArrayLike) -> tuple[Image, Bools]:
+    def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
         """Read a common map at the texels, linearly.
 
         Parameters
@@ -341,9 +341,7 @@ def find_cylinder(
     return Cylinder((float(x), float(y), float(z)))
 
 
-def common_landmarks(
-    faces: Sequence[Mapping[str, Point]],
-) -> tuple[tuple[str, ...], Floats]:
+def common_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, ...], Float64Array]:
     """Return the landmarks that all faces have, and their mean places in the unrolled plane.
 
     Parameters
@@ -468,7 +466,11 @@ def chart(
 
 
 def frame_around(
-    names: tuple[str, ...], landmarks_mm: Floats, places_mm: Sequence[Floats], *, size: int
+    names: tuple[str, ...],
+    landmarks_mm: Float64Array,
+    places_mm: Sequence[Float64Array],
+    *,
+    size: int,
 ) -> CommonFrame:
     """Return a square map that shows what most faces show.
 
@@ -491,7 +493,7 @@ def frame_around(
     return CommonFrame(names, landmarks_mm, (float(middle[0]), float(middle[1])), side, size)
 
 
-def _folds(field: LandmarkField, own: Floats) -> bool:
+def _folds(field: LandmarkField, own: Float64Array) -> bool:
     """Return whether the map turns anything over, within the landmarks and a fifth around."""
     low, high = own.min(axis=0), own.max(axis=0)
     rim = 0.2 * (high - low)
@@ -503,7 +505,9 @@ def _folds(field: LandmarkField, own: Floats) -> bool:
     return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
 
 
-def _outermost(place: Floats, reach: Floats, shown: Bools, frame: CommonFrame) -> Bools:
+def _outermost(
+    place: Float64Array, reach: Float64Array, shown: BoolArray, frame: CommonFrame
+) -> BoolArray:
     """Return the texels that lie about as far out as any near their place, on cells of 2 mm."""
     cells = max(1, math.ceil(frame.side_mm / 2.0))
     at = np.floor((place + 0.5) * (cells / frame.size)).astype(np.int64)
@@ -517,7 +521,7 @@ def _outermost(place: Floats, reach: Floats, shown: Bools, frame: CommonFrame) -
     return np.asarray(out, np.bool_)
 
 
-def _splat(at: Floats, values: Floats, size: int) -> tuple[Floats, Floats]:
+def _splat(at: Float64Array, values: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
     """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
     total = np.zeros((size * size, values.shape[1]))
     weight = np.zeros(size * size)
@@ -537,7 +541,7 @@ def _splat(at: Floats, values: Floats, size: int) -> tuple[Floats, Floats]:
     return total.reshape(size, size, -1), weight.reshape(size, size)
 
 
-def _closed(known: Bools) -> Bools:
+def _closed(known: BoolArray) -> BoolArray:
     """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
     padded = np.pad(known, 3, mode="edge")
     closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)

@@ -11,11 +11,9 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.correspondence.common_parameterization import CommonFrame
-
-Floats = NDArray[np.float64]
 
 STANDARD_MM: Final = MappingProxyType(
     {
@@ -58,7 +56,7 @@ def standard_frame(*, side_mm: float, center_mm: tuple[float, float], size: int)
     return CommonFrame(names, places, center_mm, side_mm, size)
 
 
-def region(name: str, frame: CommonFrame) -> NDArray[np.bool_]:
+def region(name: str, frame: CommonFrame) -> BoolArray:
     """Return the pixels of a region, (N, N).
 
     Parameters
@@ -93,7 +91,7 @@ def region(name: str, frame: CommonFrame) -> NDArray[np.bool_]:
     return above & ~beard
 
 
-def _beard_outline(at: dict[str, Floats]) -> Floats:
+def _beard_outline(at: dict[str, Float64Array]) -> Float64Array:
     """Return the corners of the region where a beard grows, mm, from the left jaw around."""
     left, right = at["jaw left"], at["jaw right"]
     wing_left, wing_right = at["nose wing left"], at["nose wing right"]
@@ -118,7 +116,7 @@ def _beard_outline(at: dict[str, Floats]) -> Floats:
     )
 
 
-def _eyes(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
+def _eyes(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
     """Return the eyes with the brows above them."""
     out = np.zeros(grid.shape[:2], np.bool_)
     for side in ("left", "right"):
@@ -129,14 +127,14 @@ def _eyes(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
     return out
 
 
-def _nostrils(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
+def _nostrils(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
     left, right = at["nose wing left"], at["nose wing right"]
     middle = 0.5 * (left + right) - np.array([0.0, 4.0])
     half = np.array([0.5 * abs(right[0] - left[0]), 7.0])
     return np.asarray((((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0, np.bool_)
 
 
-def _lips(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
+def _lips(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
     corners = at["mouth corner left"], at["mouth corner right"]
     middle = 0.5 * (at["upper lip"] + at["lower lip"])
     half = (
@@ -146,7 +144,7 @@ def _lips(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
     return np.asarray((((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0, np.bool_)
 
 
-def _inside(corners: Floats, grid: Floats) -> NDArray[np.bool_]:
+def _inside(corners: Float64Array, grid: Float64Array) -> BoolArray:
     """Return the points inside a polygon, by the parity of the edges to the right of them."""
     u, v = grid[..., 0], grid[..., 1]
     inside = np.zeros(u.shape, np.bool_)

@@ -18,15 +18,13 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.skin import SkinMap
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_field, landmark_table
 from reconstruction.registration import RegistrationError, dense_flow, evened, feature_matches
 
-Float32s = NDArray[np.float32]
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Points = Mapping[str, tuple[float, float]]
 
 LANDMARK_STDERR_PX = 1.0
@@ -72,11 +70,11 @@ class Alignment:
         Rows and columns of the moving picture.
     """
 
-    source_px: Float32s
-    valid: Bools
-    error_px: Float32s
-    residual_px: Float32s
-    followed: Bools
+    source_px: Float32Array
+    valid: BoolArray
+    error_px: Float32Array
+    residual_px: Float32Array
+    followed: BoolArray
     landmark_rms_px: float
     leave_one_out_px: Mapping[str, float]
     folded_fraction: float
@@ -91,7 +89,9 @@ class Alignment:
                 f"source_px: got shape {self.source_px.shape}, expected {(*shape, 2)}"
             )
 
-    def warp(self, values: ArrayLike, valid: ArrayLike | None = None) -> tuple[Float32s, Bools]:
+    def warp(
+        self, values: ArrayLike, valid: ArrayLike | None = None
+    ) -> tuple[Float32Array, BoolArray]:
         """Lay a map of the moving picture over the neutral one.
 
         Parameters
@@ -129,7 +129,7 @@ class Alignment:
 
     def warp_stderr(
         self, values: ArrayLike, stderr: ArrayLike, valid: ArrayLike | None = None
-    ) -> Float32s:
+    ) -> Float32Array:
         """Return the standard error of a warped map: its own, and that of the place.
 
         Parameters
@@ -157,7 +157,7 @@ class Alignment:
         shown = seen[..., None] if image.ndim == 3 else seen
         return np.where(shown, np.sqrt(total), 0.0).astype(np.float32)
 
-    def place_stderr(self, values: ArrayLike, valid: ArrayLike | None = None) -> Float32s:
+    def place_stderr(self, values: ArrayLike, valid: ArrayLike | None = None) -> Float32Array:
         """Return how far a map on the neutral picture may be off because its places are.
 
         Parameters
@@ -206,7 +206,9 @@ class Alignment:
             stderr = np.sqrt(np.maximum(variance, 0.0) * left).astype(np.float32)
         return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
 
-    def _checked(self, values: ArrayLike, valid: ArrayLike | None) -> tuple[Float32s, Bools]:
+    def _checked(
+        self, values: ArrayLike, valid: ArrayLike | None
+    ) -> tuple[Float32Array, BoolArray]:
         image = np.asarray(values, np.float32)
         if image.ndim not in (2, 3) or image.shape[:2] != self.moving_shape:
             raise AlignmentError(
@@ -342,7 +344,7 @@ def read_landmarks(path: str | Path) -> dict[str, tuple[float, float]]:
     return landmark_table.read(path)
 
 
-def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, Bools]:
+def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, BoolArray]:
     """Return the local contrast of a picture and where it means something."""
     image = np.asarray(picture, np.float64)
     if image.ndim not in (2, 3) or min(image.shape[:2]) < LEAST_SIDE_PX:
@@ -368,7 +370,7 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
     return evened(np.where(good, value, around)), good
 
 
-def _common(moving: Points, neutral: Points) -> tuple[list[str], Floats, Floats]:
+def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, Float64Array]:
     names = sorted(set(moving) & set(neutral))
     if len(names) < landmark_field.LEAST:
         raise AlignmentError(
@@ -382,7 +384,7 @@ def _common(moving: Points, neutral: Points) -> tuple[list[str], Floats, Floats]
     )
 
 
-def _within(source_px: Float32s, mask: Bools) -> Bools:
+def _within(source_px: Float32Array, mask: BoolArray) -> BoolArray:
     """Return which places are inside a picture, and all pixels around them in its mask."""
     height, width = mask.shape
     inside = (source_px >= 0).all(axis=-1)
@@ -391,10 +393,11 @@ def _within(source_px: Float32s, mask: Bools) -> Bools:
     return np.asarray(inside & (missing <= 0.0))
 
 
-def _folded(source_px: Float32s) -> Bools:
+def _folded(source_px: Float32Array) -> BoolArray:
     """Return where the map turns its orientation, by any of a pixel's four triangles."""
-    padded = np.pad(source_px.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="reflect",
-                    reflect_type="odd")  # fmt: skip
+    padded = np.pad(
+        source_px.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd"
+    )
     middle = padded[1:-1, 1:-1]
     right, left = padded[1:-1, 2:] - middle, middle - padded[1:-1, :-2]
     below, above = padded[2:, 1:-1] - middle, middle - padded[:-2, 1:-1]
@@ -406,7 +409,7 @@ def _folded(source_px: Float32s) -> Bools:
     return np.asarray(least <= 0.0)
 
 
-def _landmark_rms(source_px: Float32s, points: Floats, moved: Floats) -> float:
+def _landmark_rms(source_px: Float32Array, points: Float64Array, moved: Float64Array) -> float:
     height, width = source_px.shape[:2]
     inside = (points >= 0).all(axis=1) & (points <= [width - 1, height - 1]).all(axis=1)
     if not inside.any():
@@ -416,7 +419,7 @@ def _landmark_rms(source_px: Float32s, points: Floats, moved: Floats) -> float:
     return float(np.sqrt(((put - moved[inside]) ** 2).sum(axis=1).mean()))
 
 
-def _slope_variance(image: Float32s, good: Bools) -> Float32s:
+def _slope_variance(image: Float32Array, good: BoolArray) -> Float32Array:
     """Return the squared slope of a map per px, smoothed over 2 px."""
     weight = good.astype(np.float32)
     share = cv2.GaussianBlur(weight, (0, 0), 2.0)

@@ -19,13 +19,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RBFInterpolator
 from scipy.optimize import minimize_scalar
 
+from reconstruction.arrays import Float64Array
 from reconstruction.registration import RegistrationError
-
-Floats = NDArray[np.float64]
 
 LEAST = 4
 """Fewer points than these leave nothing to tell noise from deformation by."""
@@ -61,20 +60,20 @@ class LandmarkField:
         How far each landmark lies from where the others put it.
     """
 
-    points_px: Floats
-    moved_px: Floats
+    points_px: Float64Array
+    moved_px: Float64Array
     stderr_px: float
     strength: float
     scale_px: float
-    leave_one_out_px: Floats
-    _inverse: Floats
+    leave_one_out_px: Float64Array
+    _inverse: Float64Array
 
     @property
     def smoothing(self) -> float:
         """Smoothing of the thin-plate spline: noise over strength."""
         return self.stderr_px**2 / max(self.strength, self.stderr_px**2 / _STRONGEST)
 
-    def on_grid(self, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    def on_grid(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
         """Return the displacement (H, W, 2) and its standard error along each axis (H, W), px.
 
         Parameters
@@ -96,7 +95,7 @@ class LandmarkField:
         ).astype(np.float64)
         return fine[..., :2], np.maximum(fine[..., 2], 0.0)
 
-    def at(self, points_px: ArrayLike) -> tuple[Floats, Floats]:
+    def at(self, points_px: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return displacement (N, 2) and standard error along each axis (N,) at some points, px.
 
         Parameters
@@ -175,27 +174,21 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
     system[: len(first), : len(first)] = kernel + smoothing * np.eye(len(first))
     system[: len(first), len(first) :] = affine
     system[len(first) :, : len(first)] = affine.T
-    inverse: Floats = np.asarray(np.linalg.inv(system), np.float64)
+    inverse: Float64Array = np.asarray(np.linalg.inv(system), np.float64)
     own = inverse[: len(first), : len(first)]
     left_out = (own @ displacement) / np.maximum(np.diag(own), 1e-300)[:, None]
     return LandmarkField(
-        first,
-        second,
-        noise,
-        strength,
-        scale,
-        np.linalg.norm(left_out, axis=1),
-        inverse,
+        first, second, noise, strength, scale, np.linalg.norm(left_out, axis=1), inverse
     )
 
 
-def _kernel(away: Floats) -> Floats:
+def _kernel(away: Float64Array) -> Float64Array:
     """Return r^2 log r, 0 at 0."""
     return np.asarray(away**2 * np.log(np.where(away > 0, away, 1.0)))
 
 
 def _likeliest_strength(
-    kernel: Floats, affine: Floats, displacement: Floats, noise: float
+    kernel: Float64Array, affine: Float64Array, displacement: Float64Array, noise: float
 ) -> float:
     """Return the strength of deformation by restricted maximum likelihood."""
     count = len(kernel)

@@ -7,9 +7,4 @@ from reconstruction.diffuse_albedo.estimation import (
     reduced_albedo,
 )
 
-__all__ = [
-    "DiffuseAlbedo",
-    "ReducedAlbedo",
-    "estimate",
-    "reduced_albedo",
-]
+__all__ = ["DiffuseAlbedo", "ReducedAlbedo", "estimate", "reduced_albedo"]

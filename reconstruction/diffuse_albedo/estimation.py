@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import dipole
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.diffuse_albedo.kernels import LEAST_COSINE, fit_envelope
 from reconstruction.lumitexels import boundary_kernels
 
-FloatArray = NDArray[np.float64]
 Method = Literal["envelope", "stable_minimum", "minimum"]
 
 NORMAL_STDERR_RAD = np.deg2rad(1.0)
@@ -51,10 +51,10 @@ class DiffuseAlbedo:
         Channel values without a say in the end: outliers on either side.
     """
 
-    r_d: FloatArray
-    stderr: FloatArray
-    valid: NDArray[np.bool_]
-    discarded: NDArray[np.int64]
+    r_d: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
+    discarded: Int64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +75,11 @@ class ReducedAlbedo:
         R_d is known and outside [0, 1]: no medium has it.
     """
 
-    albedo_prime: FloatArray
-    deficit: FloatArray
-    stderr: FloatArray
-    valid: NDArray[np.bool_]
-    outlier: NDArray[np.bool_]
+    albedo_prime: Float64Array
+    deficit: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
+    outlier: BoolArray
 
 
 def estimate(
@@ -168,7 +168,7 @@ def estimate(
         )
         for name, v in (("light_dirs", light_dirs), ("view_dirs", view_dirs))
     )
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(f))
+    usable: BoolArray = np.asarray(np.isfinite(f))
     if valid is not None:
         given = np.asarray(valid, dtype=bool)
         given = given[..., None] if given.ndim == len(lead) + 1 else given
@@ -196,15 +196,25 @@ def estimate(
         r_d, stderr = np.empty(start.shape), np.empty(start.shape)
         counts = np.zeros((len(f), 2), dtype=np.int64)
         fit_envelope(
-            np.where(usable, f, np.float32(0.0)), np.where(usable, var, np.float32(1.0)), light,
-            view, n, usable, start, float(eta), float(normal_stderr_rad), variance is not None,
-            r_d, stderr, counts,
-        )  # fmt: skip
+            np.where(usable, f, np.float32(0.0)),
+            np.where(usable, var, np.float32(1.0)),
+            light,
+            view,
+            n,
+            usable,
+            start,
+            float(eta),
+            float(normal_stderr_rad),
+            variance is not None,
+            r_d,
+            stderr,
+            counts,
+        )
         dropped = counts[:, 1]
     else:
         r_d, dropped = _minimum(ratio, cos_l, cos_v, usable, method, discard)
         stderr = np.full(r_d.shape, np.nan)
-    found: NDArray[np.bool_] = np.asarray(np.isfinite(r_d).all(axis=-1))
+    found: BoolArray = np.asarray(np.isfinite(r_d).all(axis=-1))
     r_d = np.where(found[:, None], r_d, np.nan)
     return DiffuseAlbedo(
         r_d.reshape(shape),
@@ -225,7 +235,7 @@ def reduced_albedo(albedo: DiffuseAlbedo, *, eta: float) -> ReducedAlbedo:
         Relative refractive index, as in the estimate.
     """
     r_d = np.asarray(albedo.r_d, dtype=np.float64)
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(r_d))
+    known: BoolArray = np.asarray(np.isfinite(r_d))
     outlier = known & dipole.is_outlier(r_d)
     usable = known & ~outlier
     inside = np.where(usable, r_d, 0.5)
@@ -245,13 +255,13 @@ def _spread(name: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[
 
 
 def _ratios(
-    f: NDArray[np.float32],
-    light: NDArray[np.float32],
-    view: NDArray[np.float32],
-    n: NDArray[np.float32],
-    usable: NDArray[np.bool_],
+    f: Float32Array,
+    light: Float32Array,
+    view: Float32Array,
+    n: Float32Array,
+    usable: BoolArray,
     eta: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
     cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
     above = (cosines[0] >= LEAST_COSINE) & (cosines[1] >= LEAST_COSINE)
@@ -264,12 +274,12 @@ def _ratios(
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]
 
 
-def _ranks(ratio: FloatArray) -> NDArray[np.intp]:
+def _ranks(ratio: Float64Array) -> NDArray[np.intp]:
     """Return each value's place from the smallest, along the samples."""
     return np.argsort(np.argsort(ratio, axis=1, kind="stable"), axis=1, kind="stable")
 
 
-def _lower(ratio: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
+def _lower(ratio: Float64Array, usable: BoolArray) -> Float64Array:
     """Return the lower quartile of the ratios: a start that neither lobes nor outliers move far."""
     count = usable.sum(axis=1)
     ordered = np.sort(ratio, axis=1)
@@ -279,13 +289,13 @@ def _lower(ratio: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
 
 
 def _minimum(
-    ratio: FloatArray,
-    cos_l: FloatArray,
-    cos_v: FloatArray,
-    usable: NDArray[np.bool_],
+    ratio: Float64Array,
+    cos_l: Float64Array,
+    cos_v: Float64Array,
+    usable: BoolArray,
     method: Method,
     discard: int | None,
-) -> tuple[FloatArray, NDArray[np.intp]]:
+) -> tuple[Float64Array, NDArray[np.intp]]:
     """Return eq. (6) as it stands, or with grazing samples raised and the smallest dropped."""
     drop = np.zeros(len(ratio), dtype=np.intp)
     if method == "stable_minimum":

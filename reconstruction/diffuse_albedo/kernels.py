@@ -154,15 +154,23 @@ def _bounded(h, rhs, channels, free, low, b, x):  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        types.Array(float32, 3, "C", readonly=True), types.Array(float32, 3, "C", readonly=True),
-        types.Array(float32, 3, "C", readonly=True), types.Array(float32, 3, "C", readonly=True),
-        types.Array(float32, 2, "C", readonly=True), types.Array(boolean, 3, "C", readonly=True),
-        types.Array(float64, 2, "C", readonly=True), float64, float64, boolean,
-        types.Array(float64, 2, "C"), types.Array(float64, 2, "C"), types.Array(int64, 2, "C"),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 3, "C", readonly=True),
+        types.Array(float32, 2, "C", readonly=True),
+        types.Array(boolean, 3, "C", readonly=True),
+        types.Array(float64, 2, "C", readonly=True),
+        float64,
+        float64,
+        boolean,
+        types.Array(float64, 2, "C"),
+        types.Array(float64, 2, "C"),
+        types.Array(int64, 2, "C"),
     ),
     parallel=True,
     cache=True,
-)  # fmt: skip
+)
 def fit_envelope(  # type: ignore[no-untyped-def]
     f, variance, light, view, normal, valid, start, eta, tilt_rad, known, r_d, stderr, counts
 ):
@@ -193,9 +201,14 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                 some |= valid[point, i, c]
             if some:
                 good[i] = _shapes(
-                    light[point, i], view[point, i], normal[point], eta,
-                    through[i : i + 1], slope[i : i + 1], lobe[i],
-                )  # fmt: skip
+                    light[point, i],
+                    view[point, i],
+                    normal[point],
+                    eta,
+                    through[i : i + 1],
+                    slope[i : i + 1],
+                    lobe[i],
+                )
             if good[i]:
                 for c in range(channels):
                     seen[c] += valid[point, i, c]

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 LEAST_CHANGE = 0.002
 """Least relative change of light from state to state that is allowed for in each pixel: what a
@@ -21,8 +19,12 @@ FREE_CHANGE = 1.0
 
 
 def smooth(
-    log_shading: Map, shading_variance: Map, good: Mask, shape: tuple[int, ...], window_px: float
-) -> tuple[Map, Map]:
+    log_shading: Float32Array,
+    shading_variance: Float32Array,
+    good: BoolArray,
+    shape: tuple[int, ...],
+    window_px: float,
+) -> tuple[Float32Array, Float32Array]:
     """Return how the light of each state differs, smoothed, and one over the variance of the rest.
 
     Parameters
@@ -52,7 +54,7 @@ def smooth(
     # a pixel seen in one state alone tells nothing of changes
     weight = np.where(known & (share < 1.0 - 1e-9), 1.0 / np.maximum(scatter, 1e-12), 0.0)
 
-    def around(values: NDArray[np.float64], reach_px: float) -> NDArray[np.float64]:
+    def around(values: Float64Array, reach_px: float) -> Float64Array:
         stack = values.reshape(-1, *shape)
         return np.stack([gaussian_filter(v, reach_px, mode="constant") for v in stack]).reshape(
             values.shape

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 PLACES = ("forehead", "cheek", "nose", "chin", "temple")
 """Places that are followed."""
@@ -48,15 +47,15 @@ class CurveError(ValueError):
 class DiscMeans:
     """What discs of maps hold."""
 
-    mean: Floats
+    mean: Float64Array
     """(P, N): mean of each place in each map; NaN where no pixel is valid."""
-    stderr: Floats
+    stderr: Float64Array
     """(P, N): its standard error, of errors that differ from pixel to pixel."""
-    pixels: NDArray[np.int64]
+    pixels: Int64Array
     """(P, N): how many valid pixels it is of."""
 
     @property
-    def valid(self) -> Bools:
+    def valid(self) -> BoolArray:
         """(P, N): whether there is a mean."""
         return self.pixels > 0
 
@@ -133,7 +132,7 @@ def disc_means(
 
 def disc_pixels(
     shape: tuple[int, ...], name: str, place: tuple[float, float], radius_px: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Int64Array, Int64Array]:
     """Return rows and columns of the pixels of a disc about (x, y), px.
 
     Raises
@@ -228,7 +227,7 @@ def reproducibility(
     return Reproducibility(sd, repeats, longest)
 
 
-def same_phase(phase_s: ArrayLike, *, cycle_s: float) -> NDArray[np.int64]:
+def same_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
     """Return a number for each shot that those of one phase share, shape (N,).
 
     Phases are parted at gaps that are wider than a quarter of the usual interval.
@@ -251,7 +250,7 @@ class Transition:
 
     seen: bool
     """Whether at least one does."""
-    where: NDArray[np.int64]
+    where: Int64Array
     """Indices of those shots."""
     tested: int
     """How many shots could."""
@@ -342,7 +341,7 @@ def transition(
     usual2 = float(np.median(own2))
     upper, lower = (0, 1) if means[0] >= means[1] else (1, 0)
 
-    def window(variance: Floats) -> tuple[Floats, Floats]:
+    def window(variance: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return between which values a sample of so much noise is off both levels."""
         reach = [limit * np.sqrt(variance + usual2 / count) for count in counts]
         return means[lower] + reach[lower], means[upper] - reach[upper]
@@ -369,14 +368,14 @@ def transition(
     )
 
 
-def _between(phase: Floats, value: Floats, begin: float, end: float) -> NDArray[np.int64]:
+def _between(phase: Float64Array, value: Float64Array, begin: float, end: float) -> Int64Array:
     """Return the shots of a stretch of phases that have a value, in the order of phase."""
     order = np.argsort(phase, kind="stable")
     inside = (phase[order] >= begin) & (phase[order] < end) & np.isfinite(value[order])
     return np.asarray(order[inside], np.int64)
 
 
-def _like(part: ArrayLike, values: Floats, name: str) -> NDArray[np.generic]:
+def _like(part: ArrayLike, values: Float64Array, name: str) -> NDArray[np.generic]:
     array = np.asarray(part)
     if array.shape != values.shape:
         raise CurveError(f"{name}: got shape {array.shape}, expected {values.shape}")

@@ -16,14 +16,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
+from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
 from reconstruction.facial_color.perfusion_likelihood import Landscape, Shape
 from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
 
-Floats = NDArray[np.float64]
 Known = Literal["estimated", "only below", "only above", "unknown"]
 
 BOUND_LEVEL = 0.95
@@ -43,13 +43,13 @@ _DELAYS_OF_POSE = 41
 class RelaxationFit:
     """What relaxing curves share, and the levels of each."""
 
-    start: Floats
+    start: Float64Array
     """(P,): level that is left: rest, or that of the event's end."""
-    end: Floats
+    end: Float64Array
     """(P,): level that is gone to."""
-    stderr_start: Floats
+    stderr_start: Float64Array
     """(P,)"""
-    stderr_end: Floats
+    stderr_end: Float64Array
     """(P,)"""
     time_constant_s: float
     """Best time constant, s."""
@@ -70,13 +70,13 @@ class RelaxationFit:
     """Half of its 68 % interval, s; with steps of a pose, the standard deviation."""
     delay_interval_s: tuple[float, float]
     """95 % interval of the delay, s: where the change is quick, the gap between two samples."""
-    stderr_change: Floats
+    stderr_change: Float64Array
     """(P,): standard error of ``end`` less ``start``, which hang together."""
-    step: Floats
+    step: Float64Array
     """(P,): what the samples of a moved face are off the curve by together; 0 where none is."""
-    stderr_step: Floats
+    stderr_step: Float64Array
     """(P,)"""
-    noise: Floats
+    noise: Float64Array
     """(P,): standard deviation of one sample about the curve."""
     chi2: float
     """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
@@ -153,7 +153,7 @@ def fit_cycle(
     data = Samples.of(phase, values, stderr, pose)
     phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
 
-    def straight(delay: Floats, constant: Floats) -> Floats:
+    def straight(delay: Float64Array, constant: Float64Array) -> Float64Array:
         """Part of the way to the expression's level, of the steady cycle."""
         on, off = middle, cycle_s - middle
         into = (phase - delay) % cycle_s
@@ -216,7 +216,7 @@ def fit_course(
     errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
     data = Samples.of(time, shown, errors)
 
-    def course(delay: Floats, constant: Floats) -> Floats:
+    def course(delay: Float64Array, constant: Float64Array) -> Float64Array:
         """Part of the way to the new level."""
         return np.asarray(-np.expm1(-time / constant))
 
@@ -240,7 +240,7 @@ def _bent(shape: Shape, amount: float) -> Shape:
     if amount == 0.0:
         return shape
 
-    def bent(delay: Floats, constant: Floats) -> Floats:
+    def bent(delay: Float64Array, constant: Float64Array) -> Float64Array:
         part = shape(delay, constant)
         return np.asarray(part + amount * part * (1.0 - part))
 
@@ -312,7 +312,7 @@ def of_vessels(fit: RelaxationFit) -> RelaxationFit:
 
 
 def _fit(
-    given: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+    given: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
 ) -> RelaxationFit:
     data = given.with_free_step()
     for _ in range(1 + data.stepped):
@@ -323,7 +323,7 @@ def _fit(
 
 
 def _fit_once(
-    data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+    data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
 ) -> RelaxationFit:
     landscape = Landscape.of(data, curve, delays, constants, at)
     delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
@@ -353,9 +353,7 @@ def _fit_once(
         known = "only above"
     step = data.step(found_shape)[0]
     errors = landscape.level_errors(
-        gap,
-        with_constant=known == "estimated",
-        with_delay=delays.size > 1 and not data.stepped,
+        gap, with_constant=known == "estimated", with_delay=delays.size > 1 and not data.stepped
     )
     if data.stepped:
         # beside a step the delay trades with levels, and its end is as likely as its middle

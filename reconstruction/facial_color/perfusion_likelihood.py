@@ -14,14 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, stats
 
+from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_samples import Samples
 
-Floats = NDArray[np.float64]
 Ends = tuple[float | None, float | None]
-Shape = Callable[[Floats, Floats], Floats]
+Shape = Callable[[Float64Array, Float64Array], Float64Array]
 """Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
 _SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
@@ -36,14 +35,14 @@ class Landscape:
 
     data: Samples
     curve: Shape
-    delays: Floats
+    delays: Float64Array
     """(D,): delays that are tried with each constant, s; one where none is fitted."""
-    constants: Floats
+    constants: Float64Array
     """(C,): time constants that are tried, s."""
-    total: Floats
+    total: Float64Array
     """(C, D or more): square sums of the best levels; beyond D are delays of each constant's
     own."""
-    noise2: Floats
+    noise2: Float64Array
     """(P,): variance of one sample of each curve."""
     freedom: float
     """Degrees of freedom of all curves together."""
@@ -57,7 +56,9 @@ class Landscape:
     """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
 
     @staticmethod
-    def of(data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats) -> Landscape:
+    def of(
+        data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
+    ) -> Landscape:
         """Look at all delays and constants, and refine the best.
 
         Parameters
@@ -72,7 +73,7 @@ class Landscape:
             How long after a prompt samples are, s; () where there are no prompts.
         """
 
-        def residuals(delay: Floats, constant: Floats) -> Floats:
+        def residuals(delay: Float64Array, constant: Float64Array) -> Float64Array:
             """(..., P) square sums for delays and constants that broadcast to (...)."""
             return data.residual(curve(delay[..., None], constant[..., None]))
 
@@ -165,19 +166,19 @@ class Landscape:
             high if high is not None else float(self.delays[-1]),
         )
 
-    def delay_weights(self) -> Floats:
+    def delay_weights(self) -> Float64Array:
         """Return the probability of each delay, (D,), all alike before; with its best constant."""
         weights = np.exp(-0.5 * self._along())
         return np.asarray(weights / weights.sum())
 
-    def constant_at_delays(self) -> Floats:
+    def constant_at_delays(self) -> Float64Array:
         """Return the best time constant for each delay, (D,), s."""
         best = np.argmin(self.total[:, : self.delays.size], axis=0)
         return np.asarray(self.constants[best])
 
     def level_errors(
-        self, gap: Floats, *, with_constant: bool, with_delay: bool
-    ) -> tuple[Floats, ...]:
+        self, gap: Float64Array, *, with_constant: bool, with_delay: bool
+    ) -> tuple[Float64Array, ...]:
         """Return standard errors of start, end, their difference, and the step of a pose.
 
         By the information that the samples hold, and with what delay and constant add where they
@@ -196,7 +197,7 @@ class Landscape:
         """
         delay, constant = self.delay_s, self.time_constant_s
 
-        def at(d: float, c: float) -> Floats:
+        def at(d: float, c: float) -> Float64Array:
             return np.asarray(self.curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
 
         base = at(delay, constant)
@@ -233,7 +234,7 @@ class Landscape:
             errors[2 * curves : 3 * curves],
         )
 
-    def _along(self) -> Floats:
+    def _along(self) -> Float64Array:
         """Return the excess of the square sum over its least, by delay, (D,)."""
         least = self.total[:, : self.delays.size].min(axis=0)
         return np.asarray(least - self.least)
@@ -242,7 +243,7 @@ class Landscape:
         return float(stats.f.ppf(level, 1, self.freedom))
 
 
-def _near(since: Floats, constant: float, delays: Floats) -> Floats:
+def _near(since: Float64Array, constant: float, delays: Float64Array) -> Float64Array:
     """Return delays that leave a sample, so long after a prompt, on the slope of the change, s.
 
     Their number is the same for each constant; those beyond the range are put into it.
@@ -253,9 +254,9 @@ def _near(since: Floats, constant: float, delays: Floats) -> Floats:
 
 def _refined(
     landscape: Callable[[float, float], float],
-    start: Floats,
-    delays: Floats,
-    logs: Floats,
+    start: Float64Array,
+    delays: Float64Array,
+    logs: Float64Array,
     at_start: float,
 ) -> tuple[float, float, float]:
     """Return delay, logarithm of the constant, and height of the lowest point near the start."""
@@ -274,9 +275,12 @@ def _refined(
             (max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
         ]
         simplex = optimize.minimize(
-            lambda v: landscape(v[0], v[1]), start, method="Nelder-Mead", bounds=bounds,
+            lambda v: landscape(v[0], v[1]),
+            start,
+            method="Nelder-Mead",
+            bounds=bounds,
             options={"xatol": 1e-5, "fatol": 1e-9},
-        )  # fmt: skip
+        )
         point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
     if height < at_start:
         return (*point, height)
@@ -284,7 +288,7 @@ def _refined(
 
 
 def _crossings(
-    grid: Floats, profile: Floats, best: float, excess: float
+    grid: Float64Array, profile: Float64Array, best: float, excess: float
 ) -> tuple[float | None, float | None]:
     """Return where a profile first rises by ``excess`` on both sides of its best; None: nowhere."""
     ends: list[float | None] = []

@@ -11,20 +11,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseStep:
     """What is known of the step that a moved face makes in curves."""
 
-    moved: NDArray[np.bool_]
+    moved: BoolArray
     """(N,): samples in which the face has moved."""
-    stderr: Floats
+    stderr: Float64Array
     """(P,): standard error of the level of those samples against the others, >= 0."""
 
 
@@ -32,20 +31,20 @@ class PoseStep:
 class Samples:
     """Curves (P, N) with weights that sum to the number of samples of each; 0 where missing."""
 
-    values: Floats
-    weights: Floats
-    variance: Floats
+    values: Float64Array
+    weights: Float64Array
+    variance: Float64Array
     """(P,): mean variance by the given errors; NaN without."""
-    moved: Floats
+    moved: Float64Array
     """(N,): 1 where the face has moved, else 0."""
-    stderr_of_pose: Floats
+    stderr_of_pose: Float64Array
     """(P,): prior of the step; 0 where there is none, and where all samples are of one pose."""
-    taken: Floats
+    taken: Float64Array
     """(P,): part of the moved samples' mean that is taken from them, 0 to 1."""
 
     @staticmethod
     def of(
-        at: Floats, values: ArrayLike, stderr: ArrayLike | None, pose: PoseStep | None = None
+        at: Float64Array, values: ArrayLike, stderr: ArrayLike | None, pose: PoseStep | None = None
     ) -> Samples:
         """Return the samples of curves, without steps yet.
 
@@ -89,7 +88,9 @@ class Samples:
         """Whether any curve has a step."""
         return bool((self.stderr_of_pose > 0).any())
 
-    def moves_between(self, phase: Floats, middle: float, longest: float) -> tuple[float, float]:
+    def moves_between(
+        self, phase: Float64Array, middle: float, longest: float
+    ) -> tuple[float, float]:
         """Return between which delays the face moves: when it last had not, and first had.
 
         Parameters
@@ -115,21 +116,21 @@ class Samples:
         """Return these with steps of which nothing is known, where there are any."""
         return replace(self, taken=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
 
-    def with_prior(self, noise2: Floats) -> Samples:
+    def with_prior(self, noise2: Float64Array) -> Samples:
         """Return these with steps of their prior, for noise of these variances (P,)."""
         many = (self.weights * self.moved).sum(axis=-1) * self.stderr_of_pose**2
         held = many / np.maximum(noise2 + many, 1e-300)
         # B = 1 - c m m'W / m'Wm has B'WB = W - (2c - c^2) W m m'W / m'Wm: W less the step's part
         return replace(self, taken=1.0 - np.sqrt(np.maximum(1.0 - held, 0.0)))
 
-    def residual(self, shape: Floats) -> Floats:
+    def residual(self, shape: Float64Array) -> Float64Array:
         """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
         level, gap = self.levels(shape)
         ones, values, curve = self._without_step(shape)
         left = values - level[..., None] * ones - gap[..., None] * curve
         return np.asarray((self.weights * left**2).sum(axis=-1))
 
-    def levels(self, shape: Floats) -> tuple[Floats, Floats]:
+    def levels(self, shape: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return the best start and gap of each curve, (..., P)."""
         w = self.weights
         ones, values, b = self._without_step(shape)
@@ -142,32 +143,32 @@ class Samples:
         gap = np.where(square > 1e-12 * total, product / np.maximum(square, 1e-300), 0.0)
         return v_mean - gap * b_mean, gap
 
-    def step(self, shape: Floats) -> Floats:
+    def step(self, shape: Float64Array) -> Float64Array:
         """Return the best step of each curve, (..., P), of shapes (..., N)."""
         level, gap = self.levels(shape)
         left = self.values - level[..., None] - gap[..., None] * shape[..., None, :]
         return np.asarray((1.0 - (1.0 - self.taken) ** 2) * self._of_moved(left))
 
-    def _without_step(self, shape: Floats) -> tuple[Floats, Floats, Floats]:
+    def _without_step(self, shape: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return ones, values and shape with the moved samples' mean taken from them."""
         curve = shape[..., None, :]
         if not self.taken.any():
             return np.ones_like(self.values), self.values, curve
 
-        def shed(part: Floats) -> Floats:
+        def shed(part: Float64Array) -> Float64Array:
             off = self.taken * self._of_moved(part)
             return np.asarray(part - off[..., None] * self.moved)
 
         return shed(np.ones_like(self.values)), shed(self.values), shed(curve)
 
-    def _of_moved(self, part: Floats) -> Floats:
+    def _of_moved(self, part: Float64Array) -> Float64Array:
         """Return the mean over the moved samples, (..., P); 0 without any."""
         weights = self.weights * self.moved
         total = weights.sum(axis=-1)
         return np.asarray((weights * part).sum(axis=-1) / np.where(total > 0, total, 1.0))
 
 
-def _steps(pose: PoseStep | None, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _steps(pose: PoseStep | None, good: BoolArray) -> tuple[Float64Array, Float64Array]:
     curves, samples = good.shape
     if pose is None:
         return np.zeros(samples), np.zeros(curves)

@@ -12,17 +12,14 @@ that off: what is left is the slopes that are finer than the window in which it 
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error
 from reconstruction.correspondence.expression_alignment import Alignment
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.floating[Any]]
 
 AROUND_PX: Final = 1.0
 """Standard deviation of the window that squares of slopes are averaged in, px: over single pixels
@@ -37,13 +34,13 @@ WITHOUT_BRIGHTNESS: Final = np.eye(3) - 1.0 / 3.0
 
 
 def own_error(
-    rgb: Image,
-    variance: Image,
-    valid: NDArray[np.bool_],
+    rgb: FloatArray,
+    variance: FloatArray,
+    valid: BoolArray,
     alignment: Alignment,
     *,
     light_window_px: float | None = None,
-) -> Floats:
+) -> Float64Array:
     """Return the covariance of each pixel's relative error by its place, (H, W, 3, 3).
 
     Parameters
@@ -95,8 +92,8 @@ def own_error(
 
 
 def _slopes(
-    log_rgb: Floats, noise: Floats, good: NDArray[np.bool_], window_px: float | None
-) -> Floats:
+    log_rgb: Float64Array, noise: Float64Array, good: BoolArray, window_px: float | None
+) -> Float64Array:
     """Return the sum over both axes of the slopes' outer products, per px^2, (H, W, 3, 3)."""
     outer = np.zeros((*good.shape, 3, 3))
     count = np.zeros(good.shape)
@@ -126,7 +123,7 @@ def _slopes(
     return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
-def _even(slope: Floats, known: NDArray[np.bool_], window_px: float) -> Floats:
+def _even(slope: Float64Array, known: BoolArray, window_px: float) -> Float64Array:
     """Return the slope of brightness averaged over a window, (..., 1), for all channels alike."""
     weight = gaussian_filter(known.astype(np.float64), window_px, mode="constant")
     total = gaussian_filter(slope.mean(axis=-1), window_px, mode="constant")

@@ -8,22 +8,18 @@ darker, and how bright a pixel is is left open by those who take chromophores fr
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-Image = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
 _ENOUGH = 200_000
 """Pixels that tell a median to a quarter of a percent."""
 
 
 def average(
-    rgb: Image, variance: Image, valid: Mask
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+    rgb: FloatArray, variance: FloatArray, valid: BoolArray
+) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Return the mean of repeats where any is valid, and the variance of the mean.
 
     Parameters
@@ -74,7 +70,7 @@ def average(
     return mean.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
 
 
-def excess(rgb: Image, variance: Image, valid: Mask) -> float:
+def excess(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
     """Return the variance of what colors of repeats differ by over that of noise, at least 1.
 
     Of the whole picture: what one pixel's few repeats scatter by is known poorly. It is the median

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float64Array
 
 FALSE_ALARM = 0.01
 """Chance that any of the regions is said to scatter, or to drift, when none does."""
@@ -72,8 +71,8 @@ class RegionRepeatability:
 
     name: str
     pixels: int
-    means: Floats
-    stderr: Floats
+    means: Float64Array
+    stderr: Float64Array
     within: float
     within_stderr: float
     between: float
@@ -294,18 +293,24 @@ def drift(
         level = float(means.mean())
         found.append(
             Drift(
-                name, slope, stderr_slope, slope / level if level else math.nan, p_value,
-                p_value < limit, degrees, scatter,
+                name,
+                slope,
+                stderr_slope,
+                slope / level if level else math.nan,
+                p_value,
+                p_value < limit,
+                degrees,
+                scatter,
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 
 def _compared(
     name: str,
     pixels: int,
-    means: Floats,
-    noise: Floats,
+    means: Float64Array,
+    noise: Float64Array,
     groups: Mapping[str, NDArray[np.intp]],
     reference: str,
     limit: float,
@@ -337,15 +342,24 @@ def _compared(
     start = levels.get(reference, float(np.mean(list(levels.values()))))
     largest = max(abs(level - start) for level in levels.values())
     return RegionRepeatability(
-        name=name, pixels=pixels, means=means, stderr=noise, within=within,
-        within_stderr=within / math.sqrt(2.0 * degrees), between=between,
-        correlation=correlation, correlation_stderr=error, chi_square=chi_square,
-        degrees=degrees, p_value=p_value, scatters=p_value < limit,
+        name=name,
+        pixels=pixels,
+        means=means,
+        stderr=noise,
+        within=within,
+        within_stderr=within / math.sqrt(2.0 * degrees),
+        between=between,
+        correlation=correlation,
+        correlation_stderr=error,
+        chi_square=chi_square,
+        degrees=degrees,
+        p_value=p_value,
+        scatters=p_value < limit,
         change_to_scatter=largest / within if within > 0 else math.inf,
-    )  # fmt: skip
+    )
 
 
-def _scatter(means: Floats, noise: Floats) -> float:
+def _scatter(means: Float64Array, noise: Float64Array) -> float:
     """Return the chi-square of some captures about their weighted mean."""
     weight = noise**-2.0
     center = float((weight * means).sum() / weight.sum())
@@ -359,8 +373,8 @@ def _correlation_stderr(correlation: float, size: float, kinds: int, count: int)
 
 
 def _means(
-    values: Floats, error: Floats, mask: Bools, correlated_px: float
-) -> tuple[Floats, Floats]:
+    values: Float64Array, error: Float64Array, mask: BoolArray, correlated_px: float
+) -> tuple[Float64Array, Float64Array]:
     count = int(mask.sum())
     means = values[:, mask].mean(axis=1)
     noise = np.sqrt((error[:, mask] ** 2).sum(axis=1) * min(correlated_px, count)) / count
@@ -384,7 +398,7 @@ def _check_rates(false_alarm: float, correlated_px: float) -> None:
 
 def _checked(
     maps: ArrayLike, states: Sequence[str], stderr: ArrayLike, valid: ArrayLike | None
-) -> tuple[Floats, Floats, Bools, tuple[str, ...]]:
+) -> tuple[Float64Array, Float64Array, BoolArray, tuple[str, ...]]:
     values, error = np.asarray(maps, np.float64), np.asarray(stderr, np.float64)
     if values.ndim != 3:
         raise RepeatabilityError(f"maps: got shape {values.shape}, expected (N, H, W)")
@@ -403,8 +417,8 @@ def _checked(
 
 
 def _regions(
-    regions: Mapping[str, ArrayLike] | None, known: Bools
-) -> tuple[dict[str, Bools], tuple[tuple[str, str], ...]]:
+    regions: Mapping[str, ArrayLike] | None, known: BoolArray
+) -> tuple[dict[str, BoolArray], tuple[tuple[str, str], ...]]:
     wanted = (
         _grid(known) if regions is None else {k: np.asarray(v, bool) for k, v in regions.items()}
     )
@@ -425,10 +439,10 @@ def _regions(
     return chosen, tuple(left_out)
 
 
-def _grid(known: Bools) -> dict[str, Bools]:
+def _grid(known: BoolArray) -> dict[str, BoolArray]:
     """Return 3 x 3 cells over the valid pixels, named as seen in the picture."""
     places = np.argwhere(known)
-    out: dict[str, Bools] = {}
+    out: dict[str, BoolArray] = {}
     if not len(places):
         return out
     low, high = places.min(axis=0), places.max(axis=0) + 1

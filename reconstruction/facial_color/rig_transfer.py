@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.facial_color import HemoglobinRig, StateMaps
 from model.facial_color.coarse_maps import Cells
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.correspondence import landmark_field
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Points = Mapping[str, tuple[float, float]]
 
 LANDMARK_STDERR_PX = 2.0
@@ -87,9 +85,12 @@ def carried(
         good = np.logical_and.reduce([here, *(seen for _, seen in sampled.values())])
         maps = {part: np.where(good, values, 0.0) for part, (values, _) in sampled.items()}
         states[name] = StateMaps(
-            **maps, valid=good, prior=state.prior, storage_rms=state.storage_rms,
+            **maps,
+            valid=good,
+            prior=state.prior,
+            storage_rms=state.storage_rms,
             storage_largest=state.storage_largest,
-        )  # fmt: skip
+        )
     (neutral,) = Cells(shape, stored).refine(np.where(here, mean, 0.0), valid=here)
     valid = np.isfinite(neutral)
     size = float(np.median(np.hypot(*np.gradient(source[..., 0]))))
@@ -105,7 +106,7 @@ def carried(
     )
 
 
-def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Floats:
+def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Float64Array:
     """Return where the cells' centres lie on the map, (h, w, 2) as (x, y) px."""
     rows, columns = (
         (np.arange(few) + 0.5) * full / few - 0.5 for full, few in zip(shape, stored, strict=True)
@@ -113,7 +114,9 @@ def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Floats:
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-def _sampled(values: Floats, valid: Mask, cell: Floats) -> tuple[Floats, Mask]:
+def _sampled(
+    values: Float64Array, valid: BoolArray, cell: Float64Array
+) -> tuple[Float64Array, BoolArray]:
     """Return a stored map at places (2, h, w), rows first, and where it is known there."""
     share = ndimage.map_coordinates(valid.astype(np.float64), cell, order=1, cval=0.0)
     total = ndimage.map_coordinates(np.where(valid, values, 0.0), cell, order=1, cval=0.0)

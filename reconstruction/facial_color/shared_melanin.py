@@ -25,9 +25,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import (
     ChromophoreError,
     dark_spots,
@@ -42,9 +43,6 @@ from reconstruction.chromophores.posterior import FINEST, WeighedChromophores
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import LOWEST
 from reconstruction.facial_color import light_change
-
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 OWN_SHARE = 0.01
 """Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
@@ -61,36 +59,36 @@ _TASK_PIXELS = 2048
 class SharedMelanin:
     """One melanin and S bloods; maps have the pixels' shape (...), those of states (S, ...)."""
 
-    melanin: Map
+    melanin: Float32Array
     """Volume fraction of melanin in the epidermis; NaN where no state is usable."""
-    stderr_melanin: Map
+    stderr_melanin: Float32Array
     """Its standard error, with noise, model error and second solutions."""
-    noise_stderr_melanin: Map
+    noise_stderr_melanin: Float32Array
     """The part of noise alone: what another set of pictures would differ by."""
-    hemoglobin: Map
+    hemoglobin: Float32Array
     """(S, ...): volume fraction of blood in the dermis; NaN where the state is not usable."""
-    stderr_hemoglobin: Map
+    stderr_hemoglobin: Float32Array
     """(S, ...): its standard error."""
-    noise_stderr_hemoglobin: Map
+    noise_stderr_hemoglobin: Float32Array
     """(S, ...): the part of noise alone."""
-    change: Map
+    change: Float32Array
     """(S, ...): blood less that of the reference state."""
-    stderr_change: Map
+    stderr_change: Float32Array
     """(S, ...): its standard error; what the two have in common is left out of it."""
-    shading: Map
+    shading: Float32Array
     """(S, ...): light on the pixel over that on a white tile."""
-    residual: Map
+    residual: Float32Array
     """(S, ...): root of the weighted square sum of what the color leaves, in standard errors of the
     state's own noise: of one number with free light, of two with light that changes smoothly."""
-    valid: Mask
+    valid: BoolArray
     """At least one state is usable, and the mean color belongs to the table."""
-    valid_states: Mask
+    valid_states: BoolArray
     """(S, ...): usable, and `valid`."""
     reference: int
     """State that changes are taken from."""
 
     @property
-    def misfits(self) -> Mask:
+    def misfits(self) -> BoolArray:
         """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.valid_states & (self.residual > MISFIT))
@@ -196,28 +194,42 @@ def weigh(
     mean_rgb = np.exp(mean)
     mean_error = _with_mean_of(owns, relative, usable, common)
     found = _weighed(
-        mean_rgb, table, prior, mean_variance * mean_rgb**2, mean_error,
-        shape if one_face else None,
-    )  # fmt: skip
+        mean_rgb, table, prior, mean_variance * mean_rgb**2, mean_error, shape if one_face else None
+    )
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
     # dm = 3 end a^2 da
     stderr = found.stderr_melanin / (3.0 * ends[0] * np.maximum(begin[:, 0], LOWEST) ** 2)
-    good: Mask = np.asarray(usable & np.isfinite(found.melanin))
-    fixed = (np.ascontiguousarray(begin, np.float32),
-             np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32))  # fmt: skip
+    good: BoolArray = np.asarray(usable & np.isfinite(found.melanin))
+    fixed = (
+        np.ascontiguousarray(begin, np.float32),
+        np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32),
+    )
 
     weighed_by = np.ascontiguousarray(without_brightness(common))
 
-    def fit(log_change: Map, stiffness: Map) -> tuple[Map, Map]:
+    def fit(log_change: Float32Array, stiffness: Float32Array) -> tuple[Float32Array, Float32Array]:
         pixels = mean.shape[0]
         of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         kernels.blood_of_states(
-            log_rgb, relative, good, mean, log_change, stiffness, *fixed,
-            weighed_by, owns, cells,
-            float(ends[0]), float(ends[1]), reference % states, of_pixels, of_states, _TASK_PIXELS,
-        )  # fmt: skip
+            log_rgb,
+            relative,
+            good,
+            mean,
+            log_change,
+            stiffness,
+            *fixed,
+            weighed_by,
+            owns,
+            cells,
+            float(ends[0]),
+            float(ends[1]),
+            reference % states,
+            of_pixels,
+            of_states,
+            _TASK_PIXELS,
+        )
         return of_pixels, of_states
 
     free = np.zeros(good.shape, np.float32)
@@ -232,7 +244,7 @@ def weigh(
     }
     shading = np.exp(named.pop("log_shading"))
     del named["log_shading_variance"]
-    each: Mask = np.asarray(usable & found.valid)
+    each: BoolArray = np.asarray(usable & found.valid)
     return SharedMelanin(
         melanin=found.melanin.reshape(shape),
         stderr_melanin=found.stderr_melanin.reshape(shape),
@@ -246,16 +258,22 @@ def weigh(
 
 
 def _weighed(
-    rgb: Map,
+    rgb: Float32Array,
     table: ColorTable,
     prior: ShadingPrior,
-    variance: Map,
-    model_error: NDArray[np.float64],
+    variance: Float32Array,
+    model_error: Float64Array,
     face_shape: tuple[int, ...] | None,
 ) -> WeighedChromophores:
     """Weigh all solutions of colors (n, 3); those of one face, of such a shape, by it."""
-    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior, variance=variance,
-                    model_error=model_error)  # fmt: skip
+    known = partial(
+        chromophore_posterior.weigh,
+        rgb,
+        table,
+        prior=prior,
+        variance=variance,
+        model_error=model_error,
+    )
     face = None
     if face_shape is not None:
         face = face_chromophores.in_known_light(
@@ -275,8 +293,8 @@ def _weighed(
 
 
 def _model_errors(
-    model_error: ArrayLike | None, shape: tuple[int, ...], usable: Mask
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    model_error: ArrayLike | None, shape: tuple[int, ...], usable: BoolArray
+) -> tuple[Float64Array, Float64Array]:
     """Return covariances of the pixels (n or 1, 3, 3), and the usual variances of channels (3,).
 
     Usual is the median: where a picture is finer than its pixels, errors are many times as large.
@@ -299,11 +317,8 @@ _UPPER = np.triu_indices(3)
 
 
 def _own_errors(
-    own_error: ArrayLike | None,
-    least: NDArray[np.float64],
-    shape: tuple[int, ...],
-    usable: Mask,
-) -> NDArray[np.float64]:
+    own_error: ArrayLike | None, least: Float64Array, shape: tuple[int, ...], usable: BoolArray
+) -> Float64Array:
     """Return upper triangles of the states' own covariances, (S, n or 1, 6)."""
     diagonal = np.diag(least)[_UPPER]
     if own_error is None:
@@ -320,8 +335,8 @@ def _own_errors(
 
 
 def _with_mean_of(
-    owns: NDArray[np.float64], relative: Map, usable: Mask, common: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    owns: Float64Array, relative: Float32Array, usable: BoolArray, common: Float64Array
+) -> Float64Array:
     """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
     if owns.shape[1] == 1:
         own = np.zeros((3, 3))
@@ -339,13 +354,13 @@ def _with_mean_of(
 
 
 def _mean_color(
-    log_rgb: Map,
-    relative: Map,
-    usable: Mask,
+    log_rgb: Float32Array,
+    relative: Float32Array,
+    usable: BoolArray,
     table: ColorTable,
-    cells: NDArray[np.float64],
-    owns: NDArray[np.float64],
-) -> tuple[Map, Map]:
+    cells: Float64Array,
+    owns: Float64Array,
+) -> tuple[Float32Array, Float32Array]:
     """Return the states' mean log color, as of skin with their mean blood, and its variance."""
     from reconstruction.facial_color import (
         shared_melanin_kernels as kernels,  # compiled when imported
@@ -355,26 +370,33 @@ def _mean_color(
     keep = usable[..., None]
     plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count
     noise = np.where(keep, relative, 0.0).sum(axis=0) / count**2
-    seen: Mask = np.asarray(usable.any(axis=0))
+    seen: BoolArray = np.asarray(usable.any(axis=0))
     rgb = np.where(seen[:, None], np.exp(plain), np.nan).astype(np.float32)
     first = invert(rgb, table, variance=noise * rgb**2)
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
     mean, variance = np.empty_like(plain, np.float32), np.empty_like(plain, np.float32)
     kernels.mean_color(
-        log_rgb, relative, np.ascontiguousarray(usable), begin.astype(np.float32), owns, cells,
-        mean, variance, _TASK_PIXELS,
-    )  # fmt: skip
+        log_rgb,
+        relative,
+        np.ascontiguousarray(usable),
+        begin.astype(np.float32),
+        owns,
+        cells,
+        mean,
+        variance,
+        _TASK_PIXELS,
+    )
     return mean, variance
 
 
-def _fractions(values: Map, ends: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fractions(values: Float32Array, ends: Float64Array) -> Float64Array:
     """Return volume fractions as fractions of the table's axes; NaN as a tenth of the ends."""
     known = np.where(np.isfinite(values), values, 0.001 * ends)
     return np.asarray(np.clip(np.cbrt(known / ends), LOWEST, 1.0), np.float64)
 
 
-def _usable(colors: Map, valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+def _usable(colors: Float32Array, valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     good = np.isfinite(colors).all(axis=-1)
     with np.errstate(invalid="ignore"):
         good &= (colors > 0.0).all(axis=-1)
@@ -389,8 +411,8 @@ def _usable(colors: Map, valid: ArrayLike | None, shape: tuple[int, ...]) -> Mas
 
 
 def _relative_variance(
-    colors: Map, variance: ArrayLike | None, shape: tuple[int, ...], usable: Mask
-) -> Map:
+    colors: Float32Array, variance: ArrayLike | None, shape: tuple[int, ...], usable: BoolArray
+) -> Float32Array:
     if variance is None:
         return np.full(colors.shape, RELATIVE_NOISE**2, np.float32)
     values = np.asarray(variance, np.float32)

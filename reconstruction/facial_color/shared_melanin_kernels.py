@@ -254,9 +254,24 @@ def mean_color(  # type: ignore[no-untyped-def]
     error_model="numpy",
 )
 def blood_of_states(  # type: ignore[no-untyped-def]
-    log_rgb, variance, usable, mean, log_change, stiffness, begin, melanin_stderr, commons, owns,
-    cells, melanin_end, end, reference, pixel_maps, state_maps, block,
-):  # fmt: skip
+    log_rgb,
+    variance,
+    usable,
+    mean,
+    log_change,
+    stiffness,
+    begin,
+    melanin_stderr,
+    commons,
+    owns,
+    cells,
+    melanin_end,
+    end,
+    reference,
+    pixel_maps,
+    state_maps,
+    block,
+):
     """Fit the blood of every state under the shared melanin; shapes are in the signature.
 
     Errors are linear in the noise n_s of each state, their mean n, and the model's error e that

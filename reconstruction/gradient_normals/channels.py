@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import FloatArray
 from reconstruction.gradient_normals.noise import SensorNoise
 from reconstruction.gradient_normals.patterns import GradientError, Key
 from reconstruction.normal_maps import NormalMaps
-
-Floating = NDArray[np.floating]
 
 
 def channel_count(patterns: Mapping[Key, ArrayLike]) -> int | None:
@@ -33,12 +32,8 @@ def sliced(given: Any, channel: int) -> Any:
 
 
 def summed(
-    patterns: Mapping[Key, ArrayLike],
-    *,
-    variance: Any,
-    valid: Any,
-    saturation: float | None,
-) -> tuple[dict[Key, Floating], Any]:
+    patterns: Mapping[Key, ArrayLike], *, variance: Any, valid: Any, saturation: float | None
+) -> tuple[dict[Key, FloatArray], Any]:
     """Add the channels of pictures up; NaN where one of them is not valid or saturated.
 
     Returns
@@ -48,7 +43,7 @@ def summed(
     variance
         Of the sums.
     """
-    out: dict[Key, Floating] = {}
+    out: dict[Key, FloatArray] = {}
     for key, given in patterns.items():
         image = np.asarray(given)
         kind = np.float64 if image.dtype == np.float64 else np.float32
@@ -77,7 +72,7 @@ def summed(
     return out, _sum_variance(variance, count)
 
 
-def _sum_variance(variance: ArrayLike, count: int) -> Floating:
+def _sum_variance(variance: ArrayLike, count: int) -> FloatArray:
     values = np.asarray(variance, np.float64)
     return np.asarray(values.sum(axis=-1) if values.ndim == 3 else count * values)
 

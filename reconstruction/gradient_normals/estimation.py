@@ -20,10 +20,11 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from model.fresnel import ETA_SKIN
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.gradient_normals import kernels, lobe_response
 from reconstruction.gradient_normals.channels import channel_count, joined, sliced, summed
 from reconstruction.gradient_normals.lobe_response import (
@@ -44,15 +45,20 @@ from reconstruction.normal_maps import NormalMaps
 from reconstruction.tiles import map_tiles
 
 __all__ = [
-    "GradientError", "MissingPatterns", "Roughness", "SensorNoise", "SphereLights",
-    "SphereLightsError", "estimate_roughness", "from_patterns",
-]  # fmt: skip
+    "GradientError",
+    "MissingPatterns",
+    "Roughness",
+    "SensorNoise",
+    "SphereLights",
+    "SphereLightsError",
+    "estimate_roughness",
+    "from_patterns",
+]
 
 _log = logging.getLogger(__name__)
 
-Floating = NDArray[np.floating]
 Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
-Valid = NDArray[np.bool_] | Mapping[Key, NDArray[np.bool_]] | None
+Valid = BoolArray | Mapping[Key, BoolArray] | None
 
 NEEDED = 3.0
 """Length of the moment vector over its standard error, below which a pixel has no normal."""
@@ -184,10 +190,17 @@ def from_patterns(
     if component not in ("specular", "diffuse"):
         raise GradientError(f"component: got {component!r}, expected 'specular' or 'diffuse'")
     settings: dict[str, Any] = {
-        "component": component, "view": view, "lights": lights, "alpha": alpha, "eta": eta,
-        "points_mm": points_mm, "smooth_px": smooth_px, "smooth_crossed_px": smooth_crossed_px,
-        "wiener": wiener, "executor": executor,
-    }  # fmt: skip
+        "component": component,
+        "view": view,
+        "lights": lights,
+        "alpha": alpha,
+        "eta": eta,
+        "points_mm": points_mm,
+        "smooth_px": smooth_px,
+        "smooth_crossed_px": smooth_crossed_px,
+        "wiener": wiener,
+        "executor": executor,
+    }
     channels = channel_count(patterns)
     if channels is not None and component == "specular":
         whole = summed(patterns, variance=variance, valid=valid, saturation=saturation)
@@ -196,12 +209,15 @@ def from_patterns(
         return joined(
             [
                 from_patterns(
-                    sliced(patterns, k), variance=sliced(variance, k), valid=sliced(valid, k),
-                    saturation=saturation, **settings,
+                    sliced(patterns, k),
+                    variance=sliced(variance, k),
+                    valid=sliced(valid, k),
+                    saturation=saturation,
+                    **settings,
                 )
                 for k in range(channels)
             ]
-        )  # fmt: skip
+        )
     reflection = _reflection(
         patterns, component, variance, valid, saturation, lights, smooth_px, smooth_crossed_px
     )
@@ -219,9 +235,13 @@ def from_patterns(
             alpha = _roughness(reflection, lights, middle, eta)
         known = alpha if isinstance(alpha, Roughness) else Roughness(float(alpha), 0.0, 0)
         table = lobe_response.specular(
-            lights, view=middle, alpha=known.alpha, eta=eta, near=places is not None,
+            lights,
+            view=middle,
+            alpha=known.alpha,
+            eta=eta,
+            near=places is not None,
             alpha_stderr=known.stderr,
-        )  # fmt: skip
+        )
     if wiener:
         reflection = with_filter(reflection)
     return _maps(reflection, table, _analyser(lights, table), eta, each_view, places, executor)
@@ -291,9 +311,13 @@ def _reflection(
         if leakage > LEAKY:
             _warn_of_leakage(round(leakage, 4))
     return prepare(
-        with_shared_dark(stacks), component, noise=noise, leakage=leakage, smooth_px=smooth_px,
+        with_shared_dark(stacks),
+        component,
+        noise=noise,
+        leakage=leakage,
+        smooth_px=smooth_px,
         smooth_crossed_px=smooth_crossed_px,
-    )  # fmt: skip
+    )
 
 
 @lru_cache(maxsize=64)
@@ -307,7 +331,7 @@ def _warn_of_leakage(leakage: float) -> None:
     )
 
 
-def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[Floating, Floating]:
+def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
     v = np.asarray(view, np.float64)
     if v.shape not in ((3,), (*shape, 3)):
@@ -325,9 +349,9 @@ def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[Floating, Floating]
 def _places(
     points_mm: ArrayLike | None,
     shape: tuple[int, int],
-    middle: Floating,
+    middle: FloatArray,
     lights: SphereLights | None,
-) -> Floating | None:
+) -> FloatArray | None:
     """Return the pixels' places (P, 2) along the frame's first two axes, mm."""
     if points_mm is None:
         return None
@@ -349,14 +373,14 @@ def _places(
     return np.asarray(flat @ frame_of(middle)[:2].T)
 
 
-def _analyser(lights: SphereLights | None, table: Response) -> Floating:
+def _analyser(lights: SphereLights | None, table: Response) -> FloatArray:
     """Return the analyser's axis in the frame of the view, (2,)."""
     if lights is None:
         return np.zeros(2)
     return np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
 
 
-def _grid(table: Response) -> NDArray[np.float64]:
+def _grid(table: Response) -> Float64Array:
     """Return places for the search to begin at, see :func:`gradient_kernels.starts`."""
     if table.coefficients.size == 0:
         return np.zeros((2, 2, 2))
@@ -368,25 +392,37 @@ def _grid(table: Response) -> NDArray[np.float64]:
 
 def _inverted(
     reflection: Reflection,
-    moments: tuple[Floating, Floating],
+    moments: tuple[FloatArray, FloatArray],
     table: Response,
-    grid: Floating,
-    analyser: Floating,
+    grid: FloatArray,
+    analyser: FloatArray,
     eta: float,
-    view: Floating,
-    place: Floating,
-) -> NDArray[np.float64]:
+    view: FloatArray,
+    place: FloatArray,
+) -> Float64Array:
     out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
     kernels.invert(
-        *moments, table.frame, reflection.component == "specular", table.coefficients, table.least,
-        table.step, grid, analyser, eta, view, place, reflection.told > 0, NEEDED,
-        1e-5 if reflection.kind == np.float32 else 1e-9, out,
-    )  # fmt: skip
+        *moments,
+        table.frame,
+        reflection.component == "specular",
+        table.coefficients,
+        table.least,
+        table.step,
+        grid,
+        analyser,
+        eta,
+        view,
+        place,
+        reflection.told > 0,
+        NEEDED,
+        1e-5 if reflection.kind == np.float32 else 1e-9,
+        out,
+    )
     return out
 
 
 def _roughness(
-    reflection: Reflection, lights: SphereLights, middle: Floating, eta: float
+    reflection: Reflection, lights: SphereLights, middle: FloatArray, eta: float
 ) -> Roughness:
     rows = list(reflection.tiles())
     height, width = reflection.shape
@@ -404,13 +440,19 @@ def _roughness(
         np.ascontiguousarray(np.concatenate([b for _, b in picked], axis=1)),
     )
 
-    def excess(log_alpha: float) -> tuple[float, Floating]:
+    def excess(log_alpha: float) -> tuple[float, FloatArray]:
         """Return how much longer the vectors are than this roughness makes them, each and all."""
         table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
         found = _inverted(
-            reflection, moments, table, _grid(table), _analyser(lights, table), eta,
-            np.zeros((0, 3)), np.zeros((0, 2)),
-        )  # fmt: skip
+            reflection,
+            moments,
+            table,
+            _grid(table),
+            _analyser(lights, table),
+            eta,
+            np.zeros((0, 3)),
+            np.zeros((0, 2)),
+        )
         # no vector is longer than its light; a lobe that falls between lights has no length at all
         length = found[:, kernels.CONCENTRATION]
         good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
@@ -433,8 +475,11 @@ def _roughness(
         best = int(np.nanargmin(np.abs(values)))
         _log.warning(
             "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
-            "narrower" if values[best] > 0.0 else "wider", ALPHAS[0], ALPHAS[-1], ALPHAS[best],
-        )  # fmt: skip
+            "narrower" if values[best] > 0.0 else "wider",
+            ALPHAS[0],
+            ALPHAS[-1],
+            ALPHAS[best],
+        )
         return Roughness(ALPHAS[best], ALPHAS[best], pixels)
     low, high = ladder[change[0]], ladder[change[0] + 1]
     root = float(brentq(lambda a: excess(a)[0], low, high, xtol=2e-3))
@@ -449,10 +494,10 @@ def _roughness(
 def _maps(
     reflection: Reflection,
     table: Response,
-    analyser: Floating,
+    analyser: FloatArray,
     eta: float,
-    view: Floating,
-    places: Floating | None,
+    view: FloatArray,
+    places: FloatArray | None,
     executor: Executor | None,
 ) -> NormalMaps:
     height, width = reflection.shape
@@ -466,9 +511,15 @@ def _maps(
         span = slice(rows.start * width, rows.stop * width)
         moments = reflection.moments(rows)
         found = _inverted(
-            reflection, moments, table, grid, analyser, eta, view[span] if len(view) else view,
+            reflection,
+            moments,
+            table,
+            grid,
+            analyser,
+            eta,
+            view[span] if len(view) else view,
             np.zeros((0, 2)) if places is None else places[span],
-        ).reshape(-1, width, kernels.NORMAL_COLUMNS)  # fmt: skip
+        ).reshape(-1, width, kernels.NORMAL_COLUMNS)
         good = found[..., kernels.STATUS] == kernels.GOOD
         valid[rows] = good
         normals[rows] = found[..., :3]

@@ -384,9 +384,23 @@ def _exit_ratio(nx, ny, nz, a0, a1, eta):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def invert(  # type: ignore[no-untyped-def]
-    parallel, crossed, frame, mirror, table, least, step, grid, analyser, eta, view, place, told,
-    needed, close, out,
-):  # fmt: skip
+    parallel,
+    crossed,
+    frame,
+    mirror,
+    table,
+    least,
+    step,
+    grid,
+    analyser,
+    eta,
+    view,
+    place,
+    told,
+    needed,
+    close,
+    out,
+):
     """Turn moments into normals, per pixel.
 
     Parameters

@@ -16,13 +16,12 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 
 from model import fresnel
 from model.brdf import microfacet
-
-Floats = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 REACH = 1.3
 """Length of the places that tables are made for: tilts up to 81 degrees."""
@@ -45,7 +44,7 @@ class SphereLightsError(ValueError):
     """Lights that no gradient sphere has."""
 
 
-def _none() -> Floats:
+def _none() -> Float64Array:
     return np.zeros(0)
 
 
@@ -83,15 +82,15 @@ class SphereLights:
     [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     """
 
-    directions: Floats
-    intensities: Floats = field(default_factory=_none)
-    leakage: Floats = field(default_factory=_none)
-    polarizers: Floats = field(default_factory=_none)
+    directions: Float64Array
+    intensities: Float64Array = field(default_factory=_none)
+    leakage: Float64Array = field(default_factory=_none)
+    polarizers: Float64Array = field(default_factory=_none)
     analyser: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    programmed: Floats = field(default_factory=_none)
+    programmed: Float64Array = field(default_factory=_none)
     distance_mm: float = np.inf
-    intensity_stderr: Floats = field(default_factory=_none)
-    leakage_stderr: Floats = field(default_factory=_none)
+    intensity_stderr: Float64Array = field(default_factory=_none)
+    leakage_stderr: Float64Array = field(default_factory=_none)
 
     def __post_init__(self) -> None:
         """Check shapes and ranges, and keep copies that cannot be written to."""
@@ -143,12 +142,12 @@ class SphereLights:
         object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
 
 
-def _keep(lights: SphereLights, name: str, values: Floats) -> None:
+def _keep(lights: SphereLights, name: str, values: Float64Array) -> None:
     values.flags.writeable = False
     object.__setattr__(lights, name, values)
 
 
-def _unit_vectors(name: str, vectors: ArrayLike) -> Floats:
+def _unit_vectors(name: str, vectors: ArrayLike) -> Float64Array:
     array = np.array(vectors, np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise SphereLightsError(f"{name}: got shape {array.shape}, expected (L, 3)")
@@ -175,16 +174,16 @@ class Response:
         Rows: right, up and the view, in the rig frame.
     """
 
-    coefficients: Floats
+    coefficients: Float64Array
     least: float
     step: float
-    frame: Floats
+    frame: Float64Array
 
     def __post_init__(self) -> None:
         self.coefficients.flags.writeable = False  # of one kind: what reads them is compiled once
 
 
-def _require_finite(name: str, values: Floats) -> None:
+def _require_finite(name: str, values: Float64Array) -> None:
     wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
     if wrong:
         raise SphereLightsError(
@@ -193,7 +192,7 @@ def _require_finite(name: str, values: Floats) -> None:
         )
 
 
-def frame_of(view: ArrayLike) -> Floats:
+def frame_of(view: ArrayLike) -> Float64Array:
     """Return the orthonormal frame about a view, rows right, up, view; identity for +z.
 
     Parameters
@@ -218,7 +217,7 @@ def frame_of(view: ArrayLike) -> Floats:
     return np.stack([right, np.cross(v, right), v])
 
 
-def normal_at(place: Floats) -> Floats:
+def normal_at(place: Float64Array) -> Float64Array:
     """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
 
     The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
@@ -240,7 +239,7 @@ def normal_at(place: Floats) -> Floats:
     return np.concatenate([seen * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
 
 
-def place_of(normal: Floats) -> Floats:
+def place_of(normal: Float64Array) -> Float64Array:
     """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
 
     Raises
@@ -252,7 +251,7 @@ def place_of(normal: Floats) -> Floats:
     return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))
 
 
-def facet_reflectance(lights: SphereLights, view: Floats, eta: float) -> Floats:
+def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> Float64Array:
     """Return what facets that mirror each light into the view send through the analyser, (L,).
 
     Over the light's own irradiance, after its film; the same for every normal, as the facet is.
@@ -351,19 +350,32 @@ _Key = tuple[bytes, ...]
 
 def _key(lights: SphereLights) -> _Key:
     arrays = (
-        lights.directions, lights.intensities, lights.leakage, lights.polarizers,
-        np.asarray(lights.analyser), lights.programmed, np.asarray(lights.distance_mm),
-        lights.intensity_stderr, lights.leakage_stderr,
-    )  # fmt: skip
+        lights.directions,
+        lights.intensities,
+        lights.leakage,
+        lights.polarizers,
+        np.asarray(lights.analyser),
+        lights.programmed,
+        np.asarray(lights.distance_mm),
+        lights.intensity_stderr,
+        lights.leakage_stderr,
+    )
     return tuple(np.asarray(a, np.float64).tobytes() for a in arrays)
 
 
 def _lights(key: _Key) -> SphereLights:
     d, e, k, p, a, w, distance, se, sk = (np.frombuffer(b) for b in key)
     return SphereLights(
-        d.reshape(-1, 3), e, k, p.reshape(-1, 3), (float(a[0]), float(a[1]), float(a[2])),
-        w.reshape(-1, 3), float(distance[0]), se, sk,
-    )  # fmt: skip
+        d.reshape(-1, 3),
+        e,
+        k,
+        p.reshape(-1, 3),
+        (float(a[0]), float(a[1]), float(a[2])),
+        w.reshape(-1, 3),
+        float(distance[0]),
+        se,
+        sk,
+    )
 
 
 @lru_cache(maxsize=48)
@@ -397,10 +409,14 @@ def _cached(
         if alpha_stderr > 0.0:
             step_a = 0.02 * alpha
             ends = [
-                _layers(lights, frame, _glossy_sums(lights, frame, a, eta)(
-                    normals[part], np.zeros(3)), True)
+                _layers(
+                    lights,
+                    frame,
+                    _glossy_sums(lights, frame, a, eta)(normals[part], np.zeros(3)),
+                    True,
+                )
                 for a in (alpha - step_a, alpha + step_a)
-            ]  # fmt: skip
+            ]
             move = (ends[1][:, :2] - ends[0][:, :2]) / (2.0 * step_a) * alpha_stderr
             layers[part, SYS_XX] += move[:, 0] ** 2
             layers[part, SYS_XY] += move[:, 0] * move[:, 1]
@@ -408,16 +424,15 @@ def _cached(
     layers[:, :2] -= places  # what differs from the normal's own place is smooth
     grid = layers.reshape(len(axis), len(axis), -1)
     coefficients = np.stack(
-        [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])],
-        axis=-1,
+        [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])], axis=-1
     )
     return Response(coefficients, float(axis[0]), step, frame)
 
 
-Sums = Callable[[Floats, Floats], Floats]
+Sums = Callable[[Float64Array, Float64Array], Float64Array]
 
 
-def _local(lights: SphereLights, point_mm: Floats) -> tuple[Floats, Floats]:
+def _local(lights: SphereLights, point_mm: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return directions to the lights, and their intensities, from a point near the origin."""
     if not np.isfinite(lights.distance_mm):
         return lights.directions, lights.intensities
@@ -426,19 +441,19 @@ def _local(lights: SphereLights, point_mm: Floats) -> tuple[Floats, Floats]:
     return way / distance[:, None], lights.intensities * (lights.distance_mm / distance) ** 2
 
 
-def _white(lights: SphereLights, frame: Floats) -> float:
+def _white(lights: SphereLights, frame: Float64Array) -> float:
     """Return what a white diffuser that faces the view shows under full light."""
     facing = np.maximum(lights.directions @ frame[2], 0.0)
     return float(np.sum(lights.intensities * facing) / np.pi)
 
 
-def _glossy_sums(lights: SphereLights, frame: Floats, alpha: float, eta: float) -> Sums:
+def _glossy_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
     view = frame[2]
     mirrored = facet_reflectance(lights, view, eta) * (1.0 - lights.leakage)
     # the analyser halves the white diffuser's light, and none of the polarized reflection's
     mirrored = mirrored * 2.0 / max(_white(lights, frame), 1e-300)
 
-    def each(normals: Floats, point_mm: Floats) -> Floats:
+    def each(normals: Float64Array, point_mm: Float64Array) -> Float64Array:
         ways, strength = _local(lights, point_mm)
         half = ways + view
         half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
@@ -450,18 +465,18 @@ def _glossy_sums(lights: SphereLights, frame: Floats, alpha: float, eta: float) 
     return each
 
 
-def _matte_sums(lights: SphereLights, frame: Floats, eta: float) -> Sums:
+def _matte_sums(lights: SphereLights, frame: Float64Array, eta: float) -> Sums:
     white = max(_white(lights, frame), 1e-300)
     mean = 1.0 - fresnel.diffuse_external(eta)
 
-    def each(normals: Floats, point_mm: Floats) -> Floats:
+    def each(normals: Float64Array, point_mm: Float64Array) -> Float64Array:
         ways, strength = _local(lights, point_mm)
         mu = normals @ ways.T
         c = np.clip(mu, 1e-6, 1.0)
         inside = np.sqrt(1.0 - (1.0 - c**2) / eta**2)
         t_s = 1.0 - ((c - eta * inside) / (c + eta * inside)) ** 2
         t_p = 1.0 - ((eta * c - inside) / (eta * c + inside)) ** 2
-        share_s: Floats | float = 0.5
+        share_s: Float64Array | float = 0.5
         if len(lights.polarizers):
             # s is along n x l: its part of the field, squared, by the triple product
             across = np.einsum("lk,plk->pl", lights.polarizers, np.cross(normals[:, None], ways))
@@ -473,7 +488,9 @@ def _matte_sums(lights: SphereLights, frame: Floats, eta: float) -> Sums:
     return each
 
 
-def _layers(lights: SphereLights, frame: Floats, each: Floats, mirror: bool) -> Floats:
+def _layers(
+    lights: SphereLights, frame: Float64Array, each: Float64Array, mirror: bool
+) -> Float64Array:
     """Return the layers (P, LAYERS) of what each light gives (P, L)."""
     axes = lights.programmed if len(lights.programmed) else lights.directions
     axes = axes @ frame.T
@@ -497,7 +514,7 @@ def _layers(lights: SphereLights, frame: Floats, each: Floats, mirror: bool) -> 
     return out
 
 
-def seen(vector: Floats, mirror: bool) -> tuple[Floats, Floats]:
+def seen(vector: Float64Array, mirror: bool) -> tuple[Float64Array, Float64Array]:
     """Return the place that a moment vector points at, and its derivative by the vector.
 
     Parameters

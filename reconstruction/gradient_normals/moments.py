@@ -7,22 +7,25 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals import kernels
 from reconstruction.gradient_normals.noise import SensorNoise, estimate_noise
 from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, Stack, require
 from reconstruction.gradient_normals.wiener import filtered
 
-Floating = NDArray[np.floating]
-
 TILE_PIXELS = 65_536
 _VALUES = slice(kernels.C_0, kernels.V_0)
 _SPREAD = slice(kernels.V_0, kernels.CHI)
 _VARIANCES = (
-    (kernels.V_0, 0, 0), (kernels.V_XX, 1, 1), (kernels.V_YY, 2, 2), (kernels.V_ZZ, 3, 3),
-    (kernels.V_XY, 1, 2), (kernels.V_XZ, 1, 3), (kernels.V_YZ, 2, 3),
-)  # fmt: skip
+    (kernels.V_0, 0, 0),
+    (kernels.V_XX, 1, 1),
+    (kernels.V_YY, 2, 2),
+    (kernels.V_ZZ, 3, 3),
+    (kernels.V_XY, 1, 2),
+    (kernels.V_XZ, 1, 3),
+    (kernels.V_YZ, 2, 3),
+)
 """Rows of variances, and which moments they are of."""
 REACH_SIGMA = 3.5
 """Where a smoothing kernel ends, in its standard deviations."""
@@ -66,8 +69,8 @@ class Reflection:
     leakage: float
     smooth_px: tuple[float, float]
     kind: Any
-    clean: tuple[Floating, Floating] | None = None
-    shares: tuple[Floating, Floating] | None = None
+    clean: tuple[FloatArray, FloatArray] | None = None
+    shares: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -81,7 +84,7 @@ class Reflection:
         for start in range(0, height, step):
             yield slice(start, min(start + step, height))
 
-    def moments(self, rows: slice) -> tuple[Floating, Floating]:
+    def moments(self, rows: slice) -> tuple[FloatArray, FloatArray]:
         """Return what is to be inverted (MOMENT_ROWS, P), and what is to be taken off it.
 
         The second one is (MOMENT_ROWS, 0) where nothing is.
@@ -104,7 +107,7 @@ class Reflection:
             self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
 
-    def _replace(self, first: Floating, second: Floating, rows: slice) -> None:
+    def _replace(self, first: FloatArray, second: FloatArray, rows: slice) -> None:
         """Put filtered moments in, and all of their variance into the first."""
         if self.clean is None or self.shares is None:
             return
@@ -119,7 +122,7 @@ class Reflection:
             moments[_VALUES] = clean[:, rows].reshape(4, -1)
             moments[: kernels.CHI, lost] = np.nan
 
-    def _of(self, stack: Stack, rows: slice, sigma: float) -> Floating:
+    def _of(self, stack: Stack, rows: slice, sigma: float) -> FloatArray:
         taps = _taps(sigma).astype(self.kind)
         reach = len(taps) - 1
         start, stop = max(0, rows.start - reach), min(self.shape[0], rows.stop + reach)
@@ -141,7 +144,7 @@ class Reflection:
         return np.ascontiguousarray(inner).reshape(kernels.MOMENT_ROWS, -1)
 
 
-def _taps(sigma: float) -> NDArray[np.float64]:
+def _taps(sigma: float) -> Float64Array:
     """Return a Gaussian's taps from its middle outward, the whole kernel's sum 1."""
     if sigma == 0.0:
         return np.ones(1)
@@ -150,7 +153,7 @@ def _taps(sigma: float) -> NDArray[np.float64]:
     return np.asarray(taps / (2.0 * taps.sum() - taps[0]))
 
 
-def _smooth(moments: Floating, taps: Floating) -> None:
+def _smooth(moments: FloatArray, taps: FloatArray) -> None:
     """Smooth moments (MOMENT_ROWS, H, W) in place over their valid pixels; variances follow."""
     mask = np.isfinite(moments[kernels.C_0])
     if not mask.any():
@@ -221,10 +224,16 @@ def prepare(
         told = 0 if noise is None else 2
     kinds = {image.dtype for stack in used.values() for image in stack.pictures.values()}
     return Reflection(
-        component, parallel, stacks["crossed"], noise if told == 2 else None, told, judged, leakage,
+        component,
+        parallel,
+        stacks["crossed"],
+        noise if told == 2 else None,
+        told,
+        judged,
+        leakage,
         (smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px),
         np.float64 if np.dtype(np.float64) in kinds else np.float32,
-    )  # fmt: skip
+    )
 
 
 def with_filter(reflection: Reflection) -> Reflection:
@@ -287,7 +296,9 @@ def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:
         if "dark" in source.valid:
             valid["dark"] = source.valid["dark"]
         out[other] = replace(
-            stack, pictures={**stack.pictures, "dark": source.pictures["dark"]},
-            variance=variance, valid=valid,
-        )  # fmt: skip
+            stack,
+            pictures={**stack.pictures, "dark": source.pictures["dark"]},
+            variance=variance,
+            valid=valid,
+        )
     return out

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals.patterns import PATTERNS, GradientError, Stack, design
-
-Floating = NDArray[np.floating]
 
 _CHI_MEDIAN = 0.4549364  # of the square of a standard normal variable
 
@@ -81,7 +79,7 @@ def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
     return SensorNoise(gain, read) if gain > 0.0 or read > 0.0 else None
 
 
-def _contrasts(stack: Stack) -> list[NDArray[np.float64]]:
+def _contrasts(stack: Stack) -> list[Float64Array]:
     """Return weights (8,) of orthogonal sums of the pictures that hold nothing but noise."""
     names: list[str] = [name for name in PATTERNS if name in stack.pictures]
     if stack.redundant < 1:
@@ -98,7 +96,7 @@ def _contrasts(stack: Stack) -> list[NDArray[np.float64]]:
     return out
 
 
-def _line(signal: Floating, square: Floating) -> tuple[float, float]:
+def _line(signal: FloatArray, square: FloatArray) -> tuple[float, float]:
     """Fit ``square = gain signal + read`` by medians over 16 classes of signal."""
     edges = np.unique(np.quantile(signal, np.linspace(0.0, 1.0, 17)))
     place = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, max(len(edges) - 2, 0))
@@ -119,11 +117,7 @@ def _line(signal: Floating, square: Floating) -> tuple[float, float]:
     spread = np.sum(weight * (x - mean_x) ** 2)
     slope = np.sum(weight * (x - mean_x) * (y - mean_y)) / spread if spread > 0.0 else 0.0
     through = np.sum(weight * x * y) / max(np.sum(weight * x * x), 1e-300)
-    for gain, read in (
-        (slope, mean_y - slope * mean_x),
-        (0.0, mean_y),
-        (max(through, 0.0), 0.0),
-    ):
+    for gain, read in ((slope, mean_y - slope * mean_x), (0.0, mean_y), (max(through, 0.0), 0.0)):
         cost = float(np.sum(weight * (gain * x + read - y) ** 2))
         if gain >= 0.0 and read >= 0.0 and cost < least:
             best, least = (float(gain), float(read)), cost

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floating = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
+
 Key = tuple[str, str]
 
 PATTERNS: Final = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
@@ -41,9 +42,9 @@ class Stack:
         Only those that are not valid everywhere.
     """
 
-    pictures: dict[str, Floating]
-    variance: dict[str, Floating] | None
-    valid: dict[str, NDArray[np.bool_]]
+    pictures: dict[str, FloatArray]
+    variance: dict[str, FloatArray] | None
+    valid: dict[str, BoolArray]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -61,7 +62,7 @@ class Stack:
         """How many more pictures there are than what is asked for."""
         return redundancy(self.pictures)
 
-    def samples(self, rows: slice, kind: Any) -> Floating:
+    def samples(self, rows: slice, kind: Any) -> FloatArray:
         """Return samples (8, h, W) in the order of :data:`PATTERNS`; NaN where there is none."""
         _, width = self.shape
         height = len(range(*rows.indices(self.shape[0])))
@@ -75,7 +76,7 @@ class Stack:
             out[~np.isfinite(out)] = np.nan
         return out
 
-    def variances(self, rows: slice, kind: Any) -> Floating:
+    def variances(self, rows: slice, kind: Any) -> FloatArray:
         """Return variances (8, h, W); 1 where no picture is, and a view where it can be."""
         height, width = len(range(*rows.indices(self.shape[0]))), self.shape[1]
         if self.variance is None:
@@ -88,7 +89,7 @@ class Stack:
         return out
 
 
-def design(names: list[str], *, dark: bool) -> NDArray[np.float64]:
+def design(names: list[str], *, dark: bool) -> Float64Array:
     """Return the weights (R, 4 or 5) of full light, moments and dark level in each picture."""
     rows = []
     for name in names:
@@ -144,7 +145,7 @@ def collect(
     patterns: Mapping[Key, ArrayLike],
     *,
     variance: float | Mapping[Key, ArrayLike] | None,
-    valid: NDArray[np.bool_] | Mapping[Key, NDArray[np.bool_]] | None,
+    valid: BoolArray | Mapping[Key, BoolArray] | None,
     saturation: float | None,
 ) -> dict[str, Stack]:
     """Check the pictures and sort them by polarization.
@@ -203,10 +204,8 @@ def _known_key(key: Any) -> Key:
 
 
 def _mask(
-    valid: NDArray[np.bool_] | Mapping[Key, NDArray[np.bool_]] | None,
-    key: Key,
-    shape: tuple[int, ...],
-) -> NDArray[np.bool_] | None:
+    valid: BoolArray | Mapping[Key, BoolArray] | None, key: Key, shape: tuple[int, ...]
+) -> BoolArray | None:
     if valid is None or (isinstance(valid, Mapping) and key not in valid):
         return None
     mask = np.asarray(valid[key] if isinstance(valid, Mapping) else valid)
@@ -219,7 +218,7 @@ def _mask(
 
 
 def _with_variance(stack: Stack, polarizer: str, variance: Any, shape: tuple[int, ...]) -> Stack:
-    found: dict[str, Floating] = {}
+    found: dict[str, FloatArray] = {}
     for name in stack.pictures:
         if isinstance(variance, Mapping):
             if (name, polarizer) not in variance:

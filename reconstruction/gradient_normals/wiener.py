@@ -8,11 +8,10 @@ each frequency is signal (Wiener 1949), and that share is kept.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-Floating = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, FloatArray
 
 PAD_PX = 24
 """Mirrored border, so that the ends of a picture do not meet."""
@@ -20,7 +19,7 @@ BAND = 64
 """A spectrum is averaged over about this part of its width, which it must be smooth over."""
 
 
-def filtered(image: Floating, variance: float, valid: NDArray[np.bool_]) -> tuple[Floating, float]:
+def filtered(image: FloatArray, variance: float, valid: BoolArray) -> tuple[FloatArray, float]:
     """Return a picture as its signal most likely is, and what is left of its noise.
 
     Parameters
@@ -75,7 +74,7 @@ def _pads(side: int) -> tuple[int, int]:
     return total // 2, total - total // 2
 
 
-def _averaged(power: Floating, shape: tuple[int, ...]) -> Floating:
+def _averaged(power: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Average the half spectrum of a real picture over bands of frequencies, periodically."""
     rows, columns = (max(3, side // BAND) | 1 for side in shape)
     half = columns
@@ -90,7 +89,7 @@ def _averaged(power: Floating, shape: tuple[int, ...]) -> Floating:
     return np.asarray(whole[:, half : half + power.shape[1]])
 
 
-def _full_mean(half: Floating, width: int) -> float:
+def _full_mean(half: FloatArray, width: int) -> float:
     """Return the mean over the whole spectrum of what the half of it holds."""
     weight = np.full(half.shape[1], 2.0)
     weight[0] = 1.0

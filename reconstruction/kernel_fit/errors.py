@@ -18,13 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.kernel_fit.neutral_relief import Relief
 from reconstruction.kernel_fit.search import Buckets, Found
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.block_errors import LEAST_BLOCKS
-
-Floats = NDArray[np.float64]
 
 DRAWS = 200
 """Histograms drawn for the standard errors."""
@@ -57,7 +56,7 @@ class BlockCounts:
         blocks, because neighbors are alike.
     """
 
-    counts: Floats
+    counts: Float64Array
     growth: float
 
     @property
@@ -75,7 +74,7 @@ class BlockCounts:
         """Independent samples that would be as noisy."""
         return max(1.0, normal_blocks.effective_number(self.counts, self.samples) / self.growth)
 
-    def residuals(self) -> Floats:
+    def residuals(self) -> Float64Array:
         """Return each block's part in the error of the shares, (blocks, buckets).
 
         With independent unit normal factors on the blocks, the sum scatters as the shares do over
@@ -88,7 +87,7 @@ class BlockCounts:
             normal_blocks.residuals_of(counts) * math.sqrt(n / max(n - 1, 1) * self.growth)
         )
 
-    def noise(self, target: Floats, target_samples: float) -> float:
+    def noise(self, target: Float64Array, target_samples: float) -> float:
         """Return the standard error of the distance to a target of so many effective samples."""
         effective, residuals = self.effective_samples, self.residuals()
         signs = np.sign(self.counts.sum(axis=0) / self.samples - target)
@@ -96,7 +95,7 @@ class BlockCounts:
         own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
         return math.sqrt(own * (1.0 + effective / target_samples))
 
-    def scatter(self, target_samples: float) -> Floats:
+    def scatter(self, target_samples: float) -> Float64Array:
         """Return the parts of blocks in the error of both histograms, as of `residuals`."""
         return self.residuals() * math.sqrt(1.0 + self.effective_samples / target_samples)
 
@@ -125,8 +124,8 @@ def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -
 
 
 def nearly_as_good(
-    found: Found, alphas: Floats, sigmas_um: Floats, noise: float
-) -> NDArray[np.int64]:
+    found: Found, alphas: Float64Array, sigmas_um: Float64Array, noise: float
+) -> Int64Array:
     """Return the kernels that are no further than `noise` from the best, (K, 2).
 
     Parameters
@@ -166,11 +165,11 @@ def widths_of_best(
     relief: Relief,
     buckets: Buckets,
     found: Found,
-    alphas: Floats,
-    sigmas_um: Floats,
+    alphas: Float64Array,
+    sigmas_um: Float64Array,
     *,
     noise: float,
-    scatter: Floats,
+    scatter: Float64Array,
     rng: np.random.Generator,
 ) -> HalfWidths:
     """Return ways of the best kernel that most drawn histograms of other skin stay within.
@@ -204,11 +203,11 @@ def widths_of_pair(
     relief: Relief,
     buckets: Buckets,
     found: Found,
-    alphas: Floats,
-    sigmas_um: Floats,
+    alphas: Float64Array,
+    sigmas_um: Float64Array,
     *,
     noise: float,
-    target_blocks: Floats,
+    target_blocks: Float64Array,
     growth: float,
     rng: np.random.Generator,
 ) -> HalfWidths | None:
@@ -250,9 +249,13 @@ def widths_of_pair(
         for column in np.flatnonzero(some[:, 0] == i).tolist():
             alpha = np.float32(alphas[some[column, 1]])
             counts = kernels.count_in_groups(
-                -(relief.along + alpha * da), -(relief.across + alpha * db),
-                group, groups, buckets.bins, buckets.limit,
-            )  # fmt: skip
+                -(relief.along + alpha * da),
+                -(relief.across + alpha * db),
+                group,
+                groups,
+                buckets.bins,
+                buckets.limit,
+            )
             gap = counts.sum(axis=0) / relief.places.size - buckets.target
             apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
             used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
@@ -261,19 +264,21 @@ def widths_of_pair(
     return _widths(alphas, sigmas_um, some, distance.argmin(axis=1))
 
 
-def of_grid(widths: HalfWidths, alphas: Floats, sigmas_um: Floats) -> HalfWidths:
+def of_grid(widths: HalfWidths, alphas: Float64Array, sigmas_um: Float64Array) -> HalfWidths:
     """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
     step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (alphas, sigmas_um)]
     (alpha, alpha_95), (sigma, sigma_95) = (
-        tuple(math.hypot(w, factor * s / math.sqrt(12.0)) for w, factor in zip(
-            told, (1.0, GAUSSIAN_95), strict=True))
+        tuple(
+            math.hypot(w, factor * s / math.sqrt(12.0))
+            for w, factor in zip(told, (1.0, GAUSSIAN_95), strict=True)
+        )
         for told, s in zip((widths.alpha, widths.sigma_um), step, strict=True)
-    )  # fmt: skip
+    )
     return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
 
 
 def _widths(
-    alphas: Floats, sigmas_um: Floats, some: NDArray[np.int64], best: NDArray[np.intp]
+    alphas: Float64Array, sigmas_um: Float64Array, some: Int64Array, best: NDArray[np.intp]
 ) -> HalfWidths:
     """Return quantiles of how far draws' best kernels are from the best, which is the first."""
     i, j = some[best].T

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.microstructure import ALPHA_LIMITS
 from reconstruction import normal_histogram
+from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.kernel_fit import outcome as kernel_outcome
 from reconstruction.kernel_fit import search as kernel_search
 from reconstruction.kernel_fit.neutral_relief import Axis, KernelFitError, Relief, relief_of
@@ -27,8 +28,6 @@ from reconstruction.kernel_fit.outcome import KernelFit
 from reconstruction.kernel_fit.search import Buckets
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
-
-Floats = NDArray[np.float64]
 
 ALPHAS = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
 """The paper's grid of strengths, by 0.01."""
@@ -49,16 +48,21 @@ def convolved_histogram(
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
     y_up: bool = True,
-) -> Floats:
+) -> Float64Array:
     """Return the histogram that :func:`fit_kernel` compares with its target, (bins, bins).
 
     Axes (n_y, n_x); the shares of all samples, so that what is beyond the limit is missing from
     the sum. Parameters as of :func:`fit_kernel`.
     """
     relief = relief_of(
-        neutral_height_um, stretch=stretch, axis=axis, pixel_um=pixel_um,
-        stretch_across=stretch_across, valid=valid, y_up=y_up,
-    )  # fmt: skip
+        neutral_height_um,
+        stretch=stretch,
+        axis=axis,
+        pixel_um=pixel_um,
+        stretch_across=stretch_across,
+        valid=valid,
+        y_up=y_up,
+    )
     normal_histogram.check_buckets(bins, limit)
     buckets = Buckets(np.zeros(bins * bins + 1), bins, limit)
     change = relief.change(sigma_um)
@@ -69,7 +73,7 @@ def convolved_histogram(
 
 def fit_kernel(
     neutral_height_um: ArrayLike,
-    target_histogram: NDArray[np.floating],
+    target_histogram: FloatArray,
     *,
     stretch: float,
     axis: Axis,
@@ -142,15 +146,25 @@ def fit_kernel(
     normal_histogram.check_buckets(bins, limit)
     target = _target(target_histogram, bins, transposed=axis in ("y", 0))
     relief = relief_of(
-        neutral_height_um, stretch=stretch, axis=axis, pixel_um=pixel_um,
-        stretch_across=stretch_across, valid=valid, y_up=y_up,
-    )  # fmt: skip
+        neutral_height_um,
+        stretch=stretch,
+        axis=axis,
+        pixel_um=pixel_um,
+        stretch_across=stretch_across,
+        valid=valid,
+        y_up=y_up,
+    )
     return fit_relief(
-        relief, Buckets(target, bins, float(limit)), ALPHAS if alphas is None else alphas,
-        SIGMAS_UM if sigmas_um is None else sigmas_um, search=search,
-        target_samples=target_samples, first_sample=first_sample, seed=seed,
+        relief,
+        Buckets(target, bins, float(limit)),
+        ALPHAS if alphas is None else alphas,
+        SIGMAS_UM if sigmas_um is None else sigmas_um,
+        search=search,
+        target_samples=target_samples,
+        first_sample=first_sample,
+        seed=seed,
         target_blocks=_blocks(target_blocks, relief, bins, transposed=axis in ("y", 0)),
-    )  # fmt: skip
+    )
 
 
 def fit_relief(
@@ -163,7 +177,7 @@ def fit_relief(
     target_samples: float | None,
     first_sample: int,
     seed: int,
-    target_blocks: Floats | None = None,
+    target_blocks: Float64Array | None = None,
 ) -> KernelFit:
     """Fit the kernel of a prepared relief; parameters and errors as of :func:`fit_kernel`.
 
@@ -186,12 +200,19 @@ def fit_relief(
         )
     with kernels.threads_for(500 * relief.places.size):
         return kernel_outcome.described(
-            relief, buckets, strengths, widths, found, search=search,
-            target_samples=target_samples, target_blocks=target_blocks, rng=rng,
-        )  # fmt: skip
+            relief,
+            buckets,
+            strengths,
+            widths,
+            found,
+            search=search,
+            target_samples=target_samples,
+            target_blocks=target_blocks,
+            rng=rng,
+        )
 
 
-def _grid(name: str, values: ArrayLike, low: float, high: float) -> Floats:
+def _grid(name: str, values: ArrayLike, low: float, high: float) -> Float64Array:
     grid = np.array(values, np.float64).reshape(-1)
     if grid.size == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
         raise KernelFitError(f"{name}: got {grid}, expected finite increasing values")
@@ -200,7 +221,7 @@ def _grid(name: str, values: ArrayLike, low: float, high: float) -> Floats:
     return grid
 
 
-def _target(histogram: NDArray[np.floating], bins: int, *, transposed: bool) -> Floats:
+def _target(histogram: FloatArray, bins: int, *, transposed: bool) -> Float64Array:
     shares = np.asarray(histogram, np.float64)
     if shares.shape != (bins, bins):
         raise KernelFitError(f"target_histogram: got shape {shares.shape}, expected {(bins, bins)}")
@@ -213,7 +234,7 @@ def _target(histogram: NDArray[np.floating], bins: int, *, transposed: bool) -> 
 
 def _blocks(
     counts: NDArray[np.integer] | None, relief: Relief, bins: int, *, transposed: bool
-) -> Floats | None:
+) -> Float64Array | None:
     """Return counts of the target by blocks of the relief, (blocks, bins ** 2 + 1)."""
     if counts is None:
         return None

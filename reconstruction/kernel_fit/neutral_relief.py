@@ -19,14 +19,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.microstructure import gaussian_weights
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.relief_slopes import SlopeError, pixel_sides, stencil
 
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Axis = Literal["x", "y", 0, 1]
 
 
@@ -50,18 +49,18 @@ class Relief:
         Neutral side of a pixel along the rows, for sigma.
     """
 
-    height_um: Float32
-    code: NDArray[np.uint8]
+    height_um: Float32Array
+    code: UInt8Array
     right_um: float
     down_um: float
     pixel_um: float
-    places: NDArray[np.int64] = field(init=False)
+    places: Int64Array = field(init=False)
     """(N,) pixels with slopes, y * W + x."""
-    starts: NDArray[np.int64] = field(init=False)
+    starts: Int64Array = field(init=False)
     """(H,) samples in the rows before."""
-    along: Float32 = field(init=False)
+    along: Float32Array = field(init=False)
     """(N,) minus the neutral relief's slopes after stretching."""
-    across: Float32 = field(init=False)
+    across: Float32Array = field(init=False)
 
     def __post_init__(self) -> None:
         """List the samples and their slopes."""
@@ -73,18 +72,18 @@ class Relief:
         object.__setattr__(self, "along", along)
         object.__setattr__(self, "across", across)
 
-    def _leans(self, height: Float32) -> tuple[Float32, Float32]:
+    def _leans(self, height: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
         a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
         right, down = np.float32(self.right_um), np.float32(self.down_um)
         kernels.leans(height, self.code, self.starts, right, down, a, b)
         return a, b
 
-    def weights(self, sigma_um: float) -> Float32:
+    def weights(self, sigma_um: float) -> Float32Array:
         """Return the discrete Gaussian's right half, from the middle on; they sum to 1 mirrored."""
         return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
 
-    def change(self, sigma_um: float) -> tuple[Float32, Float32]:
+    def change(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
         """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
         moved = np.empty_like(self.height_um)
         kernels.blurred_less_itself(self.height_um, self.weights(sigma_um), moved)
@@ -139,13 +138,13 @@ def relief_of(
     return Relief(filled, code, right * stretch, to_top * down * stretch_across, right)
 
 
-def _usable(height: Floats, valid: ArrayLike | None) -> NDArray[np.bool_]:
+def _usable(height: Float64Array, valid: ArrayLike | None) -> BoolArray:
     """Return which heights are finite and not masked; shapes have been checked."""
     good = np.isfinite(height)
     return good if valid is None else good & np.asarray(valid, bool)
 
 
-def _filled(height: Floats, good: NDArray[np.bool_]) -> Floats:
+def _filled(height: Float64Array, good: BoolArray) -> Float64Array:
     """Return heights about their mean, with holes filled linearly along the rows."""
     filled = np.where(good, height - height[good].mean(), 0.0)
     columns = np.arange(height.shape[1])
@@ -162,7 +161,7 @@ def convolved(
     axis: Axis,
     pixel_um: float | tuple[float, float],
     valid: ArrayLike | None = None,
-) -> Floats:
+) -> Float64Array:
     """Return a map convolved along one axis with eq. (6)'s kernel, as the search does it.
 
     Parameters

@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reconstruction import normal_histogram
+from reconstruction.arrays import Float64Array
 from reconstruction.kernel_fit import errors as kernel_errors
 from reconstruction.kernel_fit import search as kernel_search
 from reconstruction.kernel_fit.neutral_relief import Relief
 from reconstruction.kernel_fit.search import Buckets, Found
 from reconstruction.normal_histogram.statistics import SAMPLES_PER_BUCKET
-
-Floats = NDArray[np.float64]
 
 FINER_ALPHA, FINER_SIGMA = 10, 5
 """The refinement's steps are so much smaller than the grid's, within one step to either side."""
@@ -80,7 +78,7 @@ class KernelFit:
     alpha: float
     sigma_um: float
     distance: float
-    near_best: Floats
+    near_best: Float64Array
     valid: bool
     noise: float
     floor: float
@@ -107,13 +105,13 @@ class KernelFit:
 def described(
     relief: Relief,
     buckets: Buckets,
-    alphas: Floats,
-    sigmas_um: Floats,
+    alphas: Float64Array,
+    sigmas_um: Float64Array,
     found: Found,
     *,
     search: str,
     target_samples: float | None,
-    target_blocks: Floats | None,
+    target_blocks: Float64Array | None,
     rng: np.random.Generator,
 ) -> KernelFit:
     """Return what a search found, with its noise, its valley and a finer minimum.
@@ -159,13 +157,26 @@ def described(
         pair = None
         if target_blocks is not None:
             pair = kernel_errors.widths_of_pair(
-                relief, buckets, found, alphas, sigmas_um,
-                noise=noise, target_blocks=target_blocks, growth=blocks.growth, rng=rng,
-            )  # fmt: skip
+                relief,
+                buckets,
+                found,
+                alphas,
+                sigmas_um,
+                noise=noise,
+                target_blocks=target_blocks,
+                growth=blocks.growth,
+                rng=rng,
+            )
         told = pair or kernel_errors.widths_of_best(
-            relief, buckets, found, alphas, sigmas_um,
-            noise=noise, scatter=blocks.scatter(theirs), rng=rng,
-        )  # fmt: skip
+            relief,
+            buckets,
+            found,
+            alphas,
+            sigmas_um,
+            noise=noise,
+            scatter=blocks.scatter(theirs),
+            rng=rng,
+        )
         told = kernel_errors.of_grid(told, alphas, sigmas_um)
     return KernelFit(
         alpha=alpha if not reason else 0.0,
@@ -197,9 +208,13 @@ def described(
 
 
 def _refined(
-    relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats, best: tuple[int, int],
+    relief: Relief,
+    buckets: Buckets,
+    alphas: Float64Array,
+    sigmas: Float64Array,
+    best: tuple[int, int],
     distance: float,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float, float]:
     """Return the best of a finer grid that spans one step to either side, within the grid."""
     i, j = best
     result = (float(alphas[j]), float(sigmas[i]), distance)
@@ -213,7 +228,7 @@ def _refined(
     return result
 
 
-def _finer(grid: Floats, i: int, finer: int) -> Floats:
+def _finer(grid: Float64Array, i: int, finer: int) -> Float64Array:
     low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
     steps = finer * (int(i > 0) + int(i < grid.size - 1))
     return np.linspace(low, high, steps + 1)

@@ -26,14 +26,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from reconstruction.kernel_fit.neutral_relief import Relief
 from reconstruction.normal_histogram import kernels
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 MISS = 1e-6
 """Chance at most that a hierarchical search drops the exhaustive search's result."""
@@ -71,21 +67,27 @@ class Buckets:
         As of `normal_histogram.histogram`.
     """
 
-    target: Floats
+    target: Float64Array
     bins: int
     limit: float
 
     def count(
-        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
-    ) -> NDArray[np.int32]:
+        self,
+        start: tuple[Float32Array, Float32Array],
+        change: tuple[Float32Array, Float32Array],
+        alphas: Float64Array,
+    ) -> Int32Array:
         """Count the samples of each alpha, in parts: (parts, A, bins ** 2 + 1)."""
         given = alphas.astype(np.float32)
         parts = kernels.threads()
         return kernels.count_kernels(*start, *change, given, self.bins, self.limit, parts)
 
     def distances(
-        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
-    ) -> Floats:
+        self,
+        start: tuple[Float32Array, Float32Array],
+        change: tuple[Float32Array, Float32Array],
+        alphas: Float64Array,
+    ) -> Float64Array:
         """Return eq. (7)'s sum for each alpha."""
         return kernels.distances(self.count(start, change, alphas), self.target)
 
@@ -109,14 +111,20 @@ class Found:
         Of some of the exact kernels, by their indices (sigma, alpha).
     """
 
-    distance: Floats
-    exact: Bools
+    distance: Float64Array
+    exact: BoolArray
     best: tuple[int, int]
     passes: float
-    counts: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
+    counts: dict[tuple[int, int], Int32Array] = field(default_factory=dict)
 
-    def shares(self, relief: Relief, buckets: Buckets, sigmas_um: Floats, alphas: Floats,
-               wanted: NDArray[np.int64]) -> Floats:  # fmt: skip
+    def shares(
+        self,
+        relief: Relief,
+        buckets: Buckets,
+        sigmas_um: Float64Array,
+        alphas: Float64Array,
+        wanted: Int64Array,
+    ) -> Float64Array:
         """Return histograms of kernels, (K, buckets), counting what the search has not kept.
 
         Parameters
@@ -143,7 +151,9 @@ class Found:
         return out / relief.places.size
 
 
-def gentlest(distance: Floats, alphas: Floats, sigmas_um: Floats) -> tuple[int, int]:
+def gentlest(
+    distance: Float64Array, alphas: Float64Array, sigmas_um: Float64Array
+) -> tuple[int, int]:
     """Return the indices of the least distance, (S, A), ties by the rule of :class:`Found`.
 
     Raises
@@ -161,7 +171,9 @@ def gentlest(distance: Floats, alphas: Floats, sigmas_um: Floats) -> tuple[int, 
     return int(i[order[0]]), int(j[order[0]])
 
 
-def exhaustive(relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floats) -> Found:
+def exhaustive(
+    relief: Relief, buckets: Buckets, alphas: Float64Array, sigmas_um: Float64Array
+) -> Found:
     """Evaluate all kernels of the grid on all pixels."""
     start = relief.along, relief.across
     distance = np.empty((sigmas_um.size, alphas.size))
@@ -175,8 +187,8 @@ def exhaustive(relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floa
 def hierarchical(
     relief: Relief,
     buckets: Buckets,
-    alphas: Floats,
-    sigmas_um: Floats,
+    alphas: Float64Array,
+    sigmas_um: Float64Array,
     *,
     first_sample: int = FIRST_SAMPLE,
     rng: np.random.Generator,
@@ -207,7 +219,9 @@ def hierarchical(
 class _Race:
     """State of a hierarchical search."""
 
-    def __init__(self, relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats) -> None:
+    def __init__(
+        self, relief: Relief, buckets: Buckets, alphas: Float64Array, sigmas: Float64Array
+    ) -> None:
         shape = (sigmas.size, alphas.size)
         self.relief, self.buckets, self.alphas, self.sigmas = relief, buckets, alphas, sigmas
         self.low = np.zeros(shape)  # distances are at least this
@@ -215,8 +229,10 @@ class _Race:
         self.level = np.zeros(shape, int)  # which sample that was
         self.exact = np.zeros(shape, bool)
         self.distance = np.full(shape, np.inf)  # exact ones
-        self.counts: dict[tuple[int, int], NDArray[np.int32]] = {}
-        self.signs: list[Floats] = []  # of target - histogram, of kernels evaluated on all pixels
+        self.counts: dict[tuple[int, int], Int32Array] = {}
+        self.signs: list[
+            Float64Array
+        ] = []  # of target - histogram, of kernels evaluated on all pixels
         self.passes = 0.0
 
     def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
@@ -246,11 +262,11 @@ class _Race:
         return Found(distance, self.exact, best, self.passes, self.counts)
 
     @property
-    def _open(self) -> Bools:
+    def _open(self) -> BoolArray:
         """Kernels that may still be the best, and are not evaluated on all pixels."""
         return ~self.exact & (self.low <= self.distance.min())
 
-    def _sample(self, chosen: NDArray[np.int64], before: int, log: float, number: int) -> None:
+    def _sample(self, chosen: Int64Array, before: int, log: float, number: int) -> None:
         relief, target = self.relief, self.buckets.target
         pixels, m = relief.places.size, chosen.size
         rest, fresh = pixels - before, m - before
@@ -287,7 +303,7 @@ class _Race:
                 j = int(np.argmin(np.where(self._open[i], self.guess[i], np.inf)))
                 self._evaluate(i, np.array([j]), j)
 
-    def _evaluate(self, i: int, j: NDArray[np.int64], keep: int | None = None) -> None:
+    def _evaluate(self, i: int, j: Int64Array, keep: int | None = None) -> None:
         relief = self.relief
         counts = self.buckets.count(
             (relief.along, relief.across), relief.change(float(self.sigmas[i])), self.alphas[j]
@@ -316,7 +332,7 @@ class _SampledChange:
 
     SIZE = 1024
 
-    def __init__(self, relief: Relief, chosen: NDArray[np.int64], most_um: float) -> None:
+    def __init__(self, relief: Relief, chosen: Int64Array, most_um: float) -> None:
         self.relief, self.chosen = relief, chosen
         reach = relief.weights(float(most_um)).size - 1
         blocks = -(-chosen.size // self.SIZE)
@@ -326,11 +342,16 @@ class _SampledChange:
             self.across = np.zeros_like(self.along)
             right, down = np.float32(relief.right_um), np.float32(relief.down_um)
             kernels.windows(
-                relief.height_um, relief.code, relief.places[chosen], right, down,
-                self.along, self.across,
-            )  # fmt: skip
+                relief.height_um,
+                relief.code,
+                relief.places[chosen],
+                right,
+                down,
+                self.along,
+                self.across,
+            )
 
-    def at(self, sigma_um: float) -> tuple[Float32, Float32]:
+    def at(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
         """Return both changes, in the order of the chosen pixels."""
         if not self.small:
             a, b = self.relief.change(sigma_um)

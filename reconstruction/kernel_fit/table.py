@@ -20,13 +20,12 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import lsq_linear
 from scipy.special import fdtrc
 
 from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
-
-Floats = NDArray[np.float64]
+from reconstruction.arrays import BoolArray, Float64Array
 
 LEAST_POINTS = 2
 """Points that inform a line of alpha, at least; its ends and the neutral kernel count."""
@@ -82,7 +81,7 @@ class TableFit:
     sigma_stretch_stderr_um: tuple[float, float]
     sigma_compression_covariance_um2: float
     sigma_stretch_covariance_um2: float
-    alpha_covariance: Floats
+    alpha_covariance: Float64Array
 
 
 def fit_table(
@@ -150,7 +149,7 @@ def fit_table(
         raise KernelTableFitError("stretch: got no point beside the neutral one")
     order = np.argsort(r)
     r, a, s, w, low, high = r[order], a[order], s[order], w[order], low[order], high[order]
-    fits: dict[int, tuple[Floats, float]] = {}
+    fits: dict[int, tuple[Float64Array, float]] = {}
     criterion = {}
     n = r.size
     for segments in range(1, max_segments + 1):
@@ -193,7 +192,7 @@ def fit_table(
     )
 
 
-def _design(r: Floats, breaks: Floats) -> Floats:
+def _design(r: Float64Array, breaks: Float64Array) -> Float64Array:
     """Return how much of the way from 1 to r lies on each line, signed: alpha = design @ slopes."""
     edges = np.concatenate([[-np.inf], breaks, [np.inf]])
     low, high = np.minimum(r, 1.0)[:, None], np.maximum(r, 1.0)[:, None]
@@ -201,7 +200,7 @@ def _design(r: Floats, breaks: Floats) -> Floats:
     return np.maximum(overlap, 0.0) * np.sign(r - 1.0)[:, None]
 
 
-def _lines(slopes: Floats, breaks: Floats) -> tuple[tuple[float, float], ...]:
+def _lines(slopes: Float64Array, breaks: Float64Array) -> tuple[tuple[float, float], ...]:
     """Return (slope, intercept) of each line."""
     values = _design(breaks, breaks) @ slopes if breaks.size else np.zeros(0)
     lines = []
@@ -219,15 +218,15 @@ def _lines(slopes: Floats, breaks: Floats) -> tuple[tuple[float, float], ...]:
 
 
 def _fit_slopes(
-    r: Floats, a: Floats, w: Floats, breaks: Floats
-) -> tuple[Floats, NDArray[np.bool_], float]:
+    r: Float64Array, a: Float64Array, w: Float64Array, breaks: Float64Array
+) -> tuple[Float64Array, BoolArray, float]:
     """Return slopes of least squares, which points inform them, and the sum of squares.
 
     A point on a limit where the lines go beyond it is met exactly, and says nothing more.
     """
     X, root = _design(r, breaks), np.sqrt(w)
     used = np.ones(r.size, bool)
-    best: tuple[Floats, NDArray[np.bool_], float] | None = None
+    best: tuple[Float64Array, BoolArray, float] | None = None
     for _ in range(8):
         solved = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
         slopes = np.asarray(solved, np.float64)
@@ -244,11 +243,11 @@ def _fit_slopes(
 
 
 def _fit_alpha(
-    r: Floats, a: Floats, w: Floats, segments: int, least_points: int
-) -> tuple[Floats, float] | None:
+    r: Float64Array, a: Float64Array, w: Float64Array, segments: int, least_points: int
+) -> tuple[Float64Array, float] | None:
     """Return slopes, then breaks, of least squares, and the sum of squares; None without room."""
 
-    def tried(breaks: Floats) -> tuple[float, Floats]:
+    def tried(breaks: Float64Array) -> tuple[float, Float64Array]:
         if (np.diff(breaks) <= 0).any():
             return math.inf, breaks
         slopes, informing, rss = _fit_slopes(r, a, w, breaks)
@@ -279,8 +278,13 @@ def _fit_alpha(
 
 
 def _alpha_covariance(
-    r: Floats, a: Floats, w: Floats, theta: Floats, segments: int, rss: float
-) -> Floats:
+    r: Float64Array,
+    a: Float64Array,
+    w: Float64Array,
+    theta: Float64Array,
+    segments: int,
+    rss: float,
+) -> Float64Array:
     """Return the covariance of the slopes at these breaks; infinite where no point is left over."""
     slopes, informing, _ = _fit_slopes(r, a, w, theta[segments:])
     X = _design(r, theta[segments:])[informing]
@@ -291,7 +295,12 @@ def _alpha_covariance(
 
 
 def _break_stderr(
-    r: Floats, a: Floats, w: Floats, theta: Floats, segments: int, rss: float
+    r: Float64Array,
+    a: Float64Array,
+    w: Float64Array,
+    theta: Float64Array,
+    segments: int,
+    rss: float,
 ) -> tuple[float, ...]:
     """Return half of the ways that breaks can move until the misfit grows by one residual's."""
     free = r.size - theta.size
@@ -313,7 +322,7 @@ def _break_stderr(
 
 
 def _fit_sigma(
-    r: Floats, s: Floats, w: Floats
+    r: Float64Array, s: Float64Array, w: Float64Array
 ) -> tuple[tuple[float, float] | None, tuple[float, float], float, float]:
     """Return line, standard errors, covariance and weighted RMS residual of one branch, um.
 

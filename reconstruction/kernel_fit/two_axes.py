@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import FloatArray
 from reconstruction.kernel_fit.fit import fit_kernel
 from reconstruction.kernel_fit.neutral_relief import Axis, KernelFitError, convolved
 from reconstruction.kernel_fit.outcome import KernelFit
@@ -52,7 +52,7 @@ class TwoAxisFit:
 
 def fit_two_axes(
     neutral_height_um: ArrayLike,
-    target_histogram: NDArray[np.floating],
+    target_histogram: FloatArray,
     *,
     stretch: float,
     stretch_across: float,
@@ -106,9 +106,15 @@ def fit_two_axes(
                     neutral_height_um, *pair[1 - turn], axis=across, pixel_um=pixel_um, valid=valid
                 )
                 fit = fit_kernel(
-                    relief, target_histogram, stretch=ratios[0], stretch_across=ratios[1],
-                    axis=own, pixel_um=pixel_um, valid=valid, **settings,
-                )  # fmt: skip
+                    relief,
+                    target_histogram,
+                    stretch=ratios[0],
+                    stretch_across=ratios[1],
+                    axis=own,
+                    pixel_um=pixel_um,
+                    valid=valid,
+                    **settings,
+                )
                 pair[turn] = fit.alpha, fit.sigma_um
                 fits.append(fit)
         found.append(TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, pair == before))

@@ -10,12 +10,4 @@ from reconstruction.lumitexels.samples import (
 )
 from reconstruction.lumitexels.store import gather
 
-__all__ = [
-    "Camera",
-    "Lights",
-    "Lumitexels",
-    "Surface",
-    "Visibility",
-    "gather",
-    "visibility",
-]
+__all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "gather", "visibility"]

@@ -7,22 +7,15 @@ arrays of millions of samples where one is enough.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from model.fresnel import ETA_SKIN
+from reconstruction.arrays import Float64Array, FloatArray
 
-Double = NDArray[np.float64]
 
-
-def transmitted(
-    cos_light: NDArray[np.floating[Any]],
-    cos_view: NDArray[np.floating[Any]],
-    eta: float = ETA_SKIN,
-) -> Double:
+def transmitted(cos_light: FloatArray, cos_view: FloatArray, eta: float = ETA_SKIN) -> Float64Array:
     """Return F_t(light) F_t(view) of a smooth boundary.
 
     Parameters

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 
 RAYS_PER_CALL: Final = 1 << 20
 """Rays traced in one call; bounds the memory that a batch takes."""
@@ -57,7 +57,7 @@ class RayCaster:
 
     def first_hit(
         self, origins_mm: ArrayLike, directions: ArrayLike
-    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    ) -> tuple[Int32Array, Float32Array]:
         """Return the triangle that each ray meets first, and how far away.
 
         Parameters
@@ -84,7 +84,7 @@ class RayCaster:
 
     def blocked(
         self, origins_mm: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
-    ) -> NDArray[np.bool_]:
+    ) -> BoolArray:
         """Return which rays meet a triangle before their end.
 
         Parameters
@@ -106,7 +106,7 @@ class RayCaster:
         return out
 
 
-def _pair(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
+def _pair(origins: ArrayLike, directions: ArrayLike) -> tuple[FloatArray, FloatArray]:
     start = np.ascontiguousarray(origins, np.float32)
     way = np.ascontiguousarray(directions, np.float32)
     if start.shape != way.shape or start.ndim != 2 or start.shape[1] != 3:

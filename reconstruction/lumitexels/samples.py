@@ -12,34 +12,25 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
-
-Floats = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 MIN_COSINE: Final = 0.1
 """A point seen or lit at a flatter angle gives no sample: 84 degrees."""
 OFFSET_MM: Final = 0.1
 """Shadow rays start so far above the surface."""
 
-__all__ = [
-    "Camera",
-    "Lights",
-    "Lumitexels",
-    "Surface",
-    "Visibility",
-    "visibility",
-]
+__all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "visibility"]
 
 
 class Camera(Protocol):
     """What is needed of a calibrated camera."""
 
     @property
-    def center_mm(self) -> NDArray[np.float64]:
+    def center_mm(self) -> Float64Array:
         """Centre of projection, shape (3,), mm."""
 
-    def project(self, points_mm: ArrayLike) -> NDArray[np.float64]:
+    def project(self, points_mm: ArrayLike) -> Float64Array:
         """Return columns and rows, shape (N, 2), px; NaN behind the camera."""
 
 
@@ -47,10 +38,10 @@ class Lights(Protocol):
     """What is needed of calibrated lights."""
 
     @property
-    def position_mm(self) -> NDArray[np.float64]:
+    def position_mm(self) -> Float64Array:
         """Positions, shape (L, 3), mm."""
 
-    def irradiance(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def irradiance(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return unit directions to the lights and the signal of a white that faces them.
 
         Both of shape (L, P, 3); the second is the irradiance across the direction over pi, in the
@@ -62,9 +53,9 @@ class Lights(Protocol):
 class Surface:
     """Points that samples are gathered for."""
 
-    points_mm: NDArray[np.float32]
+    points_mm: Float32Array
     """Shape (P, 3), rig frame, mm."""
-    normals: NDArray[np.float32]
+    normals: Float32Array
     """Unit, outward, shape (P, 3)."""
 
     def __post_init__(self) -> None:
@@ -92,24 +83,24 @@ class Surface:
 class Lumitexels:
     """Samples of P points; M = views x lights, the lights of a view together."""
 
-    f: NDArray[np.float32]
+    f: Float32Array
     """BRDF samples, shape (P, M, 3), 1/sr: radiance / (normal irradiance cos theta); 0 where not
     valid."""
-    variance: NDArray[np.float32]
+    variance: Float32Array
     """Of `f`, shape (P, M, 3), 1/sr^2; infinite where not valid."""
-    light_dir: NDArray[np.float32]
+    light_dir: Float32Array
     """Unit vectors from point to light, shape (P, M, 3), in the frame of the points."""
-    view_dir: NDArray[np.float32]
+    view_dir: Float32Array
     """Unit vectors from point to camera, shape (P, M, 3)."""
-    cos_light: NDArray[np.float32]
+    cos_light: Float32Array
     """Cosine between the surface's normal and `light_dir`, shape (P, M)."""
-    cos_view: NDArray[np.float32]
+    cos_view: Float32Array
     """Cosine between the surface's normal and `view_dir`, shape (P, M)."""
-    light: NDArray[np.int32]
+    light: Int32Array
     """Index of the light of each sample, shape (M,)."""
-    view: NDArray[np.int32]
+    view: Int32Array
     """Index of the view of each sample, shape (M,)."""
-    valid: Bools
+    valid: BoolArray
     """Samples that count, shape (P, M)."""
 
     @property
@@ -122,9 +113,9 @@ class Lumitexels:
 class Visibility:
     """Which points face, and are not hidden from, each light and each camera."""
 
-    light: Bools
+    light: BoolArray
     """Shape (L, P)."""
-    view: Bools
+    view: BoolArray
     """Shape (V, P)."""
 
 
@@ -155,7 +146,7 @@ def visibility(
         Least cosine to the normal.
     """
 
-    def seen(target: Floats) -> Bools:
+    def seen(target: FloatArray) -> BoolArray:
         way = target - surface.points_mm
         length = np.linalg.norm(way, axis=1, keepdims=True)
         way /= length
@@ -175,7 +166,7 @@ def visibility(
     return Visibility(np.array(light) if light else none, np.array(view) if view else none)
 
 
-def _rim(center: Floats, radius: float) -> list[Floats]:
+def _rim(center: FloatArray, radius: float) -> list[FloatArray]:
     """Return four points of the rim of a disc that faces the origin."""
     axis = center / np.linalg.norm(center)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

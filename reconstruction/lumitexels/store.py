@@ -17,13 +17,12 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
     MIN_COSINE,
     OFFSET_MM,
-    Bools,
     Camera,
-    Floats,
     Lights,
     Lumitexels,
     Surface,
@@ -34,7 +33,7 @@ SAMPLE_BYTES: Final = 57
 """Of one sample of `Lumitexels`."""
 KEPT_BYTES: Final = 2**28
 """Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
-Image = tuple[Floats, Floats, Bools | None]
+Image = tuple[FloatArray, FloatArray, BoolArray | None]
 """Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
 
 
@@ -107,7 +106,7 @@ class LumitexelStore:
         """Number of cameras."""
         return len(self._cameras)
 
-    def seen_by(self, view: int) -> NDArray[np.int32]:
+    def seen_by(self, view: int) -> Int32Array:
         """Return the indices of the points that a camera sees."""
         return self._rows[view]
 
@@ -115,11 +114,11 @@ class LumitexelStore:
         self,
         view: int,
         light: int,
-        signal: Floats,
-        variance: Floats,
-        good: Bools | None = None,
+        signal: FloatArray,
+        variance: FloatArray,
+        good: BoolArray | None = None,
         *,
-        response: Callable[[Floats], Floats] | None = None,
+        response: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         """Take what one image shows of the points.
 
@@ -195,7 +194,7 @@ class LumitexelStore:
         cosines = np.empty((2, count, views, lights), np.float32)
         valid = np.zeros((count, views, lights), np.bool_)
         lit = np.unpackbits(self._lit[:, start:stop], axis=0, bitorder="little", count=lights)
-        geometry: tuple[Floats, Floats] | None = None
+        geometry: tuple[FloatArray, FloatArray] | None = None
         for view in range(views):
             if geometry is None or self._differs_by_view():
                 geometry = self._light_geometry(view, points)
@@ -225,13 +224,13 @@ class LumitexelStore:
             valid.reshape(count, samples),
         )
 
-    def _pose(self, view: int, light: int) -> NDArray[np.float64] | None:
+    def _pose(self, view: int, light: int) -> Float64Array | None:
         return None if self._poses is None else self._poses[view, light]
 
     def _differs_by_view(self) -> bool:
         return self._poses is not None and bool((self._poses != self._poses[:1]).any())
 
-    def _light_geometry(self, view: int, points: Floats) -> tuple[Floats, Floats]:
+    def _light_geometry(self, view: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return directions and irradiance, shape (L, P, 3) each, in the frame of the points."""
         lights = self._lights if self._poses is None else _moved(self._lights, self._poses[view])
         direction, white = lights.irradiance(points)
@@ -240,7 +239,7 @@ class LumitexelStore:
             np.ascontiguousarray(white, np.float32),
         )
 
-    def _view_geometry(self, view: int, points: Floats) -> NDArray[np.float32]:
+    def _view_geometry(self, view: int, points: FloatArray) -> Float32Array:
         """Return unit vectors to the camera, shape (1 or L, P, 3), in the frame of the points."""
         center = self._cameras[view].center_mm[None]
         if self._poses is not None:
@@ -263,7 +262,7 @@ def _table(
     return table
 
 
-def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> NDArray[np.float64] | None:
+def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> Float64Array | None:
     if poses is None:
         return None
     given = np.asarray(poses, np.float64)
@@ -281,12 +280,12 @@ def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> NDArray[
     return given
 
 
-def _back(poses: NDArray[np.float64], point: Floats) -> NDArray[np.float64]:
+def _back(poses: Float64Array, point: FloatArray) -> Float64Array:
     """Return where a fixed point of the rig lies for the subject, shape (L, 3)."""
     return np.asarray(np.einsum("lji,lj->li", poses[:, :3, :3], point - poses[:, :3, 3]))
 
 
-def _moved(lights: Lights, poses: NDArray[np.float64]) -> Lights:
+def _moved(lights: Lights, poses: Float64Array) -> Lights:
     """Return the lights as they stand for the subject in each one's own frame."""
     names = getattr(lights, "__dataclass_fields__", {})
     if "position_mm" not in names:

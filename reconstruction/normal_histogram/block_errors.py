@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-Floats = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """Lengths over which blocks are alike, in sides of a block; of eight blocks across a map. Fields
@@ -26,7 +25,9 @@ LEAST_BLOCKS = 5
 """Fewer tell neither how they scatter nor how they are alike."""
 
 
-def stderr_of_mean(values: Floats, sizes: Floats, places: Floats) -> tuple[float, float]:
+def stderr_of_mean(
+    values: Float64Array, sizes: Float64Array, places: Float64Array
+) -> tuple[float, float]:
     """Return the standard error of the mean of all samples, and what it is of that of independents.
 
     Parameters

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Float64Array, FloatArray, Int64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.block_errors import stderr_of_mean
 from reconstruction.normal_histogram.counting import HistogramError, check_buckets
 from reconstruction.normal_histogram.relief_slopes import slopes, turned
-
-Floats = NDArray[np.float64]
 
 BLOCKS = 8
 """A map is cut into so many blocks a side."""
@@ -27,9 +26,7 @@ def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
     return max(1, min(blocks, shape[0] // 4)), max(1, min(blocks, shape[1] // 4))
 
 
-def block_of(
-    places: NDArray[np.int64], shape: tuple[int, int], blocks: int
-) -> tuple[NDArray[np.int64], int]:
+def block_of(places: Int64Array, shape: tuple[int, int], blocks: int) -> tuple[Int64Array, int]:
     """Return the block of pixels ``y * W + x``, and how many blocks there are.
 
     A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
@@ -41,7 +38,7 @@ def block_of(
 
 def block_counts(
     height: ArrayLike,
-    block: NDArray[np.int64],
+    block: Int64Array,
     blocks: int,
     *,
     pixel: float | tuple[float, float],
@@ -50,7 +47,7 @@ def block_counts(
     y_up: bool = True,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
-) -> NDArray[np.int64]:
+) -> Int64Array:
     """Count a relief's normals by blocks of any shape, as of another map of the same skin.
 
     Parameters
@@ -86,7 +83,7 @@ def block_counts(
     return np.asarray(counts[:, :-1], np.int64).reshape(blocks, bins, bins)
 
 
-def residuals_of(counts: Floats) -> Floats:
+def residuals_of(counts: Float64Array) -> Float64Array:
     """Return what each block adds to the error of the shares that all have in common.
 
     Parameters
@@ -110,7 +107,7 @@ def residuals_of(counts: Floats) -> Floats:
     return np.asarray((counts - sizes[:, None] * common) / sizes.sum())
 
 
-def effective_number(counts: Floats, samples: int) -> float:
+def effective_number(counts: Float64Array, samples: int) -> float:
     """Return how many independent samples would make blocks differ as much as they do.
 
     Parameters
@@ -141,11 +138,7 @@ def effective_number(counts: Floats, samples: int) -> float:
 
 
 def block_error(
-    values: NDArray[np.floating],
-    group: NDArray[np.int64],
-    groups: int,
-    shape: tuple[int, int],
-    blocks: int,
+    values: FloatArray, group: Int64Array, groups: int, shape: tuple[int, int], blocks: int
 ) -> tuple[float, float]:
     """Return the standard error of a mean of samples of a map, by its blocks.
 

@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ive
 
+from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.relief_slopes import (
     SlopeError,
@@ -25,8 +26,6 @@ from reconstruction.normal_histogram.relief_slopes import (
     turned,
 )
 
-Floats = NDArray[np.float64]
-
 
 class HistogramError(SlopeError):
     """Normals, shares or settings that no histogram can be made of."""
@@ -34,7 +33,7 @@ class HistogramError(SlopeError):
 
 def bucket_counts(
     slope_x: ArrayLike, slope_y: ArrayLike, *, bins: int = 64, limit: float = 1.0
-) -> tuple[NDArray[np.int64], int]:
+) -> tuple[Int64Array, int]:
     """Count the normals of slopes in buckets.
 
     Parameters
@@ -86,7 +85,7 @@ def histogram(
     y_up: bool = True,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
-) -> Floats:
+) -> Float64Array:
     """Return the share of a relief's normals in each bucket of (n_y, n_x).
 
     Parameters
@@ -139,7 +138,7 @@ def from_slopes(
     bins: int = 64,
     limit: float = 1.0,
     angle_rad: float = 0.0,
-) -> Floats:
+) -> Float64Array:
     """Return the histogram of normals given as slopes dh/dx, dh/dy; see :func:`histogram`."""
     given = np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64)
     if not (np.isfinite(given[0]).all() and np.isfinite(given[1]).all()):
@@ -156,7 +155,7 @@ def from_normals(
     limit: float = 1.0,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
-) -> Floats:
+) -> Float64Array:
     """Return the histogram of normals, shape (..., 3), z > 0, unit or not; see :func:`histogram`.
 
     Normals that are not finite or do not face z count as not valid.
@@ -165,7 +164,7 @@ def from_normals(
     return from_slopes(a[known], b[known], bins=bins, limit=limit, angle_rad=angle_rad)
 
 
-def shares_of(counts: NDArray[np.int64]) -> Floats:
+def shares_of(counts: Int64Array) -> Float64Array:
     """Return counts over their sum, of at least one sample."""
     total = int(counts.sum())
     if total == 0:

@@ -10,19 +10,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.normal_histogram import kernels
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 class SlopeError(ValueError):
     """A relief, normals or settings that no slopes can be taken of."""
 
 
-def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> NDArray[np.uint8]:
+def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
     """Return which neighbours each pixel's slopes are taken from.
 
     Parameters
@@ -60,7 +58,7 @@ def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> NDArray[np.uin
     return code
 
 
-def _map_of(height: ArrayLike) -> NDArray[np.floating]:
+def _map_of(height: ArrayLike) -> FloatArray:
     """Return heights as an array of real numbers (H, W)."""
     try:
         given = np.asarray(height)
@@ -74,7 +72,7 @@ def _map_of(height: ArrayLike) -> NDArray[np.floating]:
     return given
 
 
-def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> Bools:
+def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     """Return a mask as an array; one that is not given holds everywhere."""
     if valid is None:
         return np.ones(shape, bool)
@@ -109,7 +107,7 @@ def slopes(
     pixel: float | tuple[float, float],
     y_up: bool = True,
     valid: ArrayLike | None = None,
-) -> tuple[Floats, Floats, Bools]:
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the slopes of a relief, by differences over two pixels or, at edges, one.
 
     Parameters
@@ -150,7 +148,7 @@ def slopes(
 
 def slopes_of_normals(
     normals: ArrayLike, *, valid: ArrayLike | None = None
-) -> tuple[Floats, Floats, Bools]:
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the slopes of the surface that has these normals.
 
     Parameters
@@ -188,9 +186,7 @@ def slopes_of_normals(
     return a, b, known
 
 
-def turned(
-    a: NDArray[np.floating], b: NDArray[np.floating], angle_rad: float
-) -> tuple[Floats, Floats]:
+def turned(a: FloatArray, b: FloatArray, angle_rad: float) -> tuple[Float64Array, Float64Array]:
     """Return the components of plane vectors, such as slopes, along turned axes.
 
     Parameters

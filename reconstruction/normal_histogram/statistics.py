@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.blocks import BLOCKS, block_error, block_of, effective_number
 from reconstruction.normal_histogram.counting import check_buckets, shares_of
@@ -21,9 +22,6 @@ from reconstruction.normal_histogram.relief_slopes import (
     slopes_of_normals,
     turned,
 )
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SAMPLES_PER_BUCKET = 16.0
 """Mean number of samples in an occupied bucket below which a histogram is called aliased: its
@@ -57,7 +55,7 @@ class NormalStatistics:
         show (`reconstruction.normal_histogram.block_errors`); infinite below five blocks.
     """
 
-    histogram: Floats
+    histogram: Float64Array
     samples: int
     outside: int
     effective_samples: float
@@ -147,7 +145,7 @@ def measure_normals(
 
 
 def _measured(
-    a: Floats, b: Floats, known: Bools, bins: int, limit: float, blocks: int
+    a: Float64Array, b: Float64Array, known: BoolArray, bins: int, limit: float, blocks: int
 ) -> NormalStatistics:
     group, groups = block_of(np.flatnonzero(known), (known.shape[0], known.shape[1]), blocks)
     p, q = a[known], b[known]

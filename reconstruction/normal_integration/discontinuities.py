@@ -14,17 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.integration import parts, to_height
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
 from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
 from reconstruction.normal_maps import NormalMaps
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Floating = NDArray[np.floating]
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -137,21 +134,21 @@ class BrokenHeight:
         Whether the energy stopped changing.
     """
 
-    height: Floating
-    valid: NDArray[np.bool_]
-    part: NDArray[np.int32]
-    right: Float32
-    below: Float32
+    height: FloatArray
+    valid: BoolArray
+    part: Int32Array
+    right: Float32Array
+    below: Float32Array
     energy: float
     rounds: int
     settled: bool
 
 
 def integrate_broken(
-    normals: Floating | NormalMaps,
+    normals: FloatArray | NormalMaps,
     *,
     pixel: float = 1.0,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
@@ -205,9 +202,7 @@ def integrate_broken(
     before, settled, done = np.inf, False, 0
     while True:
         _side_weights(x, ex, ey, slopes.facing, float(chosen.sharpness), wx, wy)
-        _one_sided(
-            slopes.gx, slopes.gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, by_row
-        )  # fmt: skip
+        _one_sided(slopes.gx, slopes.gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, by_row)
         energy = float(by_row.sum())
         settled = abs(before - energy) <= chosen.stop * before if before < np.inf else energy == 0.0
         if settled or done >= chosen.rounds:
@@ -219,11 +214,17 @@ def integrate_broken(
     height = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera)
     return BrokenHeight(
         height.astype(np.float32) if kind == np.float32 else height,
-        slopes.valid, part, wx[1:-1, 1:-1].copy(), wy[1:-1, 1:-1].copy(), energy, done, settled,
-    )  # fmt: skip
+        slopes.valid,
+        part,
+        wx[1:-1, 1:-1].copy(),
+        wy[1:-1, 1:-1].copy(),
+        energy,
+        done,
+        settled,
+    )
 
 
-def _confidence(slopes: SlopeField) -> tuple[Float32, Float32]:
+def _confidence(slopes: SlopeField) -> tuple[Float32Array, Float32Array]:
     """Return what each slope counts: n_z^2 as in the paper, or the inverse of its variance."""
     if slopes.variance_x.shape == slopes.gx.shape and slopes.scale > 0.0:
         return 1.0 / slopes.variance_x, 1.0 / slopes.variance_y

@@ -7,9 +7,10 @@ most of it is long waves, which `height_filters.high_pass` removes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import SIGMA_OF_CUTOFF, high_pass
 from reconstruction.normal_integration.integration import parts, to_height
@@ -17,26 +18,23 @@ from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
 from reconstruction.normal_maps import NormalMaps
 
-Floats = NDArray[np.float64]
-Floating = NDArray[np.floating]
-
 _STEP = 1e-3  # of the difference quotient, in standard errors
 _TOLERANCE = 1e-3
 
 
 def sampled_stderr(
-    normals: Floating | NormalMaps,
+    normals: FloatArray | NormalMaps,
     *,
     rng: np.random.Generator,
     stderr_rad: ArrayLike | None = None,
     pixel: float = 1.0,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
     cutoff: float | None = None,
     samples: int = 16,
     smooth_px: float = 6.0,
-) -> Floats:
+) -> Float64Array:
     """Return the standard error of the height that `normal_integration.integrate` gives.
 
     Parameters
@@ -99,7 +97,7 @@ def sampled_stderr(
         _, _, ex, ey = slope_fields.edges(moved)
         x = np.zeros(ex.shape)
         solve(hierarchy, (ex - dx) / _STEP, (ey - dy) / _STEP, x, tolerance=_TOLERANCE)
-        error: Floating = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera) - flat
+        error: FloatArray = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera) - flat
         if cutoff is not None:
             error = high_pass(error, pixel=pixel, cutoff=cutoff, valid=base.valid)
         total += error**2
@@ -107,7 +105,7 @@ def sampled_stderr(
     return np.where(base.valid, np.sqrt(variance), 0.0)
 
 
-def _smoothed(values: Floats, valid: NDArray[np.bool_], sigma: float) -> Floats:
+def _smoothed(values: Float64Array, valid: BoolArray, sigma: float) -> Float64Array:
     if sigma <= 0.0:
         return values
     weight = ndimage.gaussian_filter(valid.astype(float), sigma, mode="constant")

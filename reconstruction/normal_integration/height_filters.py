@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_integration.slope_fields import SlopeField
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
-
-Floating = NDArray[np.floating]
 
 SIGMA_OF_CUTOFF = float(np.sqrt(np.log(2.0) / 2.0) / np.pi)
 """Standard deviation of the Gaussian over the wavelength it halves (ISO 16610-21: 0.18739)."""
@@ -20,12 +18,8 @@ _REACH = 4.0  # standard deviations at which the Gaussian ends
 
 
 def high_pass(
-    height: Floating,
-    *,
-    pixel: float,
-    cutoff: float,
-    valid: NDArray[np.bool_] | None = None,
-) -> Floating:
+    height: FloatArray, *, pixel: float, cutoff: float, valid: BoolArray | None = None
+) -> FloatArray:
     """Remove form and bulge: what is longer than `cutoff`.
 
     Subtracts at each pixel the plane fitted to its surroundings with Gaussian weights, over valid
@@ -87,19 +81,21 @@ def high_pass(
     return out
 
 
-def _without_planes(values: Floating, inside: NDArray[np.bool_], sigma: float) -> Floating:
+def _without_planes(values: FloatArray, inside: BoolArray, sigma: float) -> FloatArray:
     reach = max(1, int(np.ceil(_REACH * sigma)))
     shape = values.shape
     kind = values.dtype
     size = [fft.next_fast_len(n + min(reach, n), real=True) for n in shape]
     moments = [_moments(n, min(reach, m - 1), sigma) for n, m in zip(size, shape, strict=True)]
-    y = [np.fft.fft(k).conj().astype(np.complex64 if kind == np.float32 else complex)
-         for k in moments[0]]  # fmt: skip
+    y = [
+        np.fft.fft(k).conj().astype(np.complex64 if kind == np.float32 else complex)
+        for k in moments[0]
+    ]
     x = [np.fft.rfft(k).conj().astype(y[0].dtype) for k in moments[1]]
 
     middle = values[inside].mean()  # so that digits are not lost on a constant
 
-    def averages(data: Floating, orders: list[tuple[int, int]]) -> list[Floating]:
+    def averages(data: FloatArray, orders: list[tuple[int, int]]) -> list[FloatArray]:
         waves = fft.rfft2(data, size, workers=2)
         return [
             fft.irfft2(waves * (y[b][:, None] * x[a][None, :]), size, workers=2)[
@@ -123,7 +119,7 @@ def _without_planes(values: Floating, inside: NDArray[np.bool_], sigma: float) -
     return out
 
 
-def _moments(size: int, reach: int, sigma: float) -> list[NDArray[np.float64]]:
+def _moments(size: int, reach: int, sigma: float) -> list[Float64Array]:
     """Return g, u g, u^2 g around 0 on a ring of `size`, u in standard deviations."""
     u = np.arange(-reach, reach + 1)
     g = np.exp(-0.5 * (u / sigma) ** 2)
@@ -212,9 +208,19 @@ def denoise_slopes(
     gx, gy = np.zeros_like(slopes.gx), np.zeros_like(slopes.gy)
     vx, vy = np.ones_like(slopes.variance_x), np.ones_like(slopes.variance_y)
     _denoise(
-        slopes.gx, slopes.gy, slopes.variance_x, slopes.variance_y, slopes.valid,
-        slopes.scale, strength, g, gx, gy, vx, vy,
-    )  # fmt: skip
+        slopes.gx,
+        slopes.gy,
+        slopes.variance_x,
+        slopes.variance_y,
+        slopes.valid,
+        slopes.scale,
+        strength,
+        g,
+        gx,
+        gy,
+        vx,
+        vy,
+    )
     return replace(slopes, gx=gx, gy=gy, variance_x=vx, variance_y=vy)
 
 

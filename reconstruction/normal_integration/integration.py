@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int32Array
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -27,12 +28,15 @@ from reconstruction.normal_integration.weighted_poisson import (
 from reconstruction.normal_maps import NormalMaps
 
 __all__ = [
-    "HeightMap", "IntegrationError", "NotConverged", "Perspective", "Settings", "integrate",
+    "HeightMap",
+    "IntegrationError",
+    "NotConverged",
+    "Perspective",
+    "Settings",
+    "integrate",
     "integrate_map",
-]  # fmt: skip
+]
 
-Floats = NDArray[np.float64]
-Floating = NDArray[np.floating]
 Method = Literal["auto", "multigrid", "dct"]
 
 
@@ -87,24 +91,24 @@ class HeightMap:
     convergence : Convergence
     """
 
-    height: Floating
-    valid: NDArray[np.bool_]
-    part: NDArray[np.int32]
+    height: FloatArray
+    valid: BoolArray
+    part: Int32Array
     convergence: Convergence
 
 
 def integrate(
-    normals: Floating | NormalMaps,
+    normals: FloatArray | NormalMaps,
     *,
     pixel: float = 1.0,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
     method: Method = "auto",
     denoise: float = 0.0,
     settings: Settings | None = None,
-) -> Floating:
+) -> FloatArray:
     """Return the height whose slopes fit those of the normals best.
 
     Parameters
@@ -171,14 +175,28 @@ def integrate(
             out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
             for at in np.ndindex(stack.shape[:-3]):
                 out[at] = integrate(
-                    stack[at], pixel=pixel, valid=masks(at), stderr_rad=errors(at), y_up=y_up,
-                    camera=camera, method=method, denoise=denoise, settings=settings,
-                )  # fmt: skip
+                    stack[at],
+                    pixel=pixel,
+                    valid=masks(at),
+                    stderr_rad=errors(at),
+                    y_up=y_up,
+                    camera=camera,
+                    method=method,
+                    denoise=denoise,
+                    settings=settings,
+                )
             return out
     found = integrate_map(
-        normals, pixel=pixel, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera,
-        method=method, denoise=denoise, settings=settings,
-    )  # fmt: skip
+        normals,
+        pixel=pixel,
+        valid=valid,
+        stderr_rad=stderr_rad,
+        y_up=y_up,
+        camera=camera,
+        method=method,
+        denoise=denoise,
+        settings=settings,
+    )
     if not found.convergence.converged:
         raise NotConverged(
             f"iterations: residual {found.convergence.residual:.1e} after "
@@ -204,10 +222,10 @@ def _for_each(
 
 
 def integrate_map(
-    normals: Floating | NormalMaps,
+    normals: FloatArray | NormalMaps,
     *,
     pixel: float = 1.0,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
@@ -254,22 +272,20 @@ def integrate_map(
     kind = np.asarray(normals.normals if isinstance(normals, NormalMaps) else normals).dtype
     height = to_height(relief, part, pixel=pixel, camera=camera)
     return HeightMap(
-        height.astype(np.float32) if kind == np.float32 else height,
-        slopes.valid, part, convergence,
-    )  # fmt: skip
+        height.astype(np.float32) if kind == np.float32 else height, slopes.valid, part, convergence
+    )
 
 
-def _by_multigrid(slopes: SlopeField, settings: Settings) -> tuple[Floats, Convergence]:
+def _by_multigrid(slopes: SlopeField, settings: Settings) -> tuple[Float64Array, Convergence]:
     ax, ay, dx, dy = slope_fields.edges(slopes, order=settings.order)
     x = np.zeros(dx.shape)
     convergence = solve(
-        Hierarchy(ax, ay), dx, dy, x,
-        tolerance=settings.tolerance, iterations=settings.iterations,
-    )  # fmt: skip
+        Hierarchy(ax, ay), dx, dy, x, tolerance=settings.tolerance, iterations=settings.iterations
+    )
     return x[1:-1, 1:-1], convergence
 
 
-def _by_cosines(slopes: SlopeField, settings: Settings) -> Floats:
+def _by_cosines(slopes: SlopeField, settings: Settings) -> Float64Array:
     """Solve the same equations on a full rectangle, whose eigenvectors are cosines."""
     _, _, dx, dy = slope_fields.edges(slopes, order=settings.order)
     b = dx[1:-1, :-2] - dx[1:-1, 1:-1] + dy[:-2, 1:-1] - dy[1:-1, 1:-1]
@@ -284,7 +300,7 @@ def _by_cosines(slopes: SlopeField, settings: Settings) -> Floats:
     return np.asarray(fft.idctn(waves, type=2, norm="ortho", workers=2, overwrite_x=True))
 
 
-def parts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
+def parts(valid: BoolArray) -> Int32Array:
     """Return the number of each pixel's connected part, from 1; 0 where not valid."""
     if valid.all():
         return np.ones(valid.shape, np.int32)
@@ -292,8 +308,8 @@ def parts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def to_height(
-    relief: Floats, part: NDArray[np.int32], *, pixel: float, camera: Perspective | None
-) -> Floats:
+    relief: Float64Array, part: Int32Array, *, pixel: float, camera: Perspective | None
+) -> Float64Array:
     """Return height from a solution in pixels: mean 0 over each part, 0 outside.
 
     Under perspective the solution is -f log(depth) with a free constant in each part.
@@ -306,13 +322,13 @@ def to_height(
     return _centered(away * (depth / _means(depth, part)[part]), part)
 
 
-def _means(values: Floats, part: NDArray[np.int32]) -> Floats:
+def _means(values: Float64Array, part: Int32Array) -> Float64Array:
     count = np.bincount(part.ravel())
     total = np.bincount(part.ravel(), weights=values.ravel())
     return np.asarray(total / np.maximum(count, 1))
 
 
-def _centered(values: Floats, part: NDArray[np.int32]) -> Floats:
+def _centered(values: Float64Array, part: Int32Array) -> Float64Array:
     if part[0, 0] == 1 and (part == 1).all():
         return np.asarray(values - values.mean())
     return np.asarray(np.where(part > 0, values - _means(values, part)[part], 0.0))

@@ -12,11 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Floats = NDArray[np.float64]
-Floating = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 MOST_GAIN = 4.0
 """Waves are raised by this factor at most: what the lens weakens more is as good as lost."""
@@ -81,7 +79,7 @@ class Aperture:
         working = f_number * (1.0 + magnification)
         return Aperture(wavelength_um * working / magnification, pixel_um)
 
-    def transfer(self, per_um_x: Floating, per_um_y: Floating) -> Floats:
+    def transfer(self, per_um_x: FloatArray, per_um_y: FloatArray) -> Float64Array:
         """Return the modulation transfer of lens and pixel (Goodman 2005, eq. (6-31)).
 
         Parameters
@@ -116,12 +114,12 @@ class Restored:
         What waves are multiplied by, on the grid of `scipy.fft.fftfreq`.
     """
 
-    normals: Floating
+    normals: FloatArray
     noise: float
     kept_noise: float
-    filter: Floats
+    filter: Float64Array
 
-    def noise_field(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    def noise_field(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
         """Draw the noise that is left in both slopes, each of shape (H, W)."""
         shape = self.normals.shape[:2]
         x, y = (filtered(self.noise * rng.standard_normal(shape), self.filter) for _ in range(2))
@@ -129,11 +127,7 @@ class Restored:
 
 
 def restore(
-    normals: Floating,
-    *,
-    lens: Aperture,
-    valid: NDArray[np.bool_],
-    smooth_px: float = 0.0,
+    normals: FloatArray, *, lens: Aperture, valid: BoolArray, smooth_px: float = 0.0
 ) -> Restored:
     """Undo the blur of the lens where waves stand above the noise.
 
@@ -200,11 +194,11 @@ def restore(
     return Restored(found.astype(normals.dtype), noise, kept, applied)
 
 
-def _padded(values: Floats) -> Floats:
+def _padded(values: Float64Array) -> Float64Array:
     return np.pad(values, PAD_PX, mode="symmetric")
 
 
-def filtered(values: Floats, transfer: Floats) -> Floats:
+def filtered(values: Float64Array, transfer: Float64Array) -> Float64Array:
     """Return values whose waves were multiplied by a transfer on a grid 64 pixels larger."""
     whole = fft.ifft2(fft.fft2(_padded(values), workers=-1) * transfer, workers=-1).real
     return whole[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]

@@ -12,18 +12,16 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
 HEIGHT: Final = 0.07
 """Error of a height over the standard deviation of the relief."""
 SLOPE: Final = 0.055
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
 
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
 
-
-def of_height(height: NDArray[np.floating], stderr: Float32, valid: Bools) -> Float32:
+def of_height(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
     """Return standard errors of a relief's heights by noise and model together.
 
     Parameters
@@ -53,7 +51,7 @@ def of_height(height: NDArray[np.floating], stderr: Float32, valid: Bools) -> Fl
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
 
 
-def of_normals(normals: NDArray[np.floating], stderr: Float32, valid: Bools) -> Float32:
+def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
     """Return standard errors of a relief's normals by noise and model together.
 
     Parameters

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 GRAZING = 0.02
 """Least cosine between normal and ray of a pixel that is used: 88.9 degrees."""
@@ -72,12 +70,12 @@ class SlopeField:
         Variance of angles that variances are to be multiplied by, rad^2; 0 where none is known.
     """
 
-    gx: Floats
-    gy: Floats
-    variance_x: Float32
-    variance_y: Float32
-    facing: Float32
-    valid: NDArray[np.bool_]
+    gx: Float64Array
+    gy: Float64Array
+    variance_x: Float32Array
+    variance_y: Float32Array
+    facing: Float32Array
+    valid: BoolArray
     scale: float
 
 
@@ -118,9 +116,9 @@ def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid): 
 
 
 def from_normals(
-    normals: NDArray[np.floating] | NormalMaps,
+    normals: FloatArray | NormalMaps,
     *,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
@@ -158,10 +156,19 @@ def from_normals(
     vx, vy = np.ones(small, np.float32), np.ones(small, np.float32)
     cx, cy = camera.center_px if camera else (0.0, 0.0)
     _slopes(
-        n, np.ones((1, 1), np.float32) if relative is None else relative, float(cx), float(cy),
-        1.0 / camera.focal_px if camera else 0.0, 1.0 if y_up else -1.0,
-        gx, gy, vx, vy, facing, good,
-    )  # fmt: skip
+        n,
+        np.ones((1, 1), np.float32) if relative is None else relative,
+        float(cx),
+        float(cy),
+        1.0 / camera.focal_px if camera else 0.0,
+        1.0 if y_up else -1.0,
+        gx,
+        gy,
+        vx,
+        vy,
+        facing,
+        good,
+    )
     if not good.any():
         raise IntegrationError(
             f"valid: got no pixel with a normal that faces the camera among {shape[0]} x {shape[1]}"
@@ -170,8 +177,8 @@ def from_normals(
 
 
 def _relative_variance(
-    stderr_rad: ArrayLike | None, good: NDArray[np.bool_]
-) -> tuple[Float32 | None, float]:
+    stderr_rad: ArrayLike | None, good: BoolArray
+) -> tuple[Float32Array | None, float]:
     """Return the variance of angles over their median, within bounds, and that median."""
     if stderr_rad is None:
         return None, 0.0
@@ -224,9 +231,13 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
                     after = after and vx[i, j + 2] < _APART * v
                 ax[i + 1, j + 1] = np.float32(2.0) / v
                 dx[i + 1, j + 1] = _difference(
-                    gx[i, j - 1] if before else 0.0, gx[i, j], gx[i, j + 1],
-                    gx[i, j + 2] if after else 0.0, before, after,
-                )  # fmt: skip
+                    gx[i, j - 1] if before else 0.0,
+                    gx[i, j],
+                    gx[i, j + 1],
+                    gx[i, j + 2] if after else 0.0,
+                    before,
+                    after,
+                )
             if i + 1 < rows and valid[i + 1, j]:
                 v = vy[i, j] + vy[i + 1, j] if weighted else np.float32(2.0)
                 before = smooth and i > 0 and valid[i - 1, j]
@@ -236,12 +247,18 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
                     after = after and vy[i + 2, j] < _APART * v
                 ay[i + 1, j + 1] = np.float32(2.0) / v
                 dy[i + 1, j + 1] = _difference(
-                    gy[i - 1, j] if before else 0.0, gy[i, j], gy[i + 1, j],
-                    gy[i + 2, j] if after else 0.0, before, after,
-                )  # fmt: skip
+                    gy[i - 1, j] if before else 0.0,
+                    gy[i, j],
+                    gy[i + 1, j],
+                    gy[i + 2, j] if after else 0.0,
+                    before,
+                    after,
+                )
 
 
-def edges(field: SlopeField, *, order: int = 4) -> tuple[Float32, Float32, Floats, Floats]:
+def edges(
+    field: SlopeField, *, order: int = 4
+) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array]:
     """Return weights and wanted differences of the edges between pixels.
 
     Parameters
@@ -261,7 +278,15 @@ def edges(field: SlopeField, *, order: int = 4) -> tuple[Float32, Float32, Float
     ax, ay = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     dx, dy = np.zeros(shape), np.zeros(shape)
     _edges(
-        field.gx, field.gy, field.variance_x, field.variance_y, field.valid, order == 4,
-        ax, ay, dx, dy,
-    )  # fmt: skip
+        field.gx,
+        field.gy,
+        field.variance_x,
+        field.variance_y,
+        field.valid,
+        order == 4,
+        ax,
+        ay,
+        dx,
+        dy,
+    )
     return ax, ay, dx, dy

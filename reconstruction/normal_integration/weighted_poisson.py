@@ -11,13 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.normal_integration import multigrid_coarsening as coarsening
 from reconstruction.normal_integration import multigrid_kernels as kernels
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 COARSEST = 6
 """Nodes a side at which a grid is not made coarser any more."""
@@ -46,11 +43,11 @@ class Convergence:
 
 @dataclass(frozen=True, slots=True)
 class _Level:
-    A: Float32
+    A: Float32Array
     """Planes of `integration_kernels`; of the finest level (3, ...): edges, one over diagonal."""
-    P: Float32
-    b: Float32
-    x: Float32
+    P: Float32Array
+    b: Float32Array
+    x: Float32Array
 
 
 class Hierarchy:
@@ -63,7 +60,7 @@ class Hierarchy:
         stands at [1, 1]. Edges that would leave the picture have weight 0.
     """
 
-    def __init__(self, ax: Float32, ay: Float32) -> None:
+    def __init__(self, ax: Float32Array, ay: Float32Array) -> None:
         inverse = np.zeros_like(ax)
         coarsening.invert_diagonal(ax, ay, inverse)
         self.ax, self.ay, self.inverse = ax, ay, inverse
@@ -85,7 +82,7 @@ class Hierarchy:
             e, s, se, sw, inv = A
             diagonals = True
 
-    def cycle(self, b: Float32, x: Float32) -> None:
+    def cycle(self, b: Float32Array, x: Float32Array) -> None:
         """Write x, about A^-1 b: one V cycle, symmetric in the sense that CG needs."""
         ax, ay, inverse = self.ax, self.ay, self.inverse
         kernels.smooth_from_zero(ax, ay, inverse, b, x)
@@ -132,9 +129,9 @@ class Hierarchy:
 
 def solve(
     hierarchy: Hierarchy,
-    dx: Floats,
-    dy: Floats,
-    x: Floats,
+    dx: Float64Array,
+    dy: Float64Array,
+    x: Float64Array,
     *,
     tolerance: float = 1e-5,
     iterations: int = 200,

@@ -17,17 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
 from reconstruction.photometric_stereo.refinement import refine
 from reconstruction.tiles import map_tiles
 
 __all__ = [
-    "NormalMaps", "PhotometricStereoError", "Robustness", "estimate_normals", "refine",
+    "NormalMaps",
+    "PhotometricStereoError",
+    "Robustness",
+    "estimate_normals",
+    "refine",
     "require_spread",
-]  # fmt: skip
+]
 
-Floating = NDArray[np.floating]
 
 TILE_POINTS = 8192
 LEAST_SHARE = 0.5
@@ -90,14 +94,14 @@ class Robustness:
 
 
 def estimate_normals(
-    intensity_nhw: Floating,
+    intensity_nhw: FloatArray,
     light_directions_n3: ArrayLike,
     *,
     light_positions_mm: ArrayLike | None = None,
     points_mm: ArrayLike | None = None,
     light_intensity: ArrayLike | None = None,
     variance: ArrayLike | None = None,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     robust: bool = True,
     robustness: Robustness | None = None,
     executor: Executor | None = None,
@@ -190,12 +194,24 @@ def estimate_normals(
     chosen = robustness or Robustness()
     settings = np.array(
         [
-            chosen.shadow, chosen.grazing, chosen.tuning, 1e-3,
-            1e-6 if kind is np.float32 else 1e-13, 0.01, 1e-5, 1 / 8, 3.0, 1.5, LEAST_SHARE,
-            chosen.few, TIGHT, CLEAR, LOOSE,
+            chosen.shadow,
+            chosen.grazing,
+            chosen.tuning,
+            1e-3,
+            1e-6 if kind is np.float32 else 1e-13,
+            0.01,
+            1e-5,
+            1 / 8,
+            3.0,
+            1.5,
+            LEAST_SHARE,
+            chosen.few,
+            TIGHT,
+            CLEAR,
+            LOOSE,
         ],
         kind,
-    )  # fmt: skip
+    )
     count = int(np.prod(shape))
     flat = samples.reshape(lights, count)
     out = np.empty((count, kernels.ROWS), kind)
@@ -209,11 +225,22 @@ def estimate_normals(
     def solve(span: slice) -> None:
         each = per_point[:, span] if way == kernels.PER_POINT else per_point
         fit_points(
-            *(_of_kind(array[:, span], kind) for array in (flat, noise)), mask[:, span],
-            _of_kind(strength[:, span], kind), shared, _of_kind(each, kind), positions,
-            points[span] if way == kernels.NEAR else points, way, robust, variance is not None,
-            chosen.l1_iterations, chosen.iterations, settings, out[span], good[span],
-        )  # fmt: skip
+            *(_of_kind(array[:, span], kind) for array in (flat, noise)),
+            mask[:, span],
+            _of_kind(strength[:, span], kind),
+            shared,
+            _of_kind(each, kind),
+            positions,
+            points[span] if way == kernels.NEAR else points,
+            way,
+            robust,
+            variance is not None,
+            chosen.l1_iterations,
+            chosen.iterations,
+            settings,
+            out[span],
+            good[span],
+        )
 
     for _ in _mapped(solve, count, executor):
         pass
@@ -232,7 +259,7 @@ def estimate_normals(
     )
 
 
-def _of_kind(array: NDArray[Any], kind: Any) -> Floating:
+def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
     """Return an array of a type; one that repeats itself still does."""
     if array.dtype == kind:
         return array
@@ -255,7 +282,7 @@ def _geometry(
     points: ArrayLike | None,
     lights: int,
     shape: tuple[int, ...],
-) -> tuple[int, tuple[Floating, ...]]:
+) -> tuple[int, tuple[FloatArray, ...]]:
     """Return how light vectors are given, and the arrays that give them."""
     if (positions is None) != (points is None):
         raise PhotometricStereoError(
@@ -293,7 +320,7 @@ def _geometry(
     return kernels.SHARED, (towards,)
 
 
-def require_spread(directions: Floating) -> None:
+def require_spread(directions: FloatArray) -> None:
     """Refuse unit vectors (N, 3) that lie in a plane through the surface point.
 
     Raises
@@ -314,8 +341,8 @@ def require_spread(directions: Floating) -> None:
 
 
 def _light_arrays(
-    way: int, geometry: tuple[Floating, ...], kind: Any
-) -> tuple[Floating, Floating, Floating, Floating]:
+    way: int, geometry: tuple[FloatArray, ...], kind: Any
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     none2, none3 = np.zeros((1, 3), kind), np.zeros((1, 1, 3), kind)
     if way == kernels.SHARED:
         return geometry[0].astype(kind, order="C"), none3, none2, none2
@@ -327,10 +354,10 @@ def _light_arrays(
 
 def _strength(
     intensity: ArrayLike | None,
-    near: tuple[Floating, ...] | None,
+    near: tuple[FloatArray, ...] | None,
     lights: int,
     shape: tuple[int, ...],
-) -> Floating:
+) -> FloatArray:
     if intensity is None:
         level = 1.0
         if near is not None:
@@ -346,7 +373,7 @@ def _strength(
 
 def _per_sample(
     name: str, values: ArrayLike | None, lights: int, shape: tuple[int, ...]
-) -> Floating:
+) -> FloatArray:
     """Return (N, P), as a view where it repeats itself."""
     count = int(np.prod(shape))
     if values is None:
@@ -363,9 +390,7 @@ def _per_sample(
     )
 
 
-def _usable(
-    valid: NDArray[np.bool_] | None, lights: int, shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
+def _usable(valid: BoolArray | None, lights: int, shape: tuple[int, ...]) -> BoolArray:
     count = int(np.prod(shape))
     if valid is None:
         return np.broadcast_to(np.True_, (lights, count))

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, FloatArray, Int32Array
 from reconstruction.tiles import map_tiles
 
 TILE_POINTS = 2048
@@ -46,19 +47,19 @@ class HalfVectorNormals:
         Views that agree.
     """
 
-    normals: NDArray[np.floating]
-    valid: NDArray[np.bool_]
-    stderr_rad: NDArray[np.floating]
-    views: NDArray[np.int32]
+    normals: FloatArray
+    valid: BoolArray
+    stderr_rad: FloatArray
+    views: Int32Array
 
 
 def estimate(
-    values: NDArray[np.floating],
-    light_dir: NDArray[np.floating],
-    view_dir: NDArray[np.floating],
+    values: FloatArray,
+    light_dir: FloatArray,
+    view_dir: FloatArray,
     view: NDArray[np.integer],
     *,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     executor: Executor | None = None,
 ) -> HalfVectorNormals:
     """Estimate normals by the half vectors of each view's four brightest samples.
@@ -129,9 +130,16 @@ def estimate(
     def solve(span: slice) -> None:
         to_lights, to_cameras = (np.asarray(each[span], kind) for each in (light_dir, view_dir))
         _estimate(
-            samples[span], to_lights, to_cameras, cameras,
-            mask[span], int(cameras.max(initial=-1)) + 1, normals[span], stderr[span], views[span],
-        )  # fmt: skip
+            samples[span],
+            to_lights,
+            to_cameras,
+            cameras,
+            mask[span],
+            int(cameras.max(initial=-1)) + 1,
+            normals[span],
+            stderr[span],
+            views[span],
+        )
 
     spans = [slice(a, min(a + TILE_POINTS, points)) for a in range(0, points, TILE_POINTS)]
     if executor is not None or len(spans) < 2:

@@ -237,8 +237,8 @@ def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _finish(  # type: ignore[no-untyped-def]
-    x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, robust, settings, sums, out,
-):  # fmt: skip
+    x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, robust, settings, sums, out
+):
     """Write normal, albedo, residual and standard errors of one point; False where it has none."""
     kind = x.dtype.type
     length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
@@ -368,8 +368,8 @@ def _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear):  # type: ignore[no-u
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_point(  # type: ignore[no-untyped-def]
-    x, y, z, v, s, e, q, m, robust, known, l1_steps, steps, settings, sums, out,
-):  # fmt: skip
+    x, y, z, v, s, e, q, m, robust, known, l1_steps, steps, settings, sums, out
+):
     """Fit one point: v = x b0 + y b1 + z b2 on samples with s > 0."""
     kind = x.dtype.type
     zero, one = kind(0.0), kind(1.0)
@@ -467,9 +467,23 @@ def _fit_point(  # type: ignore[no-untyped-def]
 
 
 def _fit_points(  # type: ignore[no-untyped-def]
-    intensity, variance, usable, strength, directions, per_point, positions, points, way,
-    robust, known, l1_steps, steps, settings, out, valid,
-):  # fmt: skip
+    intensity,
+    variance,
+    usable,
+    strength,
+    directions,
+    per_point,
+    positions,
+    points,
+    way,
+    robust,
+    known,
+    l1_steps,
+    steps,
+    settings,
+    out,
+    valid,
+):
     """Fit every point of a tile.
 
     Parameters
@@ -572,8 +586,21 @@ def fit_points(kind: type[np.floating]) -> Any:
         return types.Array(dtype, axes, "A", readonly=True)
 
     signature = void(
-        given(real, 2), given(real, 2), given(boolean, 2), given(real, 2), real[:, ::1],
-        given(real, 3), real[:, ::1], given(real, 2), int64, boolean, boolean, int64, int64,
-        real[::1], real[:, ::1], boolean[::1],
-    )  # fmt: skip
+        given(real, 2),
+        given(real, 2),
+        given(boolean, 2),
+        given(real, 2),
+        real[:, ::1],
+        given(real, 3),
+        real[:, ::1],
+        given(real, 2),
+        int64,
+        boolean,
+        boolean,
+        int64,
+        int64,
+        real[::1],
+        real[:, ::1],
+        boolean[::1],
+    )
     return njit(signature, cache=True, nogil=True, error_model="numpy")(_fit_points)

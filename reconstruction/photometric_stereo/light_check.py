@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo.estimation import estimate_normals
-
-Floats = NDArray[np.float64]
 
 SAMPLE_POINTS = 1500
 DEAD = 0.05
@@ -50,16 +49,16 @@ class LightCheck:
     order: str
     permutation: NDArray[np.intp]
     misfit: dict[str, float]
-    strength: Floats
-    dead: NDArray[np.bool_]
+    strength: Float64Array
+    dead: BoolArray
     points: int
 
 
 def check(
-    intensity: NDArray[np.floating],
+    intensity: FloatArray,
     light_directions: ArrayLike,
     *,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     names: Sequence[str] | None = None,
     rng: np.random.Generator,
 ) -> LightCheck:
@@ -98,9 +97,11 @@ def check(
     samples, usable = _chosen(stack, valid, rng)
     # a light from the side leaves most points dark, a dead one all of them
     top = np.array(
-        [np.quantile(row[ok], 0.99) if ok.any() else 0.0
-         for row, ok in zip(samples, usable, strict=True)]
-    )  # fmt: skip
+        [
+            np.quantile(row[ok], 0.99) if ok.any() else 0.0
+            for row, ok in zip(samples, usable, strict=True)
+        ]
+    )
     dead = ~(top > DEAD * float(np.median(top)))
     if np.count_nonzero(~dead) < 4:
         raise PhotometricStereoError(
@@ -122,8 +123,8 @@ def check(
 
 
 def _chosen(
-    stack: NDArray[np.floating], valid: NDArray[np.bool_] | None, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.bool_]]:
+    stack: FloatArray, valid: BoolArray | None, rng: np.random.Generator
+) -> tuple[Float64Array, BoolArray]:
     """Return samples (N, P) of points of middling to full brightness, and which are usable."""
     lights, shape = stack.shape[0], stack.shape[1:]
     flat = stack.reshape(lights, -1)
@@ -187,8 +188,8 @@ def _orders(lights: int, names: Sequence[str] | None) -> dict[str, NDArray[np.in
 
 
 def _fit(
-    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
-) -> tuple[Floats, NDArray[np.bool_]]:
+    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
+) -> tuple[Float64Array, BoolArray]:
     """Return the shading fitted under living lights (N, P), and the points that have it."""
     alive = ~dead
     found = estimate_normals(samples[alive], directions[alive], valid=usable[alive], robust=True)
@@ -197,7 +198,7 @@ def _fit(
 
 
 def _misfit(
-    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
+    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
 ) -> float:
     shading, valid = _fit(samples, directions, usable, dead)
     counted = usable & ~dead[:, None]
@@ -208,8 +209,8 @@ def _misfit(
 
 
 def _strength(
-    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
-) -> Floats:
+    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
+) -> Float64Array:
     shading, valid = _fit(samples, directions, usable, dead)
     strength = np.zeros(len(samples))
     for light in np.flatnonzero(~dead):

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float64Array
 
 UNKNOWN_RAD = np.radians(10.0)
 """Error that a point without an estimate counts as: about what a scan's normals are off."""
@@ -53,19 +52,21 @@ class Information:
         Error of each tilt that no light removes.
     """
 
-    tilt: Floats
-    weight: Floats
-    reaches: Bools
-    importance: Floats
-    systematic_rad: Floats
+    tilt: Float64Array
+    weight: Float64Array
+    reaches: BoolArray
+    importance: Float64Array
+    systematic_rad: Float64Array
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
         points, lights = self.weight.shape if self.weight.ndim == 2 else (0, 0)
         for name, shape in (
-            ("tilt", (points, lights, 2)), ("reaches", (points, lights)),
-            ("importance", (points,)), ("systematic_rad", (points,)),
-        ):  # fmt: skip
+            ("tilt", (points, lights, 2)),
+            ("reaches", (points, lights)),
+            ("importance", (points,)),
+            ("systematic_rad", (points,)),
+        ):
             if getattr(self, name).shape != shape:
                 raise SelectionError(f"{name}: got {getattr(self, name).shape}, expected {shape}")
         if not points or not lights:
@@ -96,9 +97,9 @@ class Prediction:
         Rayleigh distributed at each point, lie below. pi / 2 where no point is valid.
     """
 
-    tilt_rad: Floats
-    log_albedo: Floats
-    valid: Bools
+    tilt_rad: Float64Array
+    log_albedo: Float64Array
+    valid: BoolArray
     valid_share: float
     median_rad: float
 
@@ -273,14 +274,14 @@ def _good(prediction: Prediction, median_rad: float, valid_share: float) -> bool
     return prediction.median_rad <= median_rad and prediction.valid_share >= valid_share
 
 
-def _start(found: Information, chosen: NDArray[np.intp]) -> Floats:
+def _start(found: Information, chosen: NDArray[np.intp]) -> Float64Array:
     """Return the information of these lights, (P, 3, 3)."""
     weight = found.weight[:, chosen]
     g = np.concatenate([found.tilt[:, chosen], np.ones((*weight.shape, 1))], axis=-1)
     return np.asarray(np.einsum("pl,pli,plj->pij", weight, g, g) + _VAGUE * np.eye(3))
 
 
-def _gains(found: Information, chosen: list[int], least: int) -> Floats:
+def _gains(found: Information, chosen: list[int], least: int) -> Float64Array:
     """Return by how much each light would lower the mean squared error of the points, (L,).
 
     Points that too few lights reach count `UNKNOWN_RAD` and more, the more the fewer reach them, so
@@ -306,13 +307,15 @@ def _gains(found: Information, chosen: list[int], least: int) -> Floats:
     return np.asarray(found.importance @ (now[:, None] - then))
 
 
-def _loss(variance: Floats, reached: NDArray[np.intp], least: int, unknown: float) -> Floats:
+def _loss(
+    variance: Float64Array, reached: NDArray[np.intp], least: int, unknown: float
+) -> Float64Array:
     missing = np.clip(least - reached, 0, None) / least
     return np.where(missing > 0, unknown * (1.0 + missing), np.minimum(variance, unknown))
 
 
 def _judged(
-    found: Information, covariance: Floats, reached: NDArray[np.intp], least: int
+    found: Information, covariance: Float64Array, reached: NDArray[np.intp], least: int
 ) -> Prediction:
     variance = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + found.systematic_rad**2
     valid = np.asarray(reached >= least)

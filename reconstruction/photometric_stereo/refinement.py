@@ -9,11 +9,11 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.tiles import map_tiles
 
-Floats = NDArray[np.float64]
-Predict = Callable[[Floats, Floats, Floats, NDArray[np.intp]], ArrayLike]
+Predict = Callable[[Float64Array, Float64Array, Float64Array, NDArray[np.intp]], ArrayLike]
 """(normals (P, 3), light_dir (P, M, 3), view_dir (P, M, 3), points (P,)) -> f_r (P, M), 1/sr."""
 
 TILE_SAMPLES = 500_000
@@ -24,14 +24,14 @@ _STEP_RAD = 1e-4  # of the one-sided difference quotients
 
 
 def refine(
-    values: NDArray[np.floating],
-    light_dir: NDArray[np.floating],
-    view_dir: NDArray[np.floating],
-    normals: NDArray[np.floating],
-    predict: Predict | NDArray[np.floating],
+    values: FloatArray,
+    light_dir: FloatArray,
+    view_dir: FloatArray,
+    normals: FloatArray,
+    predict: Predict | FloatArray,
     *,
     variance: ArrayLike | None = None,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     iterations: int = 6,
     free_scale: bool = True,
     most_rad: float = 0.35,
@@ -105,17 +105,23 @@ def refine(
         way = np.asarray(light_dir[chosen], np.float64)
         out = np.asarray(view_dir[chosen], np.float64)
 
-        def render(n: Floats) -> Floats:
+        def render(n: Float64Array) -> Float64Array:
             f_r = fixed if fixed is not None else predict(n, way, out, chosen)  # type: ignore[operator]
             return np.asarray(f_r, np.float64) * np.maximum(_dots(way, n), 0.0)
 
         return _refine_tile(
-            np.asarray(samples[chosen], np.float64), way, out,
-            np.asarray(normals[chosen], np.float64), render,
+            np.asarray(samples[chosen], np.float64),
+            way,
+            out,
+            np.asarray(normals[chosen], np.float64),
+            render,
             None if noise is None else np.asarray(noise[chosen], np.float64),
             None if valid is None else np.asarray(valid[chosen]),
-            iterations, free_scale, most_rad, grazing,
-        )  # fmt: skip
+            iterations,
+            free_scale,
+            most_rad,
+            grazing,
+        )
 
     size = max(1, TILE_SAMPLES // max(count, 1))
     tiles = [np.arange(a, min(a + size, points)) for a in range(0, points, size)]
@@ -130,16 +136,18 @@ def refine(
     return NormalMaps(*(np.concatenate([getattr(tile, name) for tile in done]) for name in names))
 
 
-def _dots(directions: Floats, normals: Floats) -> Floats:
+def _dots(directions: Float64Array, normals: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("pmk,pk->pm", directions, normals))
 
 
-def _turned(normals: Floats, s: Floats, t: Floats, a: Floats, b: Floats) -> Floats:
+def _turned(
+    normals: Float64Array, s: Float64Array, t: Float64Array, a: Float64Array, b: Float64Array
+) -> Float64Array:
     moved = normals + a[:, None] * s + b[:, None] * t
     return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
 
-def _tangents(normals: Floats) -> tuple[Floats, Floats]:
+def _tangents(normals: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return two unit vectors across each normal."""
     x, y, z = np.moveaxis(normals, -1, 0)
     sign = np.where(z >= 0, 1.0, -1.0)  # Duff et al. 2017, Building an orthonormal basis, revisited
@@ -150,13 +158,13 @@ def _tangents(normals: Floats) -> tuple[Floats, Floats]:
 
 
 def _refine_tile(
-    samples: Floats,
-    light_dir: Floats,
-    view_dir: Floats,
-    start: Floats,
-    render: Callable[[Floats], Floats],
-    noise: Floats | None,
-    valid: NDArray[np.bool_] | None,
+    samples: Float64Array,
+    light_dir: Float64Array,
+    view_dir: Float64Array,
+    start: Float64Array,
+    render: Callable[[Float64Array], Float64Array],
+    noise: Float64Array | None,
+    valid: BoolArray | None,
     iterations: int,
     free_scale: bool,
     most_rad: float,
@@ -211,18 +219,19 @@ def _refine_tile(
             factor = np.maximum(factor + shorter * move[:, 2], 1e-3 * factor)
         if float(np.max(reach, initial=0.0)) < 1e-6:
             iterations = step + 1  # one more pass for the errors
-    return _judged(n, first, factor, r, scale, seen & (w > 0), weight, J, u2, begun,
-                   unknowns, known, most_rad)  # fmt: skip
+    return _judged(
+        n, first, factor, r, scale, seen & (w > 0), weight, J, u2, begun, unknowns, known, most_rad
+    )
 
 
-def _ratio(samples: Floats, model: Floats, weight: Floats) -> Floats:
+def _ratio(samples: Float64Array, model: Float64Array, weight: Float64Array) -> Float64Array:
     """Return a first factor: the ratio of sums, which few outliers move little."""
     total = np.sum(model * weight, axis=-1)
     ratio = np.sum(samples * weight, axis=-1) / np.where(total > 0, total, 1.0)
     return np.where((total > 0) & (ratio > 0), ratio, 1.0)
 
 
-def _scale(r: Floats, seen: NDArray[np.bool_], unknowns: int, least: float) -> Floats:
+def _scale(r: Float64Array, seen: BoolArray, unknowns: int, least: float) -> Float64Array:
     """Return the scale of residuals from their median, without those that any fit makes 0."""
     count = np.count_nonzero(seen, axis=-1)
     ordered = np.sort(np.where(seen, np.abs(r), np.inf), axis=-1)
@@ -236,7 +245,7 @@ def _scale(r: Floats, seen: NDArray[np.bool_], unknowns: int, least: float) -> F
     return np.maximum(np.maximum(scale, least), 1e-12 * size + 1e-300)
 
 
-def _solved(A: Floats, g: Floats) -> Floats:
+def _solved(A: Float64Array, g: Float64Array) -> Float64Array:
     """Solve with a ridge that bounds what the samples do not tell."""
     diagonal = np.einsum("pii->pi", A)
     ridge = 1e-6 * diagonal + 1e-9 * diagonal.max(axis=-1, initial=0.0, keepdims=True) + 1e-300
@@ -244,16 +253,16 @@ def _solved(A: Floats, g: Floats) -> Floats:
 
 
 def _judged(
-    n: Floats,
-    first: Floats,
-    factor: Floats,
-    r: Floats,
-    scale: Floats,
-    used: NDArray[np.bool_],
-    weight: Floats,
-    J: Floats,
-    u2: Floats,
-    begun: NDArray[np.bool_],
+    n: Float64Array,
+    first: Float64Array,
+    factor: Float64Array,
+    r: Float64Array,
+    scale: Float64Array,
+    used: BoolArray,
+    weight: Float64Array,
+    J: Float64Array,
+    u2: Float64Array,
+    begun: BoolArray,
     unknowns: int,
     known: bool,
     most_rad: float,

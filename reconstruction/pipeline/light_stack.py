@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import raw
 from capture.session import Session
 from capture.session.frames import FrameRecord
 from model.skin import UNITS, SkinMap
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
 from reconstruction.pipeline import graph as stages
@@ -32,21 +32,19 @@ UNEVEN = 0.2
 """Relative strength that a light may be off before it is named."""
 OUTLIER_SIGMAS = 4.0
 
-Float32 = NDArray[np.float32]
-
 
 @dataclass(frozen=True, slots=True)
 class Stack:
     """Gray pictures under each light, over exposure and strength of the light."""
 
-    gray: Float32
+    gray: Float32Array
     """(N, H, W)."""
-    usable: NDArray[np.bool_]
+    usable: BoolArray
     """(N, H, W)."""
-    inside: NDArray[np.bool_]
+    inside: BoolArray
     """(H, W)."""
     records: tuple[FrameRecord, ...]
-    gain: NDArray[np.float64]
+    gain: Float64Array
     """(N, 3): what the values of each frame were multiplied with, per channel."""
     folder: Any
     """Keeps the file of a large stack alive."""
@@ -56,11 +54,11 @@ class Stack:
 class Lights:
     """Lights that agree with the shading."""
 
-    vectors: NDArray[np.float64]
+    vectors: Float64Array
     """(N, 3) in the order of the stack: directions, or positions in mm where near."""
     near: bool
     mm_per_px: float
-    alive: NDArray[np.bool_]
+    alive: BoolArray
 
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
@@ -69,24 +67,32 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     return [
         stages.Stage("stack", (), ("stack",), lambda: {"stack": _stack(evidence.session)}, base),
         stages.Stage(
-            "lights", ("stack",), ("lights",), lambda stack: {"lights": _lights(evidence, stack)},
+            "lights",
+            ("stack",),
+            ("lights",),
+            lambda stack: {"lights": _lights(evidence, stack)},
             base,
         ),
         stages.Stage(
-            "normals", ("stack", "lights"), ("normals", "residual", "gray_albedo"),
-            lambda stack, lights: _normals(evidence, stack, lights), base,
+            "normals",
+            ("stack", "lights"),
+            ("normals", "residual", "gray_albedo"),
+            lambda stack, lights: _normals(evidence, stack, lights),
+            base,
         ),
         stages.Stage(
-            "albedo", ("stack", "lights", "normals", "gray_albedo"), ("albedo",),
+            "albedo",
+            ("stack", "lights", "normals", "gray_albedo"),
+            ("albedo",),
             lambda stack, lights, normals, gray_albedo: _albedo(
                 evidence.session, stack, lights, normals, gray_albedo
             ),
             base,
         ),
-    ]  # fmt: skip
+    ]
 
 
-def _linear(frame: raw.RawFrame) -> tuple[Float32, NDArray[np.bool_]]:
+def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
     """Return values (H, W, C) over the range, and which are not saturated (H, W)."""
     if frame.pattern == "MONO":
         (black,) = frame.black
@@ -194,7 +200,7 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
     return Lights(vectors, near, scale, alive)
 
 
-def _points_mm(shape: tuple[int, int], mm_per_px: float) -> NDArray[np.float64]:
+def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
     """Return the places of pixels on the plane through the object's middle, (H, W, 3)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
     x, y = x - (shape[1] - 1) / 2, (shape[0] - 1) / 2 - y
@@ -212,12 +218,15 @@ def _estimate(stack: Stack, lights: Lights, *, robust: bool) -> NormalMaps:
     usable = stack.usable & stack.inside
     everything = bool(alive.all())
     return estimate_normals(
-        stack.gray if everything else stack.gray[alive], lights.vectors[alive],
-        valid=usable if everything else usable[alive], robust=robust, **near,
-    )  # fmt: skip
+        stack.gray if everything else stack.gray[alive],
+        lights.vectors[alive],
+        valid=usable if everything else usable[alive],
+        robust=robust,
+        **near,
+    )
 
 
-def _roughness_of_field(found: NormalMaps, both: NDArray[np.bool_]) -> float:
+def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
     """Return how little the normals are those of a surface: the median curl of their slopes."""
     z = np.maximum(found.normals[..., 2], 0.1)
     p, q = -found.normals[..., 0] / z, -found.normals[..., 1] / z
@@ -244,14 +253,17 @@ def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, A
     relative = np.where(valid, best.residual / np.where(valid, best.albedo, 1.0), 0.0)
     return {
         "normals": SkinMap(
-            n, UNITS["normals"], np.where(valid[..., None], each, 0.0), valid,
+            n,
+            UNITS["normals"],
+            np.where(valid[..., None], each, 0.0),
+            valid,
             "picture frame: x right, y up, z towards the camera",
         ),
         "residual": SkinMap(
             relative, UNITS["residual"], None, valid, "root mean square misfit over albedo"
         ),
         "gray_albedo": best,
-    }  # fmt: skip
+    }
 
 
 def _albedo(
@@ -290,7 +302,10 @@ def _albedo(
         albedo, errors = albedo[..., 0], errors[..., 0]
     return {
         "albedo": SkinMap(
-            albedo.astype(np.float32), "1", np.ascontiguousarray(errors, np.float32), valid,
+            albedo.astype(np.float32),
+            "1",
+            np.ascontiguousarray(errors, np.float32),
+            valid,
             "over what the lights give a white surface, up to one factor",
         )
-    }  # fmt: skip
+    }

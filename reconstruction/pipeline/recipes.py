@@ -50,9 +50,12 @@ def _dome() -> Recipe:
     from reconstruction.pipeline.dome import stages as stages_of
 
     return Recipe(
-        stages_of.MAPS, stages_of.graph, stages_of.FILES, ("position",),
+        stages_of.MAPS,
+        stages_of.graph,
+        stages_of.FILES,
+        ("position",),
         maps_of_rank=stages_of.maps_of,
-    )  # fmt: skip
+    )
 
 
 def _gradient() -> Recipe:
@@ -190,9 +193,14 @@ def reconstruct(
     if unknown:
         raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
     evidence = Evidence.of(
-        opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis,
+        opened,
+        calibration,
+        state=state,
+        on_date=on_date,
+        scan=scan,
+        basis=basis,
         landmarks=landmarks,
-    )  # fmt: skip
+    )
     evidence.progress = progress
     evidence.rank = rank
     if hold_out is not None:

@@ -2,10 +2,4 @@
 
 from reconstruction.registration.tracking import RegistrationError, Tracks, evened, textured, track
 
-__all__ = [
-    "RegistrationError",
-    "Tracks",
-    "evened",
-    "textured",
-    "track",
-]
+__all__ = ["RegistrationError", "Tracks", "evened", "textured", "track"]

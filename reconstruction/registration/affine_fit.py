@@ -12,10 +12,9 @@ doi:10.1080/00401706.1993.10485354).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-Floats = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 REACHES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Lengths over which deviations are alike, in windows. What is finer a window averages; what is
@@ -25,7 +24,9 @@ SHARES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 """Of the deviations' variance, what neighbors have in common."""
 
 
-def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floats, Floats]:
+def fit_affine(
+    places: Float64Array, found: Float64Array, *, window_px: float
+) -> tuple[Float64Array, Float64Array]:
     """Fit an affine map to displaced points, with its covariance.
 
     Parameters
@@ -64,7 +65,7 @@ def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floa
         raise ValueError(f"places: got {count} points, expected at least 7, not all on one line")
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1) / window_px
     free = count - 3
-    kept: list[tuple[float, Floats, Floats, Floats]] = []
+    kept: list[tuple[float, Float64Array, Float64Array, Float64Array]] = []
     for reach in REACHES:
         alike = _correlation(apart / reach)
         for share in SHARES:
@@ -88,14 +89,14 @@ def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floa
     return solution, total[np.ix_(order, order)]
 
 
-def _correlation(distance: Floats) -> Floats:
+def _correlation(distance: Float64Array) -> Float64Array:
     """Return a Gaussian correlation: a window's displacement is a mean over smooth ones."""
     return np.exp(-(distance**2))
 
 
 def _given(
-    design: Floats, found: Floats, correlation: Floats
-) -> tuple[float, Floats, Floats, Floats]:
+    design: Float64Array, found: Float64Array, correlation: Float64Array
+) -> tuple[float, Float64Array, Float64Array, Float64Array]:
     """Return log evidence, map, inverse information, and sums of squares of one correlation."""
     lower = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(design)))
     white = solve_triangular(

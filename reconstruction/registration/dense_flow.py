@@ -20,11 +20,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Float32s = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 
 ROUNDS = 2
 """How often the second picture is warped and the rest followed."""
@@ -63,20 +60,20 @@ class DenseFlow:
         The flow was believed; elsewhere the first guess stands, moved as neighbors are.
     """
 
-    source_px: Float32s
-    stderr_px: Float32s
-    gap_px: Float32s
-    followed: Bools
+    source_px: Float32Array
+    stderr_px: Float32Array
+    gap_px: Float32Array
+    followed: BoolArray
 
 
 def refine(
-    first: Bytes,
-    second: Bytes,
-    source_px: NDArray[np.floating],
-    stderr_px: NDArray[np.floating],
+    first: UInt8Array,
+    second: UInt8Array,
+    source_px: FloatArray,
+    stderr_px: FloatArray,
     *,
-    valid: Bools,
-    valid_second: Bools,
+    valid: BoolArray,
+    valid_second: BoolArray,
     rounds: int = ROUNDS,
 ) -> DenseFlow:
     """Refine a guess of where the pixels of one picture are in another.
@@ -133,13 +130,13 @@ def refine(
     return DenseFlow(at, stderr, gap.astype(np.float32), known)
 
 
-def grid(shape: tuple[int, ...]) -> Float32s:
+def grid(shape: tuple[int, ...]) -> Float32Array:
     """Return column and row of every pixel, (H, W, 2)."""
     x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
     return np.stack([x, y], axis=-1)
 
 
-def bilinear(image: Any, at_px: Float32s, *, interpolation: int = cv2.INTER_LINEAR) -> Any:
+def bilinear(image: Any, at_px: Float32Array, *, interpolation: int = cv2.INTER_LINEAR) -> Any:
     """Return an image's values at (column, row); beyond its border those of the border."""
     flat = at_px.reshape(*at_px.shape[:2], 2)
     return cv2.remap(
@@ -147,7 +144,7 @@ def bilinear(image: Any, at_px: Float32s, *, interpolation: int = cv2.INTER_LINE
     )
 
 
-def noise_left(at_px: Float32s) -> Float32s:
+def noise_left(at_px: Float32Array) -> Float32Array:
     """Return the variance that cubic interpolation leaves of noise of single pixels, (H, W).
 
     Parameters
@@ -166,13 +163,13 @@ def noise_left(at_px: Float32s) -> Float32s:
     return left
 
 
-def _follow(one: Bytes, two: Bytes) -> Float32s:
+def _follow(one: UInt8Array, two: UInt8Array) -> Float32Array:
     search: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)
     return np.asarray(search.calc(one, two, None), np.float32)
 
 
-def _noise_variance(one: Bytes, two: Bytes) -> Float32s:
+def _noise_variance(one: UInt8Array, two: UInt8Array) -> Float32Array:
     """Return the variance of the flow along its worse known axis, by texture and difference."""
     a, b = one.astype(np.float32), two.astype(np.float32)
     mean = 0.5 * (a + b)
@@ -184,7 +181,7 @@ def _noise_variance(one: Bytes, two: Bytes) -> Float32s:
     return np.asarray(rest / area * 0.5 * (xx + yy) / determinant, np.float32)
 
 
-def _deformation(at_px: Float32s) -> tuple[Float32s, Float32s]:
+def _deformation(at_px: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Return the squares of the Laplacian and of the gradient of a map's displacement."""
     away = at_px - grid(at_px.shape)
     displacement = np.asarray(cv2.GaussianBlur(away, (0, 0), BEND_PX))
@@ -194,15 +191,15 @@ def _deformation(at_px: Float32s) -> tuple[Float32s, Float32s]:
     return np.asarray(bent, np.float32), np.asarray(strained, np.float32)
 
 
-def _windowed(image: Float32s) -> Float32s:
+def _windowed(image: Float32Array) -> Float32Array:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), WINDOW_PX))
 
 
-def _blurred(image: Float32s) -> Float32s:
+def _blurred(image: Float32Array) -> Float32Array:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), NEIGHBORS_PX))
 
 
-def _inside(at_px: Float32s, shape: tuple[int, ...]) -> Bools:
+def _inside(at_px: Float32Array, shape: tuple[int, ...]) -> BoolArray:
     return np.asarray(
         (at_px >= 0).all(axis=-1)
         & (at_px[..., 0] <= shape[1] - 1)

@@ -18,10 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.registration.tracking import RegistrationError
-
-Floats = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 MOST_FEATURES = 3000
 RATIO = 0.85
@@ -44,12 +42,8 @@ class FeatureError(RegistrationError):
 
 
 def match(
-    first: Bytes,
-    second: Bytes,
-    *,
-    valid: NDArray[np.bool_],
-    valid_second: NDArray[np.bool_],
-) -> tuple[Floats, Floats]:
+    first: UInt8Array, second: UInt8Array, *, valid: BoolArray, valid_second: BoolArray
+) -> tuple[Float64Array, Float64Array]:
     """Find points that two pictures share.
 
     Parameters
@@ -106,7 +100,9 @@ def _mutual(words: Any, others: Any) -> NDArray[np.intp]:
     return np.array(pairs, np.intp).reshape(-1, 2)
 
 
-def _smooth(one: Floats, two: Floats, diagonal: float) -> tuple[Floats, Floats]:
+def _smooth(
+    one: Float64Array, two: Float64Array, diagonal: float
+) -> tuple[Float64Array, Float64Array]:
     """Keep matches that move with the whole, and about as their neighbors do."""
     if len(one) < LEAST_MATCHES:
         return one[:0], two[:0]

@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
-
-Floats = NDArray[np.float64]
 
 LEAST_COSINE = 0.4
 """Cosine between normal and view below which a point is not tracked."""
@@ -49,10 +48,10 @@ class Camera(Protocol):
     """What is needed of a camera."""
 
     @property
-    def center_mm(self) -> Floats:
+    def center_mm(self) -> Float64Array:
         """Centre of projection, (3,)."""
 
-    def project(self, points_mm: Floats) -> Floats:
+    def project(self, points_mm: Float64Array) -> Float64Array:
         """Return column and row (N, 2) of points (N, 3)."""
 
 
@@ -81,17 +80,17 @@ class HeadMotion:
     tracks : ndarray of int, shape (T,)
     """
 
-    times_s: Floats
-    rotation_rad: Floats
-    translation_mm: Floats
-    stderr: Floats
-    usable: NDArray[np.bool_]
-    residual_px: Floats
-    nonrigid: Floats
-    worst_part_px: Floats
+    times_s: Float64Array
+    rotation_rad: Float64Array
+    translation_mm: Float64Array
+    stderr: Float64Array
+    usable: BoolArray
+    residual_px: Float64Array
+    nonrigid: Float64Array
+    worst_part_px: Float64Array
     tracks: NDArray[np.intp]
 
-    def at(self, times_s: ArrayLike) -> tuple[Floats, Floats]:
+    def at(self, times_s: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return the motion between frames: rotation vectors (K, 3) and translations (K, 3).
 
         Straight between usable frames; before the first and after the last as there.
@@ -111,7 +110,7 @@ class HeadMotion:
         )
         return turn, shift
 
-    def matrices(self, times_s: ArrayLike) -> Floats:
+    def matrices(self, times_s: ArrayLike) -> Float64Array:
         """Return the motion as (K, 4, 4) matrices that take points to where they were."""
         turn, shift = self.at(times_s)
         out = np.tile(np.eye(4), (len(turn), 1, 1))
@@ -119,7 +118,7 @@ class HeadMotion:
         out[:, :3, 3] = shift
         return out
 
-    def covered(self, times_s: ArrayLike) -> NDArray[np.bool_]:
+    def covered(self, times_s: ArrayLike) -> BoolArray:
         """Return which times lie between two usable frames that follow each other, (K,)."""
         when = np.atleast_1d(np.asarray(times_s, np.float64))
         after = np.searchsorted(self.times_s, when, side="left")
@@ -131,7 +130,7 @@ class HeadMotion:
         low, high = np.maximum(low, 0), np.minimum(after, len(self.times_s) - 1)
         return inside & self.usable[low] & self.usable[high]
 
-    def displacement_mm(self, points_mm: ArrayLike) -> Floats:
+    def displacement_mm(self, points_mm: ArrayLike) -> Float64Array:
         """Return how far points are from where the scan has them, root mean square, (T,)."""
         points = np.asarray(points_mm, np.float64).reshape(-1, 3)
         moved = points @ np.swapaxes(rotation_matrix(self.rotation_rad), -1, -2)
@@ -139,7 +138,7 @@ class HeadMotion:
         return np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
 
 
-def rotation_matrix(vector_rad: ArrayLike) -> Floats:
+def rotation_matrix(vector_rad: ArrayLike) -> Float64Array:
     """Return the rotation of a rotation vector (..., 3) as matrices (..., 3, 3), Rodrigues.
 
     Examples
@@ -160,7 +159,7 @@ def rotation_matrix(vector_rad: ArrayLike) -> Floats:
 
 
 def estimate(
-    frames: Sequence[Sequence[NDArray[np.floating]]] | NDArray[np.floating],
+    frames: Sequence[Sequence[FloatArray]] | FloatArray,
     cameras: Sequence[Camera],
     points_mm: ArrayLike,
     normals: ArrayLike,
@@ -232,20 +231,20 @@ def estimate(
 class _Pose:
     """Rotation vector and translation of one frame, and what they leave of each track."""
 
-    motion: Floats
-    stderr: Floats
-    residual_px: Floats
+    motion: Float64Array
+    stderr: Float64Array
+    residual_px: Float64Array
     """Length, infinite for a track that was lost."""
 
 
 def _checked(
-    frames: Sequence[Sequence[NDArray[np.floating]]] | NDArray[np.floating],
+    frames: Sequence[Sequence[FloatArray]] | FloatArray,
     cameras: Sequence[Camera],
     points_mm: ArrayLike,
     normals: ArrayLike,
     times_s: ArrayLike,
     reference: int,
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     points, outward = np.asarray(points_mm, np.float64), np.asarray(normals, np.float64)
     times = np.asarray(times_s, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or outward.shape != points.shape:
@@ -265,7 +264,7 @@ def _checked(
     return points[good], outward[good], times
 
 
-def _facing(points: Floats, normals: Floats, center: Floats) -> NDArray[np.bool_]:
+def _facing(points: Float64Array, normals: Float64Array, center: Float64Array) -> BoolArray:
     towards = center - points
     length = np.linalg.norm(towards, axis=1) * np.linalg.norm(normals, axis=1)
     cosine = np.sum(towards * normals, axis=1) / np.where(length > 0, length, 1.0)
@@ -273,14 +272,14 @@ def _facing(points: Floats, normals: Floats, center: Floats) -> NDArray[np.bool_
 
 
 def _pose(
-    pictures: Sequence[NDArray[np.floating]] | NDArray[np.floating],
+    pictures: Sequence[FloatArray] | FloatArray,
     cameras: Sequence[Camera],
-    points: Floats,
+    points: Float64Array,
     chosen: Sequence[NDArray[np.intp]],
-    evened: Sequence[NDArray[np.uint8]],
+    evened: Sequence[UInt8Array],
     iterations: int,
 ) -> _Pose:
-    seen: list[tuple[Camera, Floats, Floats]] = []
+    seen: list[tuple[Camera, Float64Array, Float64Array]] = []
     kept = []
     for picture, camera, rows, even in zip(pictures, cameras, chosen, evened, strict=True):
         start = np.asarray(camera.project(points[rows])) if len(rows) else np.zeros((0, 2))
@@ -316,7 +315,7 @@ def _pose(
     return _Pose(motion, stderr, left)
 
 
-def _worst_part(points: Floats, length: Floats) -> float:
+def _worst_part(points: Float64Array, length: Float64Array) -> float:
     """Return the largest median residual of the parts of a face, 0 where none has three tracks.
 
     Parts overlap by half, so that an expression lies in one of them as a whole.
@@ -331,7 +330,7 @@ def _worst_part(points: Floats, length: Floats) -> float:
     return worst
 
 
-def _blocks(seen: Sequence[tuple[Camera, Floats, Floats]]) -> NDArray[np.intp]:
+def _blocks(seen: Sequence[tuple[Camera, Float64Array, Float64Array]]) -> NDArray[np.intp]:
     """Return a number for each track: that of its camera's part of the image."""
     names = [
         np.stack([np.full(len(at), k), *(at // BLOCK_PX).T.astype(np.intp)], axis=1)
@@ -341,7 +340,9 @@ def _blocks(seen: Sequence[tuple[Camera, Floats, Floats]]) -> NDArray[np.intp]:
     return np.asarray(block.reshape(-1), np.intp)
 
 
-def _stderr(r: Floats, J: Floats, u2: Floats, block: NDArray[np.intp]) -> Floats:
+def _stderr(
+    r: Float64Array, J: Float64Array, u2: Float64Array, block: NDArray[np.intp]
+) -> Float64Array:
     """Return the standard errors (6,), infinite where the tracks do not tell the motion.
 
     Tracks of one part of an image err alike: their windows overlap, their texture is foreshortened
@@ -372,8 +373,8 @@ def _stderr(r: Floats, J: Floats, u2: Floats, block: NDArray[np.intp]) -> Floats
 
 
 def _residuals(
-    seen: Sequence[tuple[Camera, Floats, Floats]], motion: Floats
-) -> tuple[Floats, Floats]:
+    seen: Sequence[tuple[Camera, Float64Array, Float64Array]], motion: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return what is left of the tracks (n, 2) and its derivative by the motion (n, 2, 6)."""
     rows, slopes = [], []
     R = rotation_matrix(motion[:3])
@@ -398,7 +399,9 @@ def _residuals(
     return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
 
 
-def _judged(found: Sequence[_Pose], points: Floats, times: Floats, reference: int) -> HeadMotion:
+def _judged(
+    found: Sequence[_Pose], points: Float64Array, times: Float64Array, reference: int
+) -> HeadMotion:
     """Compare the frames with each other: what is usual is noise, what is not an expression."""
     left = np.array([f.residual_px for f in found])
     known = np.isfinite(left)
@@ -434,7 +437,7 @@ def _judged(found: Sequence[_Pose], points: Floats, times: Floats, reference: in
     )
 
 
-def _middle(values: Floats) -> float:
+def _middle(values: Float64Array) -> float:
     """Return the median of the finite values, 0 where there are none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else 0.0

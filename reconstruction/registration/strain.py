@@ -16,13 +16,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration.affine_fit import fit_affine
 from reconstruction.registration.tracking import RegistrationError, evened, textured, track
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.floating]
 
 LEAST_SIDE_PX = 64
 COARSEST_PX = 48
@@ -62,9 +59,9 @@ class Strain:
         False when too few windows could be followed; the numbers then mean nothing.
     """
 
-    gradient: Floats
-    shift_px: Floats
-    covariance: Floats
+    gradient: Float64Array
+    shift_px: Float64Array
+    covariance: Float64Array
     residual_px: float
     windows: int
     valid: bool
@@ -90,7 +87,7 @@ class Strain:
         The lines were at ``angle_rad`` and across it.
         """
 
-        def closed(gradient: Floats) -> float:
+        def closed(gradient: Float64Array) -> float:
             c, s = math.cos(angle_rad), math.sin(angle_rad)
             one, two = gradient @ [c, s], gradient @ [-s, c]
             return math.asin(float(one @ two) / float(np.linalg.norm(one) * np.linalg.norm(two)))
@@ -101,7 +98,7 @@ class Strain:
     def rotation(self) -> tuple[float, float]:
         """Rotation of the rigid part (polar decomposition), rad, +x towards +y, and its error."""
 
-        def turned(gradient: Floats) -> float:
+        def turned(gradient: Float64Array) -> float:
             return math.atan2(gradient[1, 0] - gradient[0, 1], gradient[0, 0] + gradient[1, 1])
 
         return turned(self.gradient), self._error_of(turned)
@@ -115,7 +112,7 @@ class Strain:
             slope[k] = (value(self.gradient + apart) - value(self.gradient - apart)) / 2e-6
         return _stderr(slope, self.covariance)
 
-    def affine_px(self, shape: tuple[int, int]) -> Floats:
+    def affine_px(self, shape: tuple[int, int]) -> Float64Array:
         """Return the map of pixels (column, row), first picture to second, shape (2, 3)."""
         return _to_pixels(self.gradient, self.shift_px, shape)
 
@@ -130,13 +127,13 @@ GUESSES = tuple(
 
 
 def measure_strain(
-    first: Image,
-    second: Image,
+    first: FloatArray,
+    second: FloatArray,
     *,
-    start: Floats | None = None,
-    start_shift_px: Floats | None = None,
-    valid: NDArray[np.bool_] | None = None,
-    valid_second: NDArray[np.bool_] | None = None,
+    start: Float64Array | None = None,
+    start_shift_px: Float64Array | None = None,
+    valid: BoolArray | None = None,
+    valid_second: BoolArray | None = None,
     count: int = 600,
 ) -> Strain:
     """Measure the affine deformation that took the skin of one picture to that of another.
@@ -194,7 +191,7 @@ def measure_strain(
     return found
 
 
-def _filled(image: Image, valid: NDArray[np.bool_] | None) -> Image:
+def _filled(image: FloatArray, valid: BoolArray | None) -> FloatArray:
     """Put the median where there is no skin: a hard edge would be followed instead of it."""
     if valid is None or valid.all():
         return image
@@ -203,21 +200,23 @@ def _filled(image: Image, valid: NDArray[np.bool_] | None) -> Image:
     return np.where(valid, image, middle)
 
 
-def _to_pixels(gradient: Floats, shift_px: Floats, shape: tuple[int, int]) -> Floats:
+def _to_pixels(
+    gradient: Float64Array, shift_px: Float64Array, shape: tuple[int, int]
+) -> Float64Array:
     middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     turned = _FLIP @ gradient @ _FLIP
     return np.column_stack([turned, middle + _FLIP @ shift_px - turned @ middle])
 
 
-def _from_pixels(affine: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+def _from_pixels(affine: Float64Array, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
     middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     shift = affine[:, :2] @ middle + affine[:, 2] - middle
     return _FLIP @ affine[:, :2] @ _FLIP, _FLIP @ shift
 
 
 def _phase_shift(
-    one: NDArray[np.uint8], two: NDArray[np.uint8], affine: Floats, mask: NDArray[np.bool_]
-) -> Floats:
+    one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray
+) -> Float64Array:
     """Return how far the second picture, warped back, lies from the first, px."""
     size = one.shape[1], one.shape[0]
     back = cv2.warpAffine(
@@ -233,16 +232,19 @@ def _phase_shift(
 
 
 def _pyramid(
-    one: NDArray[np.uint8], two: NDArray[np.uint8], affine: Floats, mask: NDArray[np.bool_]
-) -> Floats:
+    one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray
+) -> Float64Array:
     """Improve an affine map from coarse to fine; a level that does not converge changes nothing."""
     levels = [(one.astype(np.float32), two.astype(np.float32), mask.astype(np.uint8))]
     while min(levels[-1][0].shape) >= 2 * COARSEST_PX and len(levels) < 6:
         a, b, m = levels[-1]
         levels.append(
-            (cv2.pyrDown(a), cv2.pyrDown(b), cv2.resize(m, None, fx=0.5, fy=0.5,
-             interpolation=cv2.INTER_NEAREST))
-        )  # fmt: skip
+            (
+                cv2.pyrDown(a),
+                cv2.pyrDown(b),
+                cv2.resize(m, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST),
+            )
+        )
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-6)
     # the finest level is left to the windows, which also tell the error
     last = 1 if len(levels) > 2 else 0
@@ -263,11 +265,11 @@ def _pyramid(
 
 
 def _by_windows(
-    one: NDArray[np.uint8],
-    two: NDArray[np.uint8],
-    affine: Floats,
-    mask: NDArray[np.bool_],
-    other: NDArray[np.bool_],
+    one: UInt8Array,
+    two: UInt8Array,
+    affine: Float64Array,
+    mask: BoolArray,
+    other: BoolArray,
     count: int,
 ) -> Strain:
     """Follow windows of the first picture into the second, warped back, and fit all of them."""
@@ -284,9 +286,12 @@ def _by_windows(
             two, affine, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderValue=128
         )
         seen = cv2.warpAffine(
-            other.astype(np.uint8), affine, size,
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP, borderValue=0,
-        )  # fmt: skip
+            other.astype(np.uint8),
+            affine,
+            size,
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderValue=0,
+        )
         seen = cv2.erode(seen, np.ones((WINDOW_PX, WINDOW_PX), np.uint8), borderValue=0)
         tracks = track(one, back, start, window_px=WINDOW_PX, levels=2 if number == 0 else 0)
         inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
@@ -308,8 +313,8 @@ def _by_windows(
 
 
 def _fit(
-    start: Floats, found: Floats, shape: tuple[int, int], *, last: bool
-) -> tuple[Floats, Floats, float, int] | None:
+    start: Float64Array, found: Float64Array, shape: tuple[int, int], *, last: bool
+) -> tuple[Float64Array, Float64Array, float, int] | None:
     """Fit an affine map to what is no outlier: by least squares, or with its errors when `last`.
 
     Returns
@@ -349,7 +354,7 @@ def _fit(
     return affine, covariance, residual, int(keep.sum())
 
 
-def _carry(covariance: Floats, linear: Floats) -> Floats:
+def _carry(covariance: Float64Array, linear: Float64Array) -> Float64Array:
     """Carry the covariance of a small map through the large one before it, into axes with y up."""
     jacobian = np.zeros((6, 6))
     outer = _FLIP @ linear
@@ -362,7 +367,7 @@ def _carry(covariance: Floats, linear: Floats) -> Floats:
     return jacobian @ covariance @ jacobian.T
 
 
-def _stderr(slope: Floats, covariance: Floats) -> float:
+def _stderr(slope: Float64Array, covariance: Float64Array) -> float:
     if not np.isfinite(covariance).all():
         return math.inf
     return math.sqrt(max(float(slope @ covariance @ slope), 0.0))

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.floating]
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 
 
 class RegistrationError(ValueError):
@@ -34,11 +33,11 @@ class Tracks:
         Found, inside the image, and found again on the way back.
     """
 
-    points_px: Floats
-    valid: NDArray[np.bool_]
+    points_px: Float64Array
+    valid: BoolArray
 
 
-def evened(image: Image, *, sigma_px: float = 8.0) -> NDArray[np.uint8]:
+def evened(image: FloatArray, *, sigma_px: float = 8.0) -> UInt8Array:
     """Return the local contrast of an image as 8-bit values: mean and brightness of light are gone.
 
     Parameters
@@ -76,12 +75,7 @@ def evened(image: Image, *, sigma_px: float = 8.0) -> NDArray[np.uint8]:
 
 
 def textured(
-    even: NDArray[np.uint8],
-    points_px: Floats,
-    *,
-    count: int,
-    cell_px: int = 12,
-    margin_px: int = 12,
+    even: UInt8Array, points_px: Float64Array, *, count: int, cell_px: int = 12, margin_px: int = 12
 ) -> NDArray[np.intp]:
     """Choose points that can be tracked: the one with most texture in each cell of the image.
 
@@ -122,9 +116,9 @@ def textured(
 
 
 def track(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
-    points_px: Floats,
+    first: UInt8Array,
+    second: UInt8Array,
+    points_px: Float64Array,
     *,
     window_px: int = 17,
     levels: int = 3,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from reconstruction.scan.repair import (
     RepairReport,
     ScanMeshError,
@@ -39,22 +39,20 @@ MAX_POINTS: Final = 4_000_000
 class RefinedScan:
     """A surface of many points that photographs are sampled at."""
 
-    points_mm: NDArray[np.float32]
+    points_mm: Float32Array
     """Shape (P, 3)."""
-    normals: NDArray[np.float32]
+    normals: Float32Array
     """Unit, outward, shape (P, 3)."""
-    faces: NDArray[np.int32]
+    faces: Int32Array
     """Triangles of points, shape (F, 3)."""
-    corner_uv: NDArray[np.float32]
+    corner_uv: Float32Array
     """Texture coordinates of each triangle's corners, shape (F, 3, 2), (0, 0) bottom left."""
     coarse: TriangleMesh
     """The cleaned scan that was refined, with texture coordinates: for rays."""
     report: RepairReport
     """What the cleaning found."""
 
-    def moved(
-        self, rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
-    ) -> RefinedScan:
+    def moved(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Return the surface after a rigid motion ``rotation @ p + translation_mm``."""
         turn = np.asarray(rotation, np.float64)
         coarse = TriangleMesh(
@@ -184,7 +182,7 @@ def refine(mesh: TriangleMesh, *, points: int, report: RepairReport | None = Non
     )
 
 
-def _halved(uv: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def _halved(uv: Float64Array | None) -> Float64Array | None:
     """Return texture coordinates of the four triangles of each, in the order of trimesh."""
     if uv is None:
         return None
@@ -216,9 +214,9 @@ def _split_chords(mesh: TriangleMesh) -> TriangleMesh:
         for k in rows:
             by_edge.setdefault(tuple(edges[k].tolist()), []).append(k)
         taken: set[int] = set()
-        middles: list[NDArray[np.float64]] = []
-        halves: list[NDArray[np.int64]] = []
-        half_uv: list[NDArray[np.float64]] = []
+        middles: list[Float64Array] = []
+        halves: list[Int64Array] = []
+        half_uv: list[Float64Array] = []
         for (a, b), pair in by_edge.items():
             if any(k // 3 in taken for k in pair):
                 continue

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from model.fresnel import ETA_SKIN, reflectance
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 from reconstruction.lumitexels import Camera, Lights, Surface, visibility
 from reconstruction.lumitexels.ray_casting import RayCaster
-from reconstruction.scan.repair import Faces, TriangleMesh
-
-Floats = NDArray[np.floating]
-Double = NDArray[np.float64]
+from reconstruction.scan.repair import TriangleMesh
 
 COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
 """Half vectors closer to the normal than 45 degrees may be those of a highlight."""
@@ -46,7 +44,7 @@ class RegistrationError(ValueError):
 class RayCamera(Camera, Protocol):
     """A camera that also gives the rays of its pixels."""
 
-    def rays(self, pixels: ArrayLike) -> Double:
+    def rays(self, pixels: ArrayLike) -> Float64Array:
         """Return unit vectors from the camera through pixels, shape (..., 3)."""
 
 
@@ -55,9 +53,9 @@ class NormalEvidence:
     """Normals of one view, as the light on its pixels tells them."""
 
     camera: RayCamera
-    normals: NDArray[np.float32]
+    normals: Float32Array
     """Unit, rig frame, shape (H, W, 3); zeros where unknown."""
-    weight: NDArray[np.float32]
+    weight: Float32Array
     """Trust, 0 to 1, shape (H, W)."""
     binning: int = 1
     """Camera pixels along each side of a pixel here."""
@@ -67,13 +65,13 @@ class NormalEvidence:
 class RigidFit:
     """The motion from the scan's frame to the rig's, ``rotation @ p + translation_mm``."""
 
-    rotation: Double
+    rotation: Float64Array
     """Shape (3, 3)."""
-    translation_mm: Double
+    translation_mm: Float64Array
     """Shape (3,)."""
-    center_mm: Double
+    center_mm: Float64Array
     """Centre of the scan in the rig frame; errors of turn and shift are told about it."""
-    stderr: Double
+    stderr: Float64Array
     """Of the turn about x, y, z, rad, and of the shift of `center_mm` along x, y, z, mm: (6,).
     From the scatter of residuals between cells of the surface, and from how far the last blur
     moved the fit: a blur of bent surfaces shifts them."""
@@ -83,18 +81,18 @@ class RigidFit:
     """Pairs of point and view that took part."""
     converged: bool
 
-    def move(self, points_mm: ArrayLike) -> Double:
+    def move(self, points_mm: ArrayLike) -> Float64Array:
         """Return points of the scan in the rig frame."""
         return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
 
 
 def photometric_normals(
-    stack: Floats,
+    stack: FloatArray,
     camera: RayCamera,
     lights: Lights,
     caster: RayCaster,
     *,
-    surface_normals: Floats,
+    surface_normals: FloatArray,
     binning: int = 1,
     rounds: int = 4,
 ) -> NormalEvidence:
@@ -162,14 +160,16 @@ def photometric_normals(
     )
 
 
-def _passed(cosine: Double) -> Double:
+def _passed(cosine: Float64Array) -> Float64Array:
     """Return the share of light that passes the skin's boundary at a cosine, at least 0.05."""
     at = np.linspace(0.0, 1.0, 513)
     share = 1.0 - reflectance(at, ETA_SKIN)
     return np.maximum(np.interp(cosine, at, share), 0.05)
 
 
-def _robust_normals(direction: Double, values: Floats, rounds: int) -> tuple[Double, Double]:
+def _robust_normals(
+    direction: Float64Array, values: FloatArray, rounds: int
+) -> tuple[Float64Array, Float64Array]:
     """Return unit normals, shape (P, 3), and the share of the lights that fit them."""
     good = np.isfinite(values)
     y = np.where(good, values, 0.0).astype(np.float64)
@@ -194,7 +194,7 @@ def _robust_normals(direction: Double, values: Floats, rounds: int) -> tuple[Dou
     return unit, np.where(enough, w.mean(axis=0), 0.0)
 
 
-def _median(values: Floats) -> Double:
+def _median(values: FloatArray) -> Float64Array:
     """Return the median of each column, NaN left out; 0 where nothing is left."""
     ordered = np.sort(values, axis=0)  # NaN come last
     count = np.count_nonzero(np.isfinite(values), axis=0)
@@ -207,7 +207,7 @@ def register(
     normals: ArrayLike,
     evidence: Sequence[NormalEvidence],
     *,
-    visible: NDArray[np.bool_] | None = None,
+    visible: BoolArray | None = None,
     start: tuple[ArrayLike, ArrayLike] | None = None,
     blurs_px: Sequence[float] = (8.0, 3.0, 1.5, 0.5),
     steps: int = 12,
@@ -249,7 +249,7 @@ def register(
     middle = p.mean(axis=0)
     system = _System(np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6)), np.zeros(0), 0)
     converged = False
-    at_blur: list[tuple[Double, Double]] = []
+    at_blur: list[tuple[Float64Array, Float64Array]] = []
     for blur in blurs_px:
         maps = [_blurred(view, blur) for view in evidence]
         for _ in range(steps):
@@ -290,7 +290,7 @@ def align(
     *,
     cameras: Sequence[RayCamera],
     lights: Lights,
-    stacks: Callable[[int], Floats],
+    stacks: Callable[[int], FloatArray],
     binning: int = 1,
     points: int = 6000,
     rounds: int = 3,
@@ -364,7 +364,7 @@ def align(
     return fit
 
 
-def _binned(stack: Floats) -> tuple[NDArray[np.float32], int]:
+def _binned(stack: FloatArray) -> tuple[Float32Array, int]:
     """Return images no wider than `WIDEST_PX`, and the side of their pixels; NaN spreads."""
     image, side = np.asarray(stack, np.float32), 1
     while max(image.shape[1:]) > WIDEST_PX:
@@ -374,7 +374,7 @@ def _binned(stack: Floats) -> tuple[NDArray[np.float32], int]:
     return image, side
 
 
-def _face_normals(faces: Faces, normals: Floats, fit: RigidFit | None) -> Double:
+def _face_normals(faces: Int64Array, normals: FloatArray, fit: RigidFit | None) -> Float64Array:
     """Return the mean of the vertex normals of each triangle, turned as the fit has it."""
     mean = np.asarray(normals, np.float64)[faces].sum(axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
@@ -385,16 +385,16 @@ def _face_normals(faces: Faces, normals: Floats, fit: RigidFit | None) -> Double
 class _System:
     """Normal equations of one Gauss-Newton step."""
 
-    matrix: Double
-    gradient: Double
-    by_point: Double
+    matrix: Float64Array
+    gradient: Float64Array
+    by_point: Float64Array
     """Gradient of each point, shape (P, 6)."""
-    size: Double
+    size: Float64Array
     """Length of each residual."""
     samples: int
 
 
-def _blurred(view: NormalEvidence, blur_px: float) -> NDArray[np.float32]:
+def _blurred(view: NormalEvidence, blur_px: float) -> Float32Array:
     """Return normals weighed and blurred, and the weight, shape (H, W, 4)."""
     weight = ndimage.gaussian_filter(view.weight, blur_px)
     layers = [
@@ -411,14 +411,14 @@ def _blurred(view: NormalEvidence, blur_px: float) -> NDArray[np.float32]:
 
 
 def _gauss_newton(
-    p: Double,
-    n: Double,
-    turn: Double,
-    shift: Double,
-    center: Double,
-    maps: Sequence[NDArray[np.float32]],
+    p: Float64Array,
+    n: Float64Array,
+    turn: Float64Array,
+    shift: Float64Array,
+    center: Float64Array,
+    maps: Sequence[Float32Array],
     evidence: Sequence[NormalEvidence],
-    visible: NDArray[np.bool_],
+    visible: BoolArray,
 ) -> _System:
     points, model = p @ turn.T + shift, n @ turn.T
     rows, residuals, jacobians, trusts = [], [], [], []
@@ -458,7 +458,7 @@ def _gauss_newton(
     return _System(matrix, each.sum(axis=0), by_point, size, len(row))
 
 
-def _clustered(system: _System, p: Double) -> Double:
+def _clustered(system: _System, p: Float64Array) -> Float64Array:
     """Return standard errors from the scatter of the gradient between cells of the surface."""
     _, cell = np.unique(np.floor(p / CELL_MM).astype(int), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
@@ -471,11 +471,11 @@ def _clustered(system: _System, p: Double) -> Double:
     return np.sqrt(np.diag(spread))
 
 
-def _pixels(view: NormalEvidence, points: Double) -> Double:
+def _pixels(view: NormalEvidence, points: Float64Array) -> Float64Array:
     return (view.camera.project(points) - 0.5 * (view.binning - 1)) / view.binning
 
 
-def _sampled(layers: NDArray[np.float32], at: Double) -> Double:
+def _sampled(layers: Float32Array, at: Float64Array) -> Float64Array:
     place = [np.nan_to_num(at[:, 1], nan=-9.0), np.nan_to_num(at[:, 0], nan=-9.0)]
     return np.stack(
         [
@@ -486,14 +486,14 @@ def _sampled(layers: NDArray[np.float32], at: Double) -> Double:
     ).astype(np.float64)
 
 
-def _cross(vectors: Double) -> Double:
+def _cross(vectors: Float64Array) -> Float64Array:
     """Return the matrices of the cross product by vectors, shape (K, 3, 3)."""
     x, y, z = vectors.T
     o = np.zeros_like(x)
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
 
 
-def _rotation(vector: Double) -> Double:
+def _rotation(vector: Float64Array) -> Float64Array:
     """Return the rotation by a vector, Rodrigues' formula."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-15:

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-Floats = NDArray[np.floating]
-Faces = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 WELD_MM: Final = 1e-3
 """Vertices closer than about this are one."""
@@ -32,19 +30,19 @@ class ScanMeshError(ValueError):
 class TriangleMesh:
     """Welded triangles with texture coordinates by corner."""
 
-    vertices_mm: NDArray[np.float64]
+    vertices_mm: Float64Array
     """Shape (V, 3)."""
-    faces: Faces
+    faces: Int64Array
     """Shape (F, 3), counter-clockwise seen from outside."""
-    corner_uv: NDArray[np.float64] | None = None
+    corner_uv: Float64Array | None = None
     """Texture coordinates of each corner, shape (F, 3, 2), (0, 0) bottom left; None: none yet."""
 
-    def face_vectors(self) -> NDArray[np.float64]:
+    def face_vectors(self) -> Float64Array:
         """Return normals as long as twice each triangle's area, shape (F, 3)."""
         a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
         return np.asarray(np.cross(b - a, c - a), np.float64)
 
-    def normals(self) -> NDArray[np.float32]:
+    def normals(self) -> Float32Array:
         """Return unit vertex normals, weighted by area, shape (V, 3); (0, 0, 1) for none."""
         total = np.zeros_like(self.vertices_mm)
         vectors = self.face_vectors()
@@ -57,7 +55,7 @@ class TriangleMesh:
         up = np.array([0.0, 0.0, 1.0])
         return np.where(length > 0, total / np.maximum(length, 1e-300), up).astype(np.float32)
 
-    def kept(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> TriangleMesh:
+    def kept(self, rows: BoolArray | NDArray[np.intp]) -> TriangleMesh:
         """Return some of the triangles, without vertices that none of them uses."""
         faces = self.faces[rows]
         used, faces = np.unique(faces, return_inverse=True)
@@ -179,7 +177,7 @@ def largest_surface(mesh: TriangleMesh) -> TriangleMesh:
     return mesh.kept(group == int(np.argmax(area)))
 
 
-def boundary_edges(faces: Faces) -> Faces:
+def boundary_edges(faces: Int64Array) -> Int64Array:
     """Return the directed edges that one triangle has alone, shape (E, 2)."""
     edges, _ = _edges(faces)
     _, place, counts = np.unique(
@@ -188,13 +186,13 @@ def boundary_edges(faces: Faces) -> Faces:
     return np.asarray(edges[counts[place.reshape(-1)] == 1])
 
 
-def _edges(faces: Faces) -> tuple[Faces, NDArray[np.intp]]:
+def _edges(faces: Int64Array) -> tuple[Int64Array, NDArray[np.intp]]:
     """Return all directed edges, shape (3 F, 2), and their triangles."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     return edges, np.repeat(np.arange(len(faces)), 3)
 
 
-def _pairs(faces: Faces) -> tuple[NDArray[np.intp], Bools]:
+def _pairs(faces: Int64Array) -> tuple[NDArray[np.intp], BoolArray]:
     """Return rows of edges (in `_edges`) that two triangles share, and which run the same way."""
     edges, _ = _edges(faces)
     _, place, counts = np.unique(
@@ -207,7 +205,7 @@ def _pairs(faces: Faces) -> tuple[NDArray[np.intp], Bools]:
     return order, same
 
 
-def _sound(mesh: TriangleMesh) -> Bools:
+def _sound(mesh: TriangleMesh) -> BoolArray:
     """Return the triangles that have an area."""
     faces = mesh.faces
     differ = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
@@ -234,13 +232,13 @@ def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:
         mesh = _some(mesh, ~(fins if fins.any() else crowded))
 
 
-def _some(mesh: TriangleMesh, keep: Bools) -> TriangleMesh:
+def _some(mesh: TriangleMesh, keep: BoolArray) -> TriangleMesh:
     if not keep.any():
         raise ScanMeshError("mesh: got no sound triangle, expected a surface")
     return mesh.kept(keep)
 
 
-def _face_groups(faces: Faces) -> NDArray[np.intp]:
+def _face_groups(faces: Int64Array) -> NDArray[np.intp]:
     """Return the number of the connected surface of each triangle, across shared edges."""
     pairs, _ = _pairs(faces)
     rows = pairs // 3
@@ -269,7 +267,7 @@ def _oriented(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     return _flipped(mesh, flip), int(np.count_nonzero(flip))
 
 
-def _flipped(mesh: TriangleMesh, flip: Bools) -> TriangleMesh:
+def _flipped(mesh: TriangleMesh, flip: BoolArray) -> TriangleMesh:
     faces = mesh.faces.copy()
     faces[flip] = faces[flip][:, ::-1]
     uv = None if mesh.corner_uv is None else mesh.corner_uv.copy()

@@ -45,17 +45,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.fresnel import ETA_SKIN
+from reconstruction.arrays import Float64Array, UInt8Array
 from reconstruction.subsurface import kernels, nearest
 from reconstruction.subsurface.models import METHODS, Collection, Method, profile_model
 from reconstruction.subsurface.outcome import LEFT_OUT, Outcome, SubsurfaceFit, judged
 from reconstruction.subsurface.profile_batch import ProfileBatch
 
 __all__ = [
-    "LEFT_OUT", "Outcome", "SubsurfaceError", "SubsurfaceFit", "fit_dipole", "invert",
+    "LEFT_OUT",
+    "Outcome",
+    "SubsurfaceError",
+    "SubsurfaceFit",
+    "fit_dipole",
+    "invert",
     "nearest_medium",
-]  # fmt: skip
+]
 
-Floats = NDArray[np.float64]
 
 G_SKIN, G_SKIN_ERROR = 0.825, 0.072
 """Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""
@@ -130,9 +135,16 @@ def invert(
     (0.04, 1.5)
     """
     _check_settings(
-        method, collection, eta, core_mm=core_mm, source_core_mm=source_core_mm,
-        common_error=common_error, g=g, g_error=g_error, model_error=model_error or 0.0,
-    )  # fmt: skip
+        method,
+        collection,
+        eta,
+        core_mm=core_mm,
+        source_core_mm=source_core_mm,
+        common_error=common_error,
+        g=g,
+        g_error=g_error,
+        model_error=model_error or 0.0,
+    )
     laid = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
     y, left_out = laid.y, laid.left_out
     prior = np.zeros((kernels.PARAMETERS, 2))
@@ -144,10 +156,15 @@ def invert(
     bounds = np.zeros((kernels.PARAMETERS, 2))
     for own, members in laid.by_radius():
         model = profile_model(
-            method, np.ascontiguousarray(own), eta=float(eta), collection=collection,
-            core_mm=float(core_mm), source_core_mm=float(source_core_mm), g=float(g),
+            method,
+            np.ascontiguousarray(own),
+            eta=float(eta),
+            collection=collection,
+            core_mm=float(core_mm),
+            source_core_mm=float(source_core_mm),
+            g=float(g),
             g_error=float(g_error),
-        )  # fmt: skip
+        )
         if model_error is not None:
             model = replace(model, error=np.array([float(model_error), 0.0, 0.0]))
         bounds = model.bounds
@@ -211,9 +228,15 @@ def nearest_medium(
     domain, bounds = np.zeros(laid.y.shape[0], np.bool_), np.zeros((kernels.PARAMETERS, 2))
     for own, members in laid.by_radius():
         model = profile_model(
-            "photon_table", np.ascontiguousarray(own), eta=float(eta), collection=collection,
-            core_mm=float(core_mm), source_core_mm=float(source_core_mm), g=nearest.G, g_error=0.0,
-        )  # fmt: skip
+            "photon_table",
+            np.ascontiguousarray(own),
+            eta=float(eta),
+            collection=collection,
+            core_mm=float(core_mm),
+            source_core_mm=float(source_core_mm),
+            g=nearest.G,
+            g_error=0.0,
+        )
         bounds = model.bounds
         nearest.fit_nearest(batch, model, members)
         domain[members] = model.holds(batch.theta[members])
@@ -256,15 +279,15 @@ def fit_dipole(
 class _Layout:
     """Profiles one a row, (N, F), with what of them is used."""
 
-    y: Floats
-    variance: Floats | None
-    left_out: NDArray[np.uint8]
-    radius_mm: Floats
+    y: Float64Array
+    variance: Float64Array | None
+    left_out: UInt8Array
+    radius_mm: Float64Array
     """(N or 1, F)."""
     shape: tuple[int, ...]
     """Leading axes of the profiles as given."""
 
-    def by_radius(self) -> Iterator[tuple[Floats, NDArray[np.intp]]]:
+    def by_radius(self) -> Iterator[tuple[Float64Array, NDArray[np.intp]]]:
         """Yield each set of radii with the rows that have it."""
         distinct, which = np.unique(self.radius_mm, axis=0, return_inverse=True)
         which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])

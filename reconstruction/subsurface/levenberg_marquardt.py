@@ -100,9 +100,28 @@ def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignor
 
 @njit(error_model="numpy")
 def _fit_share(  # type: ignore[no-untyped-def]
-    begin, end, kind, radius, constants, axes, grid, y, variance, model_error, logarithmic, prior,
-    bounds, theta, rounds, most, covariance, chi2, predicted, total, steps,
-):  # fmt: skip
+    begin,
+    end,
+    kind,
+    radius,
+    constants,
+    axes,
+    grid,
+    y,
+    variance,
+    model_error,
+    logarithmic,
+    prior,
+    bounds,
+    theta,
+    rounds,
+    most,
+    covariance,
+    chi2,
+    predicted,
+    total,
+    steps,
+):
     """Fit the profiles from `begin` to `end`; see `fit`."""
     fibres = radius.size
     m, trial_m = np.empty(fibres), np.empty(fibres)
@@ -291,6 +310,25 @@ def fit(
     for part in prange(parts):
         begin, end = part * profiles // parts, (part + 1) * profiles // parts
         _fit_share(
-            begin, end, kind, radius, constants, axes, grid, y, variance, model_error, logarithmic,
-            prior, bounds, theta, rounds, most, covariance, chi2, predicted, total, steps,
-        )  # fmt: skip
+            begin,
+            end,
+            kind,
+            radius,
+            constants,
+            axes,
+            grid,
+            y,
+            variance,
+            model_error,
+            logarithmic,
+            prior,
+            bounds,
+            theta,
+            rounds,
+            most,
+            covariance,
+            chi2,
+            predicted,
+            total,
+            steps,
+        )

@@ -12,15 +12,14 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from model import fresnel
 from model.dipole import kienle_patterson as diffusion
 from model.photon_table import table as photon_table
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.subsurface import kernels
 
-Floats = NDArray[np.float64]
 Method = Literal["photon_table", "diffusion", "dipole"]
 METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
 Collection = Literal["all", "fibre"]
@@ -82,45 +81,55 @@ class ProfileModel:
         Greatest sigma_a/sigma_s' that the model is good for.
     """
 
-    radius_mm: Floats
+    radius_mm: Float64Array
     kind: int
-    constants: Floats
-    axes: Floats
-    grid: Floats
-    bounds: Floats
-    error: Floats
+    constants: Float64Array
+    axes: Float64Array
+    grid: Float64Array
+    bounds: Float64Array
+    error: Float64Array
     bias: tuple[float, float]
     most_ratio: float
 
-    def profiles(self, theta: Floats) -> tuple[Floats, Floats]:
+    def profiles(self, theta: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return profiles (N, F), 1/mm^2, of parameters (N, 4), and derivatives (N, 4, F)."""
         out = np.empty((theta.shape[0], self.radius_mm.size))
         slopes = np.zeros((theta.shape[0], kernels.PARAMETERS, self.radius_mm.size))
         kernels.evaluate(
-            self.kind, np.ascontiguousarray(theta), self.radius_mm, self.constants, self.axes,
-            self.grid, out, slopes,
-        )  # fmt: skip
+            self.kind,
+            np.ascontiguousarray(theta),
+            self.radius_mm,
+            self.constants,
+            self.axes,
+            self.grid,
+            out,
+            slopes,
+        )
         return out, slopes
 
-    def holds(self, theta: Floats) -> NDArray[np.bool_]:
+    def holds(self, theta: Float64Array) -> BoolArray:
         """Return where the model is good for parameters (N, 4)."""
         return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
 
-    def relative_variance(self, theta: Floats) -> Floats:
+    def relative_variance(self, theta: Float64Array) -> Float64Array:
         """Return the model's own squared relative error at every fibre, (N, F)."""
         a, s = np.exp(theta[:, :1]), np.exp(theta[:, 1:2])
         everywhere, near, by_ratio = self.error
         source = near * np.exp(-self.radius_mm * (a + s))
         return np.asarray(everywhere**2 + source**2 + (by_ratio * a / s) ** 2)
 
-    def systematic(self, theta: Floats) -> Floats:
+    def systematic(self, theta: Float64Array) -> Float64Array:
         """Return by how much log sigma_tr is off for the model's sake, (N,)."""
         ratio = np.minimum(np.exp(theta[:, 0] - theta[:, 1]), 1.0)
         return np.asarray(self.bias[0] + self.bias[1] * ratio)
 
     def starts(
-        self, log_reflectance: Floats, weight: Floats, g: float, common_error: float = 0.0
-    ) -> tuple[Floats, Floats, Floats]:
+        self,
+        log_reflectance: Float64Array,
+        weight: Float64Array,
+        g: float,
+        common_error: float = 0.0,
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return where fits begin: the valleys of the misfit of logarithms along sigma_s'.
 
         For each sigma_s' of a grid the best sigma_tr is found, between its grid's nodes by the
@@ -171,9 +180,11 @@ class ProfileModel:
                     score -= left
             score += nowhere
             kernels.valleys(
-                score.reshape(-1, log_s.size, log_k.size), valley[:, part], place[:, part],
+                score.reshape(-1, log_s.size, log_k.size),
+                valley[:, part],
+                place[:, part],
                 depth[:, part],
-            )  # fmt: skip
+            )
         ends = []
         for which, at in zip(valley, place, strict=True):
             start = np.zeros((which.size, kernels.PARAMETERS))
@@ -195,7 +206,7 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="blas")
 
 
-def _log_absorption(log_sigma_tr: Floats, log_sigma_s: Floats) -> Floats:
+def _log_absorption(log_sigma_tr: Float64Array, log_sigma_s: Float64Array) -> Float64Array:
     """Return log sigma_a of sigma_tr and sigma_s', without cancellation."""
     x = 2.0 / 3.0 * np.exp(2.0 * (log_sigma_tr - log_sigma_s))
     return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
@@ -203,7 +214,7 @@ def _log_absorption(log_sigma_tr: Floats, log_sigma_s: Floats) -> Floats:
 
 def profile_model(
     method: Method,
-    radius_mm: Floats,
+    radius_mm: Float64Array,
     *,
     eta: float,
     collection: Collection,
@@ -265,11 +276,19 @@ def _tabled(
     decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
     for n, each in enumerate(asymmetries):
 
-        def told(r: Floats, own_mm: float, source_mm: float, g: float = float(each)) -> Floats:
+        def told(
+            r: Float64Array, own_mm: float, source_mm: float, g: float = float(each)
+        ) -> Float64Array:
             profile = photon_table.reflectance(
-                r, a[..., None], s[..., None], eta=eta, g=g, collection=collection,
-                core_mm=own_mm, source_core_mm=source_mm,
-            )  # fmt: skip
+                r,
+                a[..., None],
+                s[..., None],
+                eta=eta,
+                g=g,
+                collection=collection,
+                core_mm=own_mm,
+                source_core_mm=source_mm,
+            )
             return np.asarray(np.log(np.maximum(profile, 1e-290)))
 
         # of points, as light turns diffuse within the cores of fibres where much is scattered
@@ -281,14 +300,26 @@ def _tabled(
     bounds[3] = low, high
     axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
     return ProfileModel(
-        radius_mm, kernels.TABLE, np.zeros(4), axes, grid, bounds, TABLE_ERROR,
-        (0.0, 0.0), photon_table.MAX_ABSORPTION_RATIO,
-    )  # fmt: skip
+        radius_mm,
+        kernels.TABLE,
+        np.zeros(4),
+        axes,
+        grid,
+        bounds,
+        TABLE_ERROR,
+        (0.0, 0.0),
+        photon_table.MAX_ABSORPTION_RATIO,
+    )
 
 
 def _diffused(
-    log_profile: Floats, radius_mm: Floats, a: Floats, s: Floats, log_end: Floats, eta: float
-) -> Floats:
+    log_profile: Float64Array,
+    radius_mm: Float64Array,
+    a: Float64Array,
+    s: Float64Array,
+    log_end: Float64Array,
+    eta: float,
+) -> Float64Array:
     """Return what diffusion in place of a table's far end adds to its logarithms, (S, U, F).
 
     Parameters
@@ -306,13 +337,13 @@ def _diffused(
     return np.asarray(share * (continued - log_profile))
 
 
-def _dipole(eta: float) -> tuple[Floats, Floats, tuple[float, float]]:
+def _dipole(eta: float) -> tuple[Float64Array, Float64Array, tuple[float, float]]:
     """Return constants of Jensen's dipole; its error, equal for all fibres."""
     stretch = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
     return np.array([stretch, 0.0, 1.0, 1.0]), DIPOLE_ERROR, DIPOLE_BIAS
 
 
-def _diffusion(eta: float) -> tuple[Floats, Floats, tuple[float, float]]:
+def _diffusion(eta: float) -> tuple[Float64Array, Float64Array, tuple[float, float]]:
     """Return constants of Kienle and Patterson's diffusion; its error grows at the source."""
     stretch, (c_phi, c_j) = diffusion.image_depth(eta), diffusion.exit_coefficients(eta)
     return np.array([stretch, c_phi, c_j, 1.0]), DIFFUSION_ERROR, DIFFUSION_BIAS

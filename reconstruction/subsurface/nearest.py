@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.subsurface.models import LEAST_LOG, ProfileModel
 from reconstruction.subsurface.profile_batch import (
     LEAST_DEVIATION,
@@ -38,9 +39,6 @@ from reconstruction.subsurface.profile_batch import (
     fits_from,
 )
 from reconstruction.subsurface.smooth_misfit import smooth_misfit
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 G: Final = 0.8
 """Asymmetry of the media, of the definition."""
@@ -129,8 +127,8 @@ def fit_nearest(batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.int
 
 
 def _readings(
-    batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.intp], profile: Floats
-) -> tuple[Floats, Floats]:
+    batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.intp], profile: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return logarithms of readings about a profile's, and their variances, each (N, F).
 
     Parameters
@@ -149,8 +147,8 @@ def _readings(
 
 
 def _starts(
-    batch: ProfileBatch, model: ProfileModel, logs: Floats, counts: Bools
-) -> tuple[Floats, ...]:
+    batch: ProfileBatch, model: ProfileModel, logs: Float64Array, counts: BoolArray
+) -> tuple[Float64Array, ...]:
     """Return where fits begin, each (N, 4): two valleys, and the most scattering there is."""
     best, second, _ = model.starts(
         logs, counts / START_ERROR**2, float(batch.prior[3, 0]), float(batch.prior[2, 1])
@@ -164,9 +162,14 @@ def _starts(
 
 
 def _nearest_of(
-    batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.intp], logs: Floats,
-    wide: Floats, starts: tuple[Floats, ...], error: Floats | None = None,
-) -> Floats:  # fmt: skip
+    batch: ProfileBatch,
+    model: ProfileModel,
+    chosen: NDArray[np.intp],
+    logs: Float64Array,
+    wide: Float64Array,
+    starts: tuple[Float64Array, ...],
+    error: Float64Array | None = None,
+) -> Float64Array:
     """Fit from every start, keep the nearest medium; return what the others leave in doubt.
 
     Media may be as near as each other and far apart. Which one is nearest, a table that is off by
@@ -178,7 +181,7 @@ def _nearest_of(
     for number, start in enumerate(starts):
         alone = fits_from(model, logs, wide, start.copy(), batch.prior, logarithmic=True)
         batch.keep(chosen, alone, better=number > 0)
-        known: Bools = np.isfinite(wide)
+        known: BoolArray = np.isfinite(wide)
         off = np.where(known, logs - np.log(np.maximum(alone.predicted, 1e-290)), 0.0)
         prior = (START_ERROR * alone.theta[:, 2] / DIMMING) ** 2
         square.append(((off**2).sum(axis=1) + prior) / np.maximum(known.sum(axis=1), 1))
@@ -200,8 +203,13 @@ def _nearest_of(
 
 
 def _covariance(
-    model: ProfileModel, theta: Floats, off: Floats, owed: Bools, error: Floats, spread: Floats
-) -> Floats:
+    model: ProfileModel,
+    theta: Float64Array,
+    off: Float64Array,
+    owed: BoolArray,
+    error: Float64Array,
+    spread: Float64Array,
+) -> Float64Array:
     """Return the covariance of the parameters, (N, 4, 4), by that of profiles; see the module."""
     share = owed.astype(np.float64)
     first = _slopes(model, theta)
@@ -226,7 +234,7 @@ def _covariance(
     return covariance
 
 
-def _slopes(model: ProfileModel, theta: Floats) -> Floats:
+def _slopes(model: ProfileModel, theta: Float64Array) -> Float64Array:
     """Return the derivatives of log R by the free parameters, (N, 3, F)."""
     value, slope = model.profiles(np.ascontiguousarray(theta))
     return np.asarray(slope[:, :FREE] / np.maximum(value, 1e-290)[:, None])

@@ -7,15 +7,11 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincc, stdtrit
 
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, UInt16Array
 from reconstruction.subsurface.models import Method
 from reconstruction.subsurface.profile_batch import FEWEST_READINGS, MISFIT_CHANCE, ProfileBatch
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Codes = NDArray[np.uint16]
 
 FEWEST_FIBRES = 4
 LOG_LIMIT = 0.5
@@ -120,41 +116,41 @@ class SubsurfaceFit:
     method : str
     """
 
-    sigma_a_per_mm: Floats
-    sigma_s_prime_per_mm: Floats
-    sigma_tr_per_mm: Floats
-    covariance: Floats
-    valid: Bools
-    sigma_tr_stderr: Floats
-    interval_per_mm: Floats
-    chi2: Floats
-    dof: NDArray[np.int64]
-    p_value: Floats
-    inflation: Floats
-    model_error: Floats
-    bent: Bools
-    used: Bools
-    left_out: NDArray[np.uint8]
-    outcome: Codes
-    predicted_per_mm2: Floats
-    residual: Floats
-    scale: Floats
-    asymmetry: Floats
-    evaluations: NDArray[np.int64]
+    sigma_a_per_mm: Float64Array
+    sigma_s_prime_per_mm: Float64Array
+    sigma_tr_per_mm: Float64Array
+    covariance: Float64Array
+    valid: BoolArray
+    sigma_tr_stderr: Float64Array
+    interval_per_mm: Float64Array
+    chi2: Float64Array
+    dof: Int64Array
+    p_value: Float64Array
+    inflation: Float64Array
+    model_error: Float64Array
+    bent: BoolArray
+    used: BoolArray
+    left_out: UInt8Array
+    outcome: UInt16Array
+    predicted_per_mm2: Float64Array
+    residual: Float64Array
+    scale: Float64Array
+    asymmetry: Float64Array
+    evaluations: Int64Array
     method: Method
 
     @property
-    def sigma_a_stderr(self) -> Floats:
+    def sigma_a_stderr(self) -> Float64Array:
         """Standard error of sigma_a, 1/mm, shape (...)."""
         return np.asarray(np.sqrt(self.covariance[..., 0, 0]))
 
     @property
-    def sigma_s_prime_stderr(self) -> Floats:
+    def sigma_s_prime_stderr(self) -> Float64Array:
         """Standard error of sigma_s', 1/mm, shape (...)."""
         return np.asarray(np.sqrt(self.covariance[..., 1, 1]))
 
     @property
-    def correlation(self) -> Floats:
+    def correlation(self) -> Float64Array:
         """Correlation of sigma_a and sigma_s', shape (...); NaN where nothing is told."""
         spread = self.sigma_a_stderr * self.sigma_s_prime_stderr
         known = np.isfinite(spread) & (spread > 0.0)
@@ -162,7 +158,7 @@ class SubsurfaceFit:
         return np.divide(self.covariance[..., 0, 1], spread, out=ratio, where=known)
 
     @property
-    def coefficients_identified(self) -> Bools:
+    def coefficients_identified(self) -> BoolArray:
         """Whether sigma_a and sigma_s' are told one by one; `valid` speaks of sigma_tr alone."""
         unclear = Outcome.COEFFICIENTS_NOT_IDENTIFIED | Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL
         return np.asarray((self.outcome & np.uint16(unclear)) == 0)
@@ -181,10 +177,10 @@ class SubsurfaceFit:
 
 def judged(
     batch: ProfileBatch,
-    bounds: Floats,
-    inside: Bools,
-    bias: Floats,
-    left_out: NDArray[np.uint8],
+    bounds: Float64Array,
+    inside: BoolArray,
+    bias: Float64Array,
+    left_out: UInt8Array,
     shape: tuple[int, ...],
     method: Method,
 ) -> SubsurfaceFit:
@@ -195,7 +191,7 @@ def judged(
     dof = np.maximum(fibres - 2, 0)
     p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
     reduced = batch.chi2 / np.maximum(dof, 1)
-    misfit: Bools = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_CHANCE)
+    misfit: BoolArray = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_CHANCE)
     inflation = np.where(
         (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
     )
@@ -280,7 +276,7 @@ def judged(
     )
 
 
-def _residuals(batch: ProfileBatch) -> Floats:
+def _residuals(batch: ProfileBatch) -> Float64Array:
     """Return residuals over their standard deviations, (N, F), 0 where a fibre is not used."""
     value = batch.predicted
     if batch.logarithmic:
@@ -290,7 +286,7 @@ def _residuals(batch: ProfileBatch) -> Floats:
     return residual
 
 
-def _bent(batch: ProfileBatch) -> Bools:
+def _bent(batch: ProfileBatch) -> BoolArray:
     """Return whose neighbouring fibres agree about the misfit by more than chance, (N,).
 
     By their correlation, of fibres as far as their noise is below the misfit: that of n
@@ -310,7 +306,7 @@ def _bent(batch: ProfileBatch) -> Bools:
     return np.asarray(alike > BY_CHANCE / np.sqrt(pairs) * (off**2).sum(axis=1) / alone)
 
 
-def _repeats(residual: Floats) -> Floats:
+def _repeats(residual: Float64Array) -> Float64Array:
     """Return how many neighbours tell the same, from the residuals' correlation, (N,).
 
     A medium that the model does not describe leaves residuals that are smooth over the fibres;
@@ -322,7 +318,9 @@ def _repeats(residual: Floats) -> Floats:
     return np.asarray((1.0 + c) / (1.0 - c))
 
 
-def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
+def _interval(
+    sigma_tr: Float64Array, log_stderr: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return the ends of the 68 % interval of sigma_tr.
 
     Symmetric in the logarithm while that is well told; then in sigma_tr^2, which a profile is
@@ -338,7 +336,7 @@ def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
     return np.where(nothing, 0.0, low), np.where(nothing, math.inf, high)
 
 
-def _deviation(sigma_tr: Floats, log_stderr: Floats) -> Floats:
+def _deviation(sigma_tr: Float64Array, log_stderr: Float64Array) -> Float64Array:
     """Return the standard error, half the interval where that is wide; infinite where unknown."""
     low, high = _interval(sigma_tr, log_stderr)
     half = np.full(sigma_tr.shape, math.inf)

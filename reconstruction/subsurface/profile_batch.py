@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import gammaincc
 
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 from reconstruction.subsurface import levenberg_marquardt
 from reconstruction.subsurface.models import ProfileModel
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FEWEST_READINGS = 3
 """Fibres that must stand out of the noise by `SIGNAL` standard deviations."""
@@ -47,31 +45,33 @@ RISE = 50.0
 class ProfileBatch:
     """Profiles as the kernel takes them, and what it makes of them."""
 
-    y: Floats
+    y: Float64Array
     """Reflectance, or its logarithm; 0 where not used."""
-    variance: Floats
+    variance: Float64Array
     """Of `y`, infinite where not used."""
-    used: Bools
+    used: BoolArray
     logarithmic: bool
-    prior: Floats
-    seen: Bools
+    prior: Float64Array
+    seen: BoolArray
     """Readings that stand out of their noise."""
-    theta: Floats
-    covariance: Floats
-    chi2: Floats
-    predicted: Floats
-    total: Floats
+    theta: Float64Array
+    covariance: Float64Array
+    chi2: Float64Array
+    predicted: Float64Array
+    total: Float64Array
     """Variance of `y` with the model's error."""
-    steps: NDArray[np.int64]
-    odd: Bools
+    steps: Int64Array
+    odd: BoolArray
     """Fibres left out as outliers."""
-    spread: Floats
+    spread: Float64Array
     """Relative model error found from the residuals, 0 without a misfit."""
     erring: bool = True
     """Whether `spread` is an error of what is estimated; not of what is nearest by definition."""
 
     @classmethod
-    def of(cls, y: Floats, variance: Floats | None, used: Bools, prior: Floats) -> ProfileBatch:
+    def of(
+        cls, y: Float64Array, variance: Float64Array | None, used: BoolArray, prior: Float64Array
+    ) -> ProfileBatch:
         """Lay out profiles (N, F)."""
         n, fibres = y.shape
         clean = np.where(used, y, 0.0)
@@ -83,10 +83,21 @@ class ProfileBatch:
             spread = np.where(used, variance, math.inf)
             seen = used & (clean > SIGNAL * np.sqrt(spread))
         return cls(
-            clean, spread, used.copy(), variance is None, prior, seen, np.zeros((n, 4)),
-            np.zeros((n, 4, 4)), np.zeros(n), np.zeros((n, fibres)), np.zeros((n, fibres)),
-            np.zeros(n, np.int64), np.zeros(y.shape, np.bool_), np.zeros(n),
-        )  # fmt: skip
+            clean,
+            spread,
+            used.copy(),
+            variance is None,
+            prior,
+            seen,
+            np.zeros((n, 4)),
+            np.zeros((n, 4, 4)),
+            np.zeros(n),
+            np.zeros((n, fibres)),
+            np.zeros((n, fibres)),
+            np.zeros(n, np.int64),
+            np.zeros(y.shape, np.bool_),
+            np.zeros(n),
+        )
 
     def fit(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
         """Fit some of the profiles from the best of the starts on."""
@@ -120,7 +131,7 @@ class ProfileBatch:
             if far.size:
                 self._compare_logarithms(model, chosen[far], logs[far], best[far], second[far])
 
-    def _widen(self, model: ProfileModel, chosen: NDArray[np.intp], begin: Floats) -> None:
+    def _widen(self, model: ProfileModel, chosen: NDArray[np.intp], begin: Float64Array) -> None:
         """Fit profiles again that the model does not describe, with its error from the residuals.
 
         The same relative error at all fibres, so that the fit is the best in relative terms, as
@@ -151,7 +162,7 @@ class ProfileBatch:
         self.seen[chosen] &= kept
         self.spread[chosen] = np.median(spread / np.maximum(m, 1e-290), axis=1)
 
-    def _relative(self, chosen: NDArray[np.intp]) -> Floats:
+    def _relative(self, chosen: NDArray[np.intp]) -> Float64Array:
         """Return the median of the relative residuals of what stands out of its noise."""
         off = np.abs(self.y[chosen] / np.maximum(self.predicted[chosen], 1e-290) - 1.0)
         seen = self.seen[chosen]
@@ -163,9 +174,9 @@ class ProfileBatch:
         self,
         model: ProfileModel,
         chosen: NDArray[np.intp],
-        logs: Floats,
-        best: Floats,
-        second: Floats,
+        logs: Float64Array,
+        best: Float64Array,
+        second: Float64Array,
     ) -> None:
         """Fit profiles of no such medium by their logarithms, from the best of the starts on.
 
@@ -199,7 +210,7 @@ class ProfileBatch:
         self.used[chosen] = seen
         self.spread[chosen] = spread
 
-    def _misfits(self, chosen: NDArray[np.intp]) -> Bools:
+    def _misfits(self, chosen: NDArray[np.intp]) -> BoolArray:
         """Return which fits are so bad that another minimum may be better."""
         seen = self.seen[chosen].sum(axis=1)
         dof = np.maximum(seen - 2, 1)
@@ -211,9 +222,9 @@ class ProfileBatch:
         self,
         model: ProfileModel,
         chosen: NDArray[np.intp],
-        y: Floats,
-        variance: Floats,
-        theta: Floats,
+        y: Float64Array,
+        variance: Float64Array,
+        theta: Float64Array,
         *,
         better: bool = False,
         logarithmic: bool | None = None,
@@ -238,52 +249,79 @@ class ProfileBatch:
 class Fits:
     """What the kernel makes of profiles from one start of each."""
 
-    theta: Floats
+    theta: Float64Array
     """(N, 4)."""
-    covariance: Floats
+    covariance: Float64Array
     """(N, 4, 4)."""
-    chi2: Floats
+    chi2: Float64Array
     """(N,)."""
-    predicted: Floats
+    predicted: Float64Array
     """(N, F)."""
-    total: Floats
+    total: Float64Array
     """(N, F) variance with the model's error."""
-    steps: NDArray[np.int64]
+    steps: Int64Array
     """(N,) evaluations, negative where it did not converge."""
 
 
 def fits_from(
-    model: ProfileModel, y: Floats, variance: Floats, theta: Floats, prior: Floats,
+    model: ProfileModel,
+    y: Float64Array,
+    variance: Float64Array,
+    theta: Float64Array,
+    prior: Float64Array,
     logarithmic: bool,
-) -> Fits:  # fmt: skip
+) -> Fits:
     """Fit profiles from `theta` on, see `levenberg_marquardt.fit`; `theta` becomes the result."""
     n = y.shape[0]
     fits = Fits(
-        theta, np.empty((n, 4, 4)), np.empty(n), np.empty(y.shape), np.empty(y.shape),
+        theta,
+        np.empty((n, 4, 4)),
+        np.empty(n),
+        np.empty(y.shape),
+        np.empty(y.shape),
         np.empty(n, np.int64),
-    )  # fmt: skip
+    )
     parts = min(get_num_threads(), max(1, n // 64))
     levenberg_marquardt.fit(
-        model.kind, model.radius_mm, model.constants, model.axes, model.grid, y, variance,
-        model.error, logarithmic, prior, model.bounds, theta, ROUNDS, STEPS, parts,
-        fits.covariance, fits.chi2, fits.predicted, fits.total, fits.steps,
-    )  # fmt: skip
+        model.kind,
+        model.radius_mm,
+        model.constants,
+        model.axes,
+        model.grid,
+        y,
+        variance,
+        model.error,
+        logarithmic,
+        prior,
+        model.bounds,
+        theta,
+        ROUNDS,
+        STEPS,
+        parts,
+        fits.covariance,
+        fits.chi2,
+        fits.predicted,
+        fits.total,
+        fits.steps,
+    )
     return fits
 
 
-def _sum_over(kept: Bools, squares: Floats, variance: Floats) -> Floats:
+def _sum_over(kept: BoolArray, squares: Float64Array, variance: Float64Array) -> Float64Array:
     """Return sums of squares over variances of the fibres kept, (N,)."""
     ratio = np.zeros(squares.shape)
     np.divide(squares, variance, out=ratio, where=kept)
     return np.asarray(ratio.sum(axis=1))
 
 
-def _log_volume(total: Floats) -> Floats:
+def _log_volume(total: Float64Array) -> Float64Array:
     """Return the sum of the logarithms of the variances of what is used."""
     return np.asarray(np.log(np.where(np.isfinite(total), total, 1.0) + 1e-300).sum(axis=1))
 
 
-def _local_variance(radius_mm: Floats, residual: Floats, seen: Bools) -> Floats:
+def _local_variance(
+    radius_mm: Float64Array, residual: Float64Array, seen: BoolArray
+) -> Float64Array:
     """Return each fibre's variance from the squared residuals around it, infinite where unseen."""
     order = np.argsort(radius_mm, kind="stable")
     width = 2 * NEIGHBOURS + 1

@@ -17,9 +17,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from reconstruction.arrays import Float64Array
 
 STRENGTHS: Final = np.geomspace(1e-3, 1e3, 31)
 """Of the second derivative by the root of mm, variance over a root of mm: from next to straight
@@ -31,7 +30,9 @@ WEAKEST: Final = 1e-6
 """Information of a reading that is none, so that even without any the rest is finite."""
 
 
-def smooth_misfit(radius_mm: Floats, value: Floats, variance: Floats) -> tuple[Floats, Floats]:
+def smooth_misfit(
+    radius_mm: Float64Array, value: Float64Array, variance: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return smooth curves through noisy values, and their covariances.
 
     Parameters
@@ -70,7 +71,9 @@ def smooth_misfit(radius_mm: Floats, value: Floats, variance: Floats) -> tuple[F
     return np.asarray((covariance @ (weight * told)[..., None])[..., 0]), np.asarray(covariance)
 
 
-def log_posterior(bend: Floats, mass: Floats, value: Floats, weight: Floats) -> Floats:
+def log_posterior(
+    bend: Float64Array, mass: Float64Array, value: Float64Array, weight: Float64Array
+) -> Float64Array:
     """Return twice the logarithm of how likely each of `STRENGTHS` is, up to a constant.
 
     With Q and R of the penalty Q R^-1 Q' and W the weights, what is left after level and slope is
@@ -108,7 +111,7 @@ def log_posterior(bend: Floats, mass: Floats, value: Floats, weight: Floats) -> 
     return np.asarray(-(rest**2 / pivot + np.log(pivot)).sum(axis=0) - usual)
 
 
-def _below(bend: Floats, mass: Floats, variance: Floats, by: int) -> Floats:
+def _below(bend: Float64Array, mass: Float64Array, variance: Float64Array, by: int) -> Float64Array:
     """Return a diagonal of s R + Q' V Q for each of `STRENGTHS`, (F - 2, N, S); 0 past its end."""
     inner = np.arange(mass.shape[0] - by)
     pairs = bend[:, inner] * bend[:, inner + by]
@@ -118,7 +121,7 @@ def _below(bend: Floats, mass: Floats, variance: Floats, by: int) -> Floats:
     return out
 
 
-def _whole(weight: Floats, penalty: Floats, strength: Floats) -> Floats:
+def _whole(weight: Float64Array, penalty: Float64Array, strength: Float64Array) -> Float64Array:
     """Return the information of readings and smoothness, (N, F, F)."""
     whole = penalty / strength[:, None, None]
     fibres = np.arange(penalty.shape[0])
@@ -126,7 +129,7 @@ def _whole(weight: Floats, penalty: Floats, strength: Floats) -> Floats:
     return np.asarray(whole)
 
 
-def _bends(place: Floats) -> tuple[Floats, Floats]:
+def _bends(place: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return Q, (F, F - 2), and R, (F - 2, F - 2).
 
     The integral of the squared second derivative of the natural cubic spline through y is

@@ -22,19 +22,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 from threadpoolctl import ThreadpoolController
 
 from model.translucency_population import TranslucencyPopulation, weyrich_2005
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_table
-
-Floats: TypeAlias = NDArray[np.float64]
-Float32s: TypeAlias = NDArray[np.float32]
-Bools: TypeAlias = NDArray[np.bool_]
 
 SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
     "forehead": (0.500, 0.820),
@@ -84,9 +81,9 @@ class TranslucencyPrior:
     source : str
     """
 
-    log_mean: Floats
-    person_deviation: Floats
-    place_deviation: Floats
+    log_mean: Float64Array
+    person_deviation: Float64Array
+    place_deviation: Float64Array
     length_mm: float = LENGTH_MM
     source: str = ""
 
@@ -173,12 +170,12 @@ class TranslucencyMap:
         Place and channel whose repeats contradict each other, and how; their error was widened.
     """
 
-    values: Float32s
-    stderr: Float32s
-    valid: Bools
-    log_stderr: Float32s
-    used: Bools
-    p_value: Floats
+    values: Float32Array
+    stderr: Float32Array
+    valid: BoolArray
+    log_stderr: Float32Array
+    used: BoolArray
+    p_value: Float64Array
     left_out: tuple[tuple[str, str], ...]
     conflicts: tuple[tuple[str, str], ...]
 
@@ -305,7 +302,7 @@ def _checked(
     valid: ArrayLike | None,
     names: Sequence[str] | None,
     prior: TranslucencyPrior,
-) -> tuple[Floats, Floats, Floats, Bools, list[str]]:
+) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray, list[str]]:
     at = np.asarray(sites_uv, np.float64)
     sigma = np.asarray(sigma_tr_per_mm, np.float64)
     stderr = np.asarray(stderr_per_mm, np.float64)
@@ -330,8 +327,8 @@ def _checked(
 
 
 def _usable(
-    sigma: Floats, stderr: Floats, good: Bools, labels: list[str]
-) -> tuple[Bools, list[tuple[str, str]]]:
+    sigma: Float64Array, stderr: Float64Array, good: BoolArray, labels: list[str]
+) -> tuple[BoolArray, list[tuple[str, str]]]:
     """Return which measurements count (S, C), and why the others do not."""
     usable = np.zeros(good.shape, bool)
     left_out = []
@@ -354,13 +351,15 @@ def _usable(
 class _Places:
     """Different places of one channel: positions (P, 2), mm; logs and their variances (P,)."""
 
-    at_mm: Floats
-    log: Floats
-    variance: Floats
+    at_mm: Float64Array
+    log: Float64Array
+    variance: Float64Array
     conflicts: tuple[tuple[str, str], ...]
 
 
-def _merged(at_mm: Floats, log: Floats, error: Floats, labels: list[str]) -> _Places:
+def _merged(
+    at_mm: Float64Array, log: Float64Array, error: Float64Array, labels: list[str]
+) -> _Places:
     """Average repeats of a place by their errors, wider where these do not explain the scatter."""
     # an error of 0 would leave no weight to others; that of rounding is as good
     error = np.maximum(error, 1e-7)
@@ -391,16 +390,16 @@ def _merged(at_mm: Floats, log: Floats, error: Floats, labels: list[str]) -> _Pl
 class _Posterior:
     """Normal posterior of log(1/sigma_tr) over the texture, one channel."""
 
-    at_mm: Floats
+    at_mm: Float64Array
     length_mm: float
     log_mean: float
     shared: float
     """Prior variance of the person's level."""
     local: float
     """Prior variance of a place about it."""
-    inverse: Floats
+    inverse: Float64Array
     """Of the covariance of what was measured, (P, P)."""
-    pull: Floats
+    pull: Float64Array
     """That inverse times what was measured above the mean, (P,)."""
     p_value: float
 
@@ -419,7 +418,7 @@ class _Posterior:
         p_value = float(stats.chi2.sf(max(float(off @ pull), 0.0), off.size))
         return cls(places.at_mm, prior.length_mm, mean, shared, local, inverse, pull, p_value)
 
-    def over(self, u_mm: Floats, v_mm: Floats) -> tuple[Floats, Floats]:
+    def over(self, u_mm: Float64Array, v_mm: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return mean and standard deviation (H, W) at columns ``u_mm`` and rows ``v_mm``.
 
         The kernel is a product of one over u and one over v, so maps are products of few columns.
@@ -446,7 +445,7 @@ class _Posterior:
         return mean, np.sqrt(variance, out=variance)
 
 
-def _product(constant: float, rows: Floats, columns: Floats) -> Floats:
+def _product(constant: float, rows: Float64Array, columns: Float64Array) -> Float64Array:
     """Return ``constant + rows columns'``, (H, W), in one pass."""
     left = np.column_stack([np.full(len(rows), constant), rows])
     right = np.column_stack([np.ones(len(columns)), columns])
@@ -455,7 +454,7 @@ def _product(constant: float, rows: Floats, columns: Floats) -> Floats:
 
 def sites_of_labels(
     labels: Iterable[str], landmarks: Mapping[str, tuple[float, float]] | None = None
-) -> Floats:
+) -> Float64Array:
     """Return the texture coordinates (S, 2) of a session's sites.
 
     Parameters

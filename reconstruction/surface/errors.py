@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface.estimates import PointValues
-
-Double = NDArray[np.float64]
 
 MISPLACED_PX: Final = 0.27
 """Standard deviation of where a sample is on the surface, over the size of a pixel."""
@@ -48,15 +47,15 @@ LEAST_SPACING_PX: Final = 0.25
 
 
 def change_per_mm(
-    values: Double,
-    points_mm: NDArray[np.floating],
+    values: Float64Array,
+    points_mm: FloatArray,
     faces: NDArray[np.integer],
-    valid: NDArray[np.bool_],
+    valid: BoolArray,
     *,
     pixel_mm: float,
-    noise: Double | None = None,
+    noise: Float64Array | None = None,
     rings: int = 0,
-) -> Double:
+) -> Float64Array:
     """Return how fast a quantity changes over a surface about each of its points.
 
     Parameters
@@ -160,9 +159,14 @@ def of_albedo(
     point's own by a part, and by `SHARED_DETAIL` between those of the whole face (their median).
     """
     change = change_per_mm(
-        r_d.values, surface.points_mm, surface.faces, r_d.valid,
-        pixel_mm=pixel_mm, noise=r_d.stderr, rings=RINGS,
-    )  # fmt: skip
+        r_d.values,
+        surface.points_mm,
+        surface.faces,
+        r_d.valid,
+        pixel_mm=pixel_mm,
+        noise=r_d.stderr,
+        rings=RINGS,
+    )
     known = change[r_d.valid]
     typical = np.median(known, axis=0) if len(known) else np.zeros(change.shape[1])
     change = np.hypot(np.sqrt(1.0 - SHARED_DETAIL) * change, np.sqrt(SHARED_DETAIL) * typical)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from model import fresnel
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo, photometric_stereo
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
 from reconstruction.lumitexels.store import LumitexelStore
@@ -44,7 +45,6 @@ point err alike: by the lobes' shape, the normal and the light from inside that 
 simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
 LOBE_TILT_RAD: Final = np.radians(0.3)
 """Standard error, in each direction, of normals by highlights: lobes are known no better."""
-Double = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,9 +61,9 @@ class PointValues:
         (P,) bool.
     """
 
-    values: Double
-    stderr: Double
-    valid: NDArray[np.bool_]
+    values: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
 
 
 def chunk_points(store: LumitexelStore) -> int:
@@ -71,12 +71,12 @@ def chunk_points(store: LumitexelStore) -> int:
     return max(1, CHUNK_SAMPLES // max(store.light_count * store.view_count, 1))
 
 
-def transmitted(cos_light: NDArray[np.floating], cos_view: NDArray[np.floating]) -> Double:
+def transmitted(cos_light: FloatArray, cos_view: FloatArray) -> Float64Array:
     """Return F_t(light) F_t(view), the share that the skin's boundary lets in and out again."""
     return boundary_kernels.transmitted(np.asarray(cos_light), np.asarray(cos_view))
 
 
-def seen_enough(samples: Lumitexels) -> NDArray[np.bool_]:
+def seen_enough(samples: Lumitexels) -> BoolArray:
     """Return which points have samples of enough lights and views, shape (P,)."""
 
     def kinds(index: NDArray[np.integer]) -> NDArray[np.intp]:
@@ -121,16 +121,19 @@ def collect(
 def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
     """Return the published estimate: half vectors of each view's four brightest samples."""
     found = half_vector_normals.estimate(
-        samples.f.mean(axis=-1), samples.light_dir, samples.view_dir, samples.view,
+        samples.f.mean(axis=-1),
+        samples.light_dir,
+        samples.view_dir,
+        samples.view,
         valid=samples.valid,
-    )  # fmt: skip
+    )
     good = seen_enough(samples) & found.valid
     return _of_normals(found.normals, found.stderr_rad / np.sqrt(2.0), good)
 
 
 def normals_from_shading(
     samples: Lumitexels,
-    normals: NDArray[np.floating],
+    normals: FloatArray,
     *,
     rounds: int = 3,
     highlight_rad: float = HIGHLIGHT_RAD,
@@ -187,9 +190,7 @@ def normals_from_shading(
     return _of_normals(start, stderr, good)
 
 
-def _of_normals(
-    normals: NDArray[np.floating], stderr_rad: NDArray[np.floating], good: NDArray[np.bool_]
-) -> PointValues:
+def _of_normals(normals: FloatArray, stderr_rad: FloatArray, good: BoolArray) -> PointValues:
     spread = np.repeat(np.asarray(stderr_rad, np.float64)[:, None], 3, axis=1)
     return PointValues(
         np.where(good[:, None], normals, 0.0), np.where(good[:, None], spread, 0.0), good
@@ -250,11 +251,15 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
     samples = at_normals(samples, normals)
     strip = 1.0 / np.maximum(samples.cos_view, LEAST_COS_STRIP)[..., None]
     found = diffuse_albedo.estimate(
-        samples.f, samples.light_dir, samples.view_dir,
+        samples.f,
+        samples.light_dir,
+        samples.view_dir,
         np.where(normals.valid[:, None], normals.values, np.nan).astype(np.float32),
-        eta=fresnel.ETA_SKIN, variance=samples.variance * np.square(strip), valid=samples.valid,
+        eta=fresnel.ETA_SKIN,
+        variance=samples.variance * np.square(strip),
+        valid=samples.valid,
         normal_stderr_rad=stderr_rad,
-    )  # fmt: skip
+    )
     good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)
     keep = good[:, None]
     return PointValues(np.where(keep, found.r_d, 0.0), np.where(keep, found.stderr, 0.0), good)
@@ -266,11 +271,15 @@ def surface_samples(
     """Return what is left of the samples when the light from inside is taken off."""
     samples = at_normals(samples, normals)
     return brdf_basis.surface_samples(
-        samples.f, samples.light_dir, samples.view_dir,
+        samples.f,
+        samples.light_dir,
+        samples.view_dir,
         np.where(normals.valid[:, None], normals.values, (0.0, 0.0, 1.0)),
         np.where(r_d.valid[:, None], r_d.values, np.nan),
-        eta=fresnel.ETA_SKIN, variance=samples.variance, valid=samples.valid,
-    )  # fmt: skip
+        eta=fresnel.ETA_SKIN,
+        variance=samples.variance,
+        valid=samples.valid,
+    )
 
 
 def lobe_weights(
@@ -297,7 +306,7 @@ def normals_from_remainder(
     samples: Lumitexels,
     normals: PointValues,
     r_d: PointValues,
-    weights: Double,
+    weights: Float64Array,
     basis: BrdfBasis,
 ) -> PointValues:
     """Return normals by photometric stereo of what fitted lobes leave of the samples.
@@ -343,10 +352,10 @@ def normals_from_all_light(
     samples: Lumitexels,
     normals: PointValues,
     r_d: PointValues,
-    weights: Double,
+    weights: Float64Array,
     basis: BrdfBasis,
     *,
-    now: Double | None = None,
+    now: Float64Array | None = None,
 ) -> PointValues:
     """Return normals that hold what highlights say, where light from inside says too little.
 
@@ -367,18 +376,25 @@ def normals_from_all_light(
         return normals
     start = normals.values if now is None else now
     found = model_normals.estimate(
-        rows_of(samples, rows), start[rows], np.ones(len(rows), np.bool_),
-        r_d.values[rows].mean(axis=-1), weights[rows], basis, lobe_error=LOBE_ERROR,
-        least_cos_light=LEAST_COS_LIGHT, least_cos_view=LEAST_COS_VIEW,
-    )  # fmt: skip
+        rows_of(samples, rows),
+        start[rows],
+        np.ones(len(rows), np.bool_),
+        r_d.values[rows].mean(axis=-1),
+        weights[rows],
+        basis,
+        lobe_error=LOBE_ERROR,
+        least_cos_light=LEAST_COS_LIGHT,
+        least_cos_view=LEAST_COS_VIEW,
+    )
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])
     share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
     between = share * found.normals + (1.0 - share) * normals.values[rows]
     values, stderr = normals.values.copy(), normals.stderr.copy()
     values[rows] = between / np.linalg.norm(between, axis=-1, keepdims=True)
-    stderr[rows] = np.where(share > 0, np.sqrt(ours * theirs / (ours + theirs))[:, None],
-                            stderr[rows])  # fmt: skip
+    stderr[rows] = np.where(
+        share > 0, np.sqrt(ours * theirs / (ours + theirs))[:, None], stderr[rows]
+    )
     return PointValues(values, stderr, normals.valid)
 
 
@@ -399,8 +415,6 @@ def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
         samples,
         **{
             name: getattr(samples, name)[rows]
-            for name in (
-                "f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid",
-            )
+            for name in ("f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid")
         },
-    )  # fmt: skip
+    )

@@ -13,14 +13,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf.tables import BrdfBasis
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 STEPS: Final = 2
 """Of Gauss and Newton; R_d and the lobes are fitted anew in between calls."""
@@ -50,18 +47,18 @@ class ModelNormals:
         At least three samples, and a misfit that determines both tilts.
     """
 
-    normals: Floats
-    stderr_rad: Floats
-    moved_rad: Floats
-    valid: Bools
+    normals: Float64Array
+    stderr_rad: Float64Array
+    moved_rad: Float64Array
+    valid: BoolArray
 
 
 def estimate(
     samples: Lumitexels,
-    normals: Floats,
-    valid: Bools,
-    r_d: Floats,
-    weights: Floats,
+    normals: Float64Array,
+    valid: BoolArray,
+    r_d: Float64Array,
+    weights: Float64Array,
     basis: BrdfBasis,
     *,
     lobe_error: float,
@@ -140,20 +137,27 @@ def estimate(
 class _State:
     """The model at some normals."""
 
-    value: Floats
-    variance: Floats
-    misfit2: Floats
-    use: Bools
-    cost: Floats
+    value: Float64Array
+    variance: Float64Array
+    misfit2: Float64Array
+    use: BoolArray
+    cost: Float64Array
 
 
 class _Fit:
     """The samples of points, and the model of them as a function of the normals."""
 
     def __init__(
-        self, samples: Lumitexels, valid: Bools, r_d: Floats, weights: Floats, basis: BrdfBasis,
-        lobe_error: float, least_cos_light: float, least_cos_view: float,
-    ) -> None:  # fmt: skip
+        self,
+        samples: Lumitexels,
+        valid: BoolArray,
+        r_d: Float64Array,
+        weights: Float64Array,
+        basis: BrdfBasis,
+        lobe_error: float,
+        least_cos_light: float,
+        least_cos_view: float,
+    ) -> None:
         self.samples, self.basis, self.lobe_error = samples, basis, lobe_error
         self.least = least_cos_light, least_cos_view
         self.r_d = np.where(valid, r_d, 0.0)
@@ -161,7 +165,7 @@ class _Fit:
         self.gray = samples.f.mean(axis=-1).astype(np.float64)
         self.noise = np.where(samples.valid, samples.variance.mean(axis=-1), 1.0) / 3.0
 
-    def at(self, normals: Floats) -> _State:
+    def at(self, normals: Float64Array) -> _State:
         value, lobes, cos_light, cos_view = self._predicted(normals)
         use = self.samples.valid & (cos_light > self.least[0]) & (cos_view > self.least[1])
         variance = self.noise + np.square(self.lobe_error * lobes) + np.square(SAMPLE_ERROR * value)
@@ -171,13 +175,15 @@ class _Fit:
         cost = np.where(use, huber + np.log(variance), 0.0).sum(axis=1)
         return _State(value, variance, misfit2, use, cost / np.maximum(use.sum(axis=1), 1))
 
-    def slope(self, normals: Floats, axis: Floats) -> Floats:
+    def slope(self, normals: Float64Array, axis: Float64Array) -> Float64Array:
         ahead, behind = (
             self._predicted(_unit(normals + sign * PROBE_RAD * axis))[0] for sign in (1.0, -1.0)
         )
         return (ahead - behind) / (2.0 * PROBE_RAD)
 
-    def _predicted(self, normals: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def _predicted(
+        self, normals: Float64Array
+    ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
         s = self.samples
         cos_light = np.einsum("pmk,pk->pm", s.light_dir, normals)
         cos_view = np.einsum("pmk,pk->pm", s.view_dir, normals)
@@ -191,11 +197,11 @@ class _Fit:
         return value, lobes * ratio, cos_light, cos_view
 
 
-def _tangents(normals: Floats) -> tuple[Floats, Floats]:
+def _tangents(normals: Float64Array) -> tuple[Float64Array, Float64Array]:
     helper = np.where(np.abs(normals[:, [0]]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = _unit(np.cross(normals, helper))
     return first, np.cross(normals, first)
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

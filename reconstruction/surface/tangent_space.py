@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 SMOOTHING_MM = 6.0
 """Standard deviation of the smoothing: wrinkles of a face are 2 to 10 mm apart."""
@@ -39,14 +38,14 @@ class TangentNormals:
     valid : ndarray of bool, shape (H, W)
     """
 
-    normals: NDArray[np.float32]
-    stderr: NDArray[np.float32] | None
-    valid: Bools
+    normals: Float32Array
+    stderr: Float32Array | None
+    valid: BoolArray
 
 
 def frames(
     position_mm: ArrayLike, valid: ArrayLike, *, smoothing_mm: float = SMOOTHING_MM
-) -> tuple[Floats, Bools]:
+) -> tuple[Float64Array, BoolArray]:
     """Return the axes of the texture on the smoothed shape.
 
     Parameters
@@ -150,7 +149,7 @@ def tangent_normals(
     return TangentNormals(turned.astype(np.float32), error, good)
 
 
-def _slope(points: Floats, good: Bools, axis: int) -> tuple[Floats, Bools]:
+def _slope(points: Float64Array, good: BoolArray, axis: int) -> tuple[Float64Array, BoolArray]:
     """Return the difference to the next texel along an axis, by both sides where both are there."""
     step = np.diff(np.where(good[..., None], points, 0.0), axis=axis)
     pair = np.logical_and(*(np.moveaxis(good, axis, 0)[s] for s in (slice(1, None), slice(-1))))
@@ -164,7 +163,7 @@ def _slope(points: Floats, good: Bools, axis: int) -> tuple[Floats, Bools]:
     return total / np.maximum(count, 1.0)[..., None], count > 0
 
 
-def _smoothed(values: Floats, known: Bools, sigma_px: float) -> Floats:
+def _smoothed(values: Float64Array, known: BoolArray, sigma_px: float) -> Float64Array:
     weight = ndimage.gaussian_filter(known.astype(np.float64), sigma_px, truncate=3.0)
     out = np.empty_like(values)
     for k in range(values.shape[2]):
@@ -174,5 +173,5 @@ def _smoothed(values: Floats, known: Bools, sigma_px: float) -> Floats:
     return out / np.maximum(weight, 1e-12)[..., None]
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: Float64Array) -> Float64Array:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

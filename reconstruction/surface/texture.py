@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import UNITS, SkinMap
+from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import texture_fill
 from reconstruction.surface.estimates import PointValues
@@ -41,9 +41,9 @@ class SurfaceTexture:
 
     def map(
         self,
-        values: NDArray[np.floating],
-        stderr: NDArray[np.floating] | None,
-        valid: NDArray[np.bool_],
+        values: FloatArray,
+        stderr: FloatArray | None,
+        valid: BoolArray,
         unit: str,
         description: str,
     ) -> SkinMap:

@@ -16,10 +16,9 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.floating]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import BoolArray, Float32Array, Int32Array
 
 SIZE_RANGE: Final = (8, 8192)
 SWEEPS: Final = 5
@@ -32,13 +31,13 @@ _HASTE: Final = np.float32(1.5)
 class TexelMap:
     """Which triangle lies under each texel of a square texture, and where in it."""
 
-    face: NDArray[np.int32]
+    face: Int32Array
     """Triangle under the texel's centre, shape (N, N), row 0 at the top; -1 for none."""
-    weight: NDArray[np.float32]
+    weight: Float32Array
     """Shares of the triangle's second and third corner, shape (N, N, 2)."""
 
     @property
-    def covered(self) -> Bools:
+    def covered(self) -> BoolArray:
         """Texels with a surface under their centre, shape (N, N)."""
         return self.face >= 0
 
@@ -47,11 +46,11 @@ class TexelMap:
 class FilledTexture:
     """A dense texture."""
 
-    values: NDArray[np.float32]
+    values: Float32Array
     """Shape (N, N, C); 0 where `valid` is False."""
-    confidence: NDArray[np.float32]
+    confidence: Float32Array
     """1 for measured texels of full weight, falling with the distance to them, shape (N, N)."""
-    valid: Bools
+    valid: BoolArray
     """Texels that hold a value, shape (N, N)."""
 
 
@@ -81,7 +80,7 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
 
 def texels_from_points(
     texels: TexelMap, faces: ArrayLike, values: ArrayLike, weight: ArrayLike | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Interpolate values at points over the triangles, leaving out points without weight.
 
     Parameters
@@ -119,7 +118,7 @@ def texels_from_points(
 
 def points_from_texels(
     texture: ArrayLike, corner_uv: ArrayLike, faces: ArrayLike, points: int
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Sample a dense texture at points, bilinearly; a point at a seam takes the mean of its sides.
 
     Parameters
@@ -211,7 +210,7 @@ def densify(
     return push_pull(*texels_from_points(texels, faces, values, weight))
 
 
-def _checked_weight(weight: NDArray[np.float32], usable: Bools) -> NDArray[np.float32]:
+def _checked_weight(weight: Float32Array, usable: BoolArray) -> Float32Array:
     good = np.isfinite(weight) & usable
     # laid out by rows, however the weight was: the kernels are compiled for one layout
     known = np.where(good, weight, np.float32(0.0)).astype(np.float32, order="C")

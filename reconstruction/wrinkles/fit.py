@@ -20,12 +20,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTable
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.wrinkles.texels import (
     TOLERANCE,
@@ -42,8 +43,6 @@ from reconstruction.wrinkles.weights import (
     zone_weights,
 )
 
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 
 ROUNDS = 20
@@ -206,19 +205,24 @@ def fit(
     misfit = sum(one.misfit(rows[name]) for name, one in equations.items())
     total = sum(one.total for one in equations.values())
     layer = Layer(
-        texels.values.astype(np.float32), stack.astype(np.float32),
+        texels.values.astype(np.float32),
+        stack.astype(np.float32),
         ExpressionTable(names, {name: tuple(row) for name, row in rows.items()}, source),
-        np.where(texels.valid[..., None], texels.stderr, 0.0).astype(np.float32), texels.valid,
-    )  # fmt: skip
+        np.where(texels.valid[..., None], texels.stderr, 0.0).astype(np.float32),
+        texels.valid,
+    )
     return WrinkleFit(
         layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled, clamp
     )
 
 
 def _in_turn(
-    masks: Floats, data: Mapping[str, Difference], base: Derivatives, size: tuple[int, int],
+    masks: Float64Array,
+    data: Mapping[str, Difference],
+    base: Derivatives,
+    size: tuple[int, int],
     clamp: Clamp,
-) -> tuple[dict[str, Floats], int, bool]:  # fmt: skip
+) -> tuple[dict[str, Float64Array], int, bool]:
     """Return weights that map and weights in turn lead to, the rounds, and whether they settled.
 
     Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
@@ -254,7 +258,7 @@ def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
     ay = resampling.averaging_matrix(height, shape[0])
     ax = resampling.averaging_matrix(width, shape[1])
 
-    def mean(image: NDArray[np.floating]) -> Floats:
+    def mean(image: FloatArray) -> Float64Array:
         return np.asarray((ay @ image.astype(np.float64)) @ ax.T)
 
     v = difference.weight.astype(np.float64)
@@ -288,7 +292,7 @@ def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[
     return data
 
 
-def _pixel_weights(variance: NDArray[np.floating], good: Bools) -> NDArray[np.float32]:
+def _pixel_weights(variance: FloatArray, good: BoolArray) -> Float32Array:
     """Return 1/variance relative to its median; 1 where no variance is known; 0 where invalid."""
     mean = variance.mean(axis=2)
     known = good & (mean > 0)
@@ -303,15 +307,19 @@ def _zone_names(count: int) -> tuple[str, ...]:
     return known if count == len(known) else tuple(f"zone {z}" for z in range(count))
 
 
-def _read(texels: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.floating]:
+def _read(texels: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     planes = resampling.resampled(np.moveaxis(texels, 2, 0), (shape[0], shape[1]))
     return np.moveaxis(planes, 0, 2)
 
 
 def _shown_by(
-    masks: Floats, rows: Mapping[str, Floats], data: Mapping[str, Difference],
-    size: tuple[int, int], *, tolerance: float = TOLERANCE,
-) -> Texels:  # fmt: skip
+    masks: Float64Array,
+    rows: Mapping[str, Float64Array],
+    data: Mapping[str, Difference],
+    size: tuple[int, int],
+    *,
+    tolerance: float = TOLERANCE,
+) -> Texels:
     """Return the map that expressions with known weights show best."""
     parts = []
     for name, one in data.items():
@@ -322,9 +330,11 @@ def _shown_by(
 
 
 def _map_of(
-    parts: list[tuple[NDArray[np.floating], Difference]], size: tuple[int, int],
-    *, tolerance: float = TOLERANCE,
-) -> Texels:  # fmt: skip
+    parts: list[tuple[FloatArray, Difference]],
+    size: tuple[int, int],
+    *,
+    tolerance: float = TOLERANCE,
+) -> Texels:
     """Return the map that differences show, each with a strength (H, W)."""
     shape = parts[0][0].shape
     weight, covered = np.zeros(shape), np.zeros(shape)
@@ -339,13 +349,15 @@ def _map_of(
 
 
 def _equations(
-    masks: Floats, texels: Texels, data: Mapping[str, Difference]
+    masks: Float64Array, texels: Texels, data: Mapping[str, Difference]
 ) -> dict[str, ZoneEquations]:
     shape = next(iter(data.values())).weight.shape
     return equations_of(masks, _read(texels.values, shape), data, with_noise=False)
 
 
-def _begun(masks: Floats, data: Mapping[str, Difference], base: Derivatives) -> dict[str, Floats]:
+def _begun(
+    masks: Float64Array, data: Mapping[str, Difference], base: Derivatives
+) -> dict[str, Float64Array]:
     """Return first weights: in each zone, the leading direction of the expressions' products.
 
     With one zone at a pixel, sum_x m_z D_e . D_f is w_e w_f times the zone's energy; errors add
@@ -374,13 +386,13 @@ def _begun(masks: Floats, data: Mapping[str, Difference], base: Derivatives) -> 
     return _scaled({name: rows[i] for i, name in enumerate(names)})
 
 
-def _limited(rows: Mapping[str, Floats]) -> dict[str, Floats]:
+def _limited(rows: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
     """Return weights divided by the largest of all, by size, where that is above 1."""
     largest = max(1.0, *(float(np.abs(row).max()) for row in rows.values()))
     return {name: row / largest for name, row in rows.items()}
 
 
-def _scaled(rows: Mapping[str, Floats]) -> dict[str, Floats]:
+def _scaled(rows: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
     """Return weights whose largest, by size, is 1 in each zone; zones of zeros stay."""
     table = np.stack(list(rows.values()))
     largest = np.take_along_axis(table, np.abs(table).argmax(axis=0)[None], axis=0)[0]

@@ -10,20 +10,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from model import texture_resampling as resampling
 from model import wrinkles
 from model.wrinkles import WrinkleError
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps
-
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 
 STEEPEST = 4.0
 """Derivatives beyond this, slopes of 76 degrees, are measured by too grazing light to count."""
@@ -52,9 +50,9 @@ class Derivatives:
         Of the pixels that were valid as normals.
     """
 
-    values: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    valid: Bools
+    values: Float32Array
+    variance: Float32Array
+    valid: BoolArray
     too_steep_fraction: float
 
 
@@ -127,16 +125,16 @@ class Texels:
         Enough of the texel's weight was measured, by expressions that show it.
     """
 
-    values: Floats
-    stderr: Floats
-    valid: Bools
+    values: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
 
 
 def fit_texels(
-    weight: NDArray[np.floating],
-    product: NDArray[np.floating],
-    noise: NDArray[np.floating],
-    covered: NDArray[np.floating],
+    weight: FloatArray,
+    product: FloatArray,
+    noise: FloatArray,
+    covered: FloatArray,
     shape: tuple[int, int],
     *,
     tolerance: float = TOLERANCE,
@@ -193,10 +191,10 @@ def fit_texels(
 
 
 def low_passed(
-    derivatives: NDArray[np.floating],
+    derivatives: FloatArray,
     shape: tuple[int, int],
     *,
-    variance: NDArray[np.floating] | None = None,
+    variance: FloatArray | None = None,
     valid: ArrayLike | None = None,
 ) -> Texels:
     """Return a map of derivatives at a lower resolution, invalid pixels left out.
@@ -220,11 +218,11 @@ def low_passed(
         good = good & np.asarray(valid, bool)
     kept = good[..., None]
     spread = np.zeros(d.shape) if variance is None else np.where(kept, variance, 0.0)
-    ones: Floats = good.astype(np.float64)
+    ones: Float64Array = good.astype(np.float64)
     return fit_texels(ones, np.where(kept, d, 0.0), spread, ones, shape)
 
 
-def gathered(by: Any, bx: Any, image: NDArray[np.floating]) -> Floats:
+def gathered(by: Any, bx: Any, image: FloatArray) -> Float64Array:
     """Return what each texel's weights gather from an image: B^T image.
 
     Parameters
@@ -241,7 +239,7 @@ def gathered(by: Any, bx: Any, image: NDArray[np.floating]) -> Floats:
     return np.asarray((by.T @ whole) @ bx)
 
 
-def normal_matrix(by: Any, bx: Any, weight: Floats, shape: tuple[int, int]) -> Any:
+def normal_matrix(by: Any, bx: Any, weight: Float64Array, shape: tuple[int, int]) -> Any:
     """Return the sparse (h w, h w) matrix B^T diag(weight) B: texels meet neighbours only."""
     h, w = shape
     total = sparse.csr_array((h * w, h * w))

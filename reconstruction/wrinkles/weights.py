@@ -10,17 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from model import texture_resampling as resampling
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.wrinkles.texels import gathered, normal_matrix
-
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 
 MOST_STDERR = 0.5
 """A weight that is known no better tells nothing about [0, 1]."""
@@ -42,9 +38,9 @@ class Difference:
         Of the pixel in sums of squares; 0 where not valid.
     """
 
-    values: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    values: Float32Array
+    variance: Float32Array
+    weight: Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +67,11 @@ class ZoneWeights:
         Part of |difference|^2 that the normals' stated errors account for.
     """
 
-    weights: Floats
-    stderr: Floats
-    valid: Bools
-    at_bound: Bools
-    covariance: Floats
+    weights: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
+    at_bound: BoolArray
+    covariance: Float64Array
     explained: float
     noise_fraction: float
 
@@ -93,18 +89,18 @@ class ZoneEquations:
         Weighted sum of squared differences, and the part that stated errors add to it.
     """
 
-    matrix: Floats
-    vector: Floats
-    noise: Floats
+    matrix: Float64Array
+    vector: Float64Array
+    noise: Float64Array
     total: float
     expected: float
 
-    def misfit(self, weights: Floats) -> float:
+    def misfit(self, weights: Float64Array) -> float:
         """Return the weighted sum of squares that weights leave, at least 0."""
         left = self.total - 2.0 * weights @ self.vector + weights @ self.matrix @ weights
         return max(float(left), 0.0)
 
-    def determined(self) -> Bools:
+    def determined(self) -> BoolArray:
         """Return which weights the equations hold fast, (Z,)."""
         diagonal = np.diag(self.matrix)
         some = diagonal > SINGULAR * diagonal.max(initial=0.0)
@@ -116,19 +112,19 @@ class ZoneEquations:
         fast[some] = (np.abs(loose) < 1e-6).all(axis=1)
         return fast
 
-    def _scaled(self, some: Bools) -> Floats:
+    def _scaled(self, some: BoolArray) -> Float64Array:
         part = self.matrix[np.ix_(some, some)]
         root = np.sqrt(np.diag(part))
         return part / np.outer(root, root)
 
-    def inverse(self) -> Floats:
+    def inverse(self) -> Float64Array:
         """Return the pseudo-inverse of the matrix; rows of undetermined weights mean nothing."""
         diagonal = np.diag(self.matrix)
         root = np.sqrt(np.where(diagonal > SINGULAR * diagonal.max(initial=0.0), diagonal, np.inf))
         scaled = self.matrix / np.outer(root, root)
         return np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) / np.outer(root, root)
 
-    def least(self, bounds: tuple[float, float]) -> Floats:
+    def least(self, bounds: tuple[float, float]) -> Float64Array:
         """Return the weights within bounds that leave least; 0 for zones without a wrinkle."""
         diagonal = np.diag(self.matrix)
         some = diagonal > SINGULAR * diagonal.max(initial=0.0)
@@ -149,9 +145,7 @@ class ZoneEquations:
         return np.clip(weights, *bounds)
 
 
-def zone_equations(
-    masks: NDArray[np.floating], wrinkle: NDArray[np.floating], difference: Difference
-) -> ZoneEquations:
+def zone_equations(masks: FloatArray, wrinkle: FloatArray, difference: Difference) -> ZoneEquations:
     """Return the normal equations of one expression's weights.
 
     Parameters
@@ -165,9 +159,12 @@ def zone_equations(
 
 
 def equations_of(
-    masks: NDArray[np.floating], wrinkle: NDArray[np.floating], data: Mapping[str, Difference],
-    *, with_noise: bool = True,
-) -> dict[str, ZoneEquations]:  # fmt: skip
+    masks: FloatArray,
+    wrinkle: FloatArray,
+    data: Mapping[str, Difference],
+    *,
+    with_noise: bool = True,
+) -> dict[str, ZoneEquations]:
     """Return the normal equations of several expressions' weights for the same wrinkle map.
 
     Parameters
@@ -186,11 +183,11 @@ def equations_of(
     by, bx = (resampling.reading_matrix(t, p) for t, p in zip((h, w), shape, strict=True))
     flat = masks.reshape(len(masks), -1)
 
-    def squares(image: Floats) -> Floats:
+    def squares(image: Float64Array) -> Float64Array:
         return np.asarray(flat @ (normal_matrix(by, bx, image, (h, w)) @ flat.T))
 
     energy = np.einsum("hwc,hwc->hw", wrinkle, wrinkle)
-    weight: NDArray[np.float32] | None = None
+    weight: Float32Array | None = None
     matrix = np.zeros((len(masks), len(masks)))
     found = {}
     for name, one in data.items():
@@ -214,10 +211,7 @@ def equations_of(
 
 
 def zone_weights(
-    masks: Floats,
-    wrinkle: NDArray[np.floating],
-    difference: Difference,
-    bounds: tuple[float, float],
+    masks: Float64Array, wrinkle: FloatArray, difference: Difference, bounds: tuple[float, float]
 ) -> ZoneWeights:
     """Return the bounded weights of one expression with their errors.
 
@@ -241,15 +235,19 @@ def zone_weights(
     weights[~valid] = 0.0
     total = equations.total
     return ZoneWeights(
-        weights, stderr, valid, valid & np.isin(weights, bounds), covariance,
+        weights,
+        stderr,
+        valid,
+        valid & np.isin(weights, bounds),
+        covariance,
         1.0 - equations.misfit(weights) / total if total > 0 else 0.0,
         equations.expected / total if total > 0 else 0.0,
-    )  # fmt: skip
+    )
 
 
 def _scatter(
-    masks: Floats, wrinkle: NDArray[np.floating], difference: Difference, weights: Floats
-) -> Floats:
+    masks: Float64Array, wrinkle: FloatArray, difference: Difference, weights: Float64Array
+) -> Float64Array:
     """Return the covariance of the equations' right side that the misfit shows, block by block.
 
     Misfit of a model is even over furrows, not independent from pixel to pixel; its sums over

@@ -16,20 +16,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.ndimage import distance_transform_edt
 
 from model.texture_resampling import averaging_matrix
 from model.wrinkles import Masks, WrinkleError, mask_stack
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.wrinkles.fit import Measured, differences
 from reconstruction.wrinkles.texels import derivatives_of
-
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 
 LEAST_SIGNAL = 3.0
 """A texel's pattern counts when its energy is so many times the scatter that stated errors lead
@@ -62,10 +58,10 @@ class Amplitudes:
         The expressions.
     """
 
-    values: Floats
-    energy: Floats
-    rank_one_share: Floats
-    valid: Bools
+    values: Float64Array
+    energy: Float64Array
+    rank_one_share: Float64Array
+    valid: BoolArray
     names: tuple[str, ...]
 
 
@@ -90,9 +86,9 @@ class ZoneFit:
         Zones whose weights are not proportional to another's: what the data alone tell apart.
     """
 
-    masks: NDArray[np.float32]
+    masks: Float32Array
     weights: Mapping[str, tuple[float, ...]]
-    valid: Bools
+    valid: BoolArray
     rank_one_share: float
     explained: float
     distinct: int
@@ -211,7 +207,7 @@ def fit_zones(
 
 def _clustered(
     found: Amplitudes, zones: int, place_weight: float, rng: np.random.Generator
-) -> Floats:
+) -> Float64Array:
     """Return regions (Z, h, w) by k-means of amplitudes and places; silent texels go to the near.
 
     The best of several seeded starts is taken.
@@ -239,7 +235,7 @@ def _clustered(
     return (labels == np.arange(zones)[:, None, None]).astype(np.float64)
 
 
-def _weights_of(masks: Floats, target: Floats, strength: Floats) -> Floats:
+def _weights_of(masks: Float64Array, target: Float64Array, strength: Float64Array) -> Float64Array:
     """Return weights (Z, E) by least squares over texels; a little held to plain averages."""
     counted = masks * strength[:, None]
     mass = counted.sum(axis=0)
@@ -251,8 +247,12 @@ def _weights_of(masks: Floats, target: Floats, strength: Floats) -> Floats:
 
 
 def _on_simplex_fit(
-    masks: Floats, prior: Floats, target: Floats, weights: Floats, trust: Floats
-) -> Floats:
+    masks: Float64Array,
+    prior: Float64Array,
+    target: Float64Array,
+    weights: Float64Array,
+    trust: Float64Array,
+) -> Float64Array:
     """Return each texel's shares m >= 0 with sum 1: least trust |a - m w|^2 + PRIOR |m - prior|^2.
 
     Projected gradient; every texel has the same matrix up to its trust.
@@ -266,7 +266,7 @@ def _on_simplex_fit(
     return masks
 
 
-def _projected(v: Floats) -> Floats:
+def _projected(v: Float64Array) -> Float64Array:
     """Return the nearest points of the simplex, row by row (Held, Wolfe and Crowder 1974)."""
     ordered = -np.sort(-v, axis=1)
     sums = np.cumsum(ordered, axis=1) - 1.0
@@ -276,10 +276,10 @@ def _projected(v: Floats) -> Floats:
     return np.maximum(v - shift, 0.0)
 
 
-def _distinct(weights: Floats) -> int:
+def _distinct(weights: Float64Array) -> int:
     """Return how many directions the zones' weights have, proportional ones counted once."""
     lengths = np.linalg.norm(weights, axis=1)
-    kept: list[Floats] = []
+    kept: list[Float64Array] = []
     for row in weights[lengths > 1e-6] / lengths[lengths > 1e-6, None]:
         if all(abs(float(row @ other)) < ALIKE for other in kept):
             kept.append(row)

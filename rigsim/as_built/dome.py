@@ -9,11 +9,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import Rig, View
-
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array
 
 UNDISTORT_STEPS: Final = 12
 """Newton steps from image to ray; each doubles the right digits."""
@@ -57,9 +56,9 @@ class BuiltDome:
     """As drawn."""
     rig: Rig
     """As it stands: places, focal lengths, powers and lobes; the names are the nominal ones."""
-    axis: FloatArray
+    axis: Float64Array
     """Unit vectors in which the lights shine, shape (L, 3)."""
-    distortion: Mapping[str, FloatArray] = field(default_factory=dict)
+    distortion: Mapping[str, Float64Array] = field(default_factory=dict)
     """k1, k2, p1, p2, k3 by view, on coordinates over depth, x right and y down."""
     gain: Mapping[str, float] = field(default_factory=dict)
     """Response by view; 1 where not named."""
@@ -132,7 +131,7 @@ def _shifted(view: View, size: Tolerances, rng: np.random.Generator) -> View:
     )
 
 
-def bend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
+def bend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     """Return where a lens puts rays: slopes across the axis to slopes on the sensor, (..., 2)."""
     slopes = np.asarray(xy, np.float64)
     k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64)
@@ -148,7 +147,7 @@ def bend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
     return slopes * (1 + k1 * square + k2 * square**2 + k3 * square**3) + tangential
 
 
-def unbend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
+def unbend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     """Return the ray that a lens puts at ``xy``: the inverse of `bend`, by Newton's method."""
     wanted = np.asarray(xy, np.float64)
     found = wanted.copy()
@@ -166,7 +165,7 @@ def unbend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
     return found
 
 
-def pixel_corner_rays(view: View, distortion: ArrayLike) -> FloatArray:
+def pixel_corner_rays(view: View, distortion: ArrayLike) -> Float64Array:
     """Return the directions through the corners of all pixels, shape (H + 1, W + 1, 3).
 
     Rig frame; lengths are such that the component along the optical axis is 1.
@@ -179,7 +178,7 @@ def pixel_corner_rays(view: View, distortion: ArrayLike) -> FloatArray:
     return np.asarray(slopes[..., :1] * right - slopes[..., 1:] * up - back)
 
 
-def image_of(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> FloatArray:
+def image_of(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> Float64Array:
     """Return column and row where points appear, shape (..., 2); NaN behind the camera."""
     offset = np.asarray(points_mm, np.float64) - view.position_mm
     right, up, back = (np.array(axis) for axis in view.axes)

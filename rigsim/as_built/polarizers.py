@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Light, Rig, View
+from rigsim.arrays import Float64Array
 from rigsim.shading import axis_in_plane
 
 Polarizer = Literal["parallel", "crossed"]
@@ -90,7 +90,7 @@ def films_of(rig: Rig) -> Films:
     return Films(float(light), float(analyser), zero)
 
 
-def absorbing_axis(light: Light) -> NDArray[np.float64]:
+def absorbing_axis(light: Light) -> Float64Array:
     """Return the absorbing axis of a light's film, which faces the rig's origin; shape (3,)."""
     if light.polarizer_axis_deg is None:
         raise FilmError(f"light {light.name!r}: has no polarizer; give it a polarizer_axis_deg")

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfc
 
 from capture.rig import Rig, View
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
+from rigsim.arrays import Float32Array, Float64Array
 
 SPOT_RADIUS_PX: Final = 12.0
 """Nominal radius of a fibre's end in the camera's image."""
@@ -62,16 +59,16 @@ class ProbeTolerances:
 class ProbeBuild:
     """The truth about the fibres, in the order of the rig."""
 
-    spot_px: FloatArray
+    spot_px: Float64Array
     """Middles of the spots, pixels, x right and y down from the first pixel's middle, (F, 2)."""
-    radius_px: FloatArray
+    radius_px: Float64Array
     """Radii of the spots at half height, pixels, > 0, shape (F,)."""
-    gain: FloatArray
+    gain: Float64Array
     """Transmission relative to the drawing's, > 0, shape (F,)."""
-    crosstalk: FloatArray
+    crosstalk: Float64Array
     """Share of fibre j's light that comes out of fibre i, shape (F, F) at [i, j]; columns sum
     to 1."""
-    unevenness: FloatArray
+    unevenness: Float64Array
     """Light over a spot: 1 + a u + b v + c (2 (u^2 + v^2) - 1) of u, v in radii, shape (F, 3)."""
     edge_px: float
     """Standard deviation of the edges' blur, pixels, > 0."""
@@ -154,9 +151,15 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
     radius = SPOT_RADIUS_PX * (1.0 + size.radius * _bounded(rng, (count,)))
     uneven = UNEVENNESS * _bounded(rng, (count, 3)) if size.radius > 0.0 else np.zeros((count, 3))
     return ProbeBuild(
-        place, radius, gain, _leaks(count, size.crosstalk, rng), uneven,
-        size.edge_px, size.wings, size.veil,
-    )  # fmt: skip
+        place,
+        radius,
+        gain,
+        _leaks(count, size.crosstalk, rng),
+        uneven,
+        size.edge_px,
+        size.wings,
+        size.veil,
+    )
 
 
 def unit_images(build: ProbeBuild, view: View) -> Float32Array:
@@ -198,12 +201,12 @@ def unit_images(build: ProbeBuild, view: View) -> Float32Array:
     return out
 
 
-def _bounded(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
+def _bounded(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64Array:
     """Return standard normal numbers of at most 2; a workshop throws the others away."""
     return np.asarray(np.clip(rng.standard_normal(shape), -2.0, 2.0))
 
 
-def _leaks(count: int, neighbour: float, rng: np.random.Generator) -> FloatArray:
+def _leaks(count: int, neighbour: float, rng: np.random.Generator) -> Float64Array:
     out = np.zeros((count, count))
     for step, share in ((1, neighbour), (2, 0.1 * neighbour)):
         for i in range(count - step):

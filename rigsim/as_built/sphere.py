@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Light, Rig
+from rigsim.arrays import Float64Array
 from rigsim.as_built.polarizers import absorbing_axis
 from rigsim.shading import axis_in_plane
-
-FloatArray = NDArray[np.float64]
 
 MOMENTS: Final = ("1", "x", "y", "z")
 """What each LED's light is weighted with; every lighting condition is a sum of these four."""
@@ -60,13 +58,13 @@ class BuiltSphere:
 
     nominal: Rig
     """As drawn; the box weighs the LEDs by the directions in it."""
-    position_mm: FloatArray
+    position_mm: Float64Array
     """Where the LEDs are, mm, rig frame, shape (L, 3)."""
-    intensity: FloatArray
+    intensity: Float64Array
     """Power over the mean of the drawing's, shape (L,), >= 0; 0 is dead."""
-    absorbs: FloatArray
+    absorbs: Float64Array
     """Absorbing axes of the films, unit vectors, shape (L, 3)."""
-    radius_mm: FloatArray
+    radius_mm: Float64Array
     """Radii of the LEDs' discs, mm, shape (L,)."""
 
     def __post_init__(self) -> None:
@@ -85,7 +83,7 @@ class BuiltSphere:
             raise SphereError(f"intensity: got {self.intensity.min()}, expected >= 0")
 
     @property
-    def weights(self) -> FloatArray:
+    def weights(self) -> Float64Array:
         """Return what the moments weigh each LED with, shape (L, 4): 1 and nominal direction."""
         place = np.array([light.position_mm for light in self.nominal.lights])
         direction = place / np.linalg.norm(place, axis=1, keepdims=True)
@@ -184,8 +182,8 @@ REFERENCE_MM: Final = 600.0
 
 
 def diffuser_radiance(
-    sphere: BuiltSphere, x_mm: FloatArray, y_mm: FloatArray, *, extinction: float = math.inf
-) -> FloatArray:
+    sphere: BuiltSphere, x_mm: Float64Array, y_mm: Float64Array, *, extinction: float = math.inf
+) -> Float64Array:
     """Return the radiance of a perfect white diffuser at z = 0 that faces +z, for each moment.
 
     Parameters

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Light
+from rigsim.arrays import Float64Array
 
 __all__ = ["EyeGuard", "Lit"]
 
@@ -98,7 +98,7 @@ class EyeGuard:
             power += float((np.abs((turn @ weight) / (part * span)) ** 2).sum())
         return math.sqrt(2.0 * power) / mean
 
-    def _integral(self, light: Iterable[Lit]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _integral(self, light: Iterable[Lit]) -> tuple[Float64Array, Float64Array]:
         """Return times at which light is switched, and the light until then, W s/m^2."""
         changes: dict[float, float] = {}
         for pulse in light:
@@ -124,7 +124,7 @@ def _at_eye(light: Light) -> float:
     return (light.power_w or 0.0) * spread * cosine / (1e-3 * distance_mm) ** 2
 
 
-def _turns(values: NDArray[np.float64], least: float) -> list[int]:
+def _turns(values: Float64Array, least: float) -> list[int]:
     """Return where a curve has risen, or fallen, by ``least`` since its last turn."""
     found: list[int] = []
     low = high = float(values[0])

@@ -220,12 +220,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     def _until(self, light: PatternLight, t_off_s: float) -> PatternLight:
         return PatternLight(
-            light.pattern,
-            light.level,
-            light.t_on_s,
-            t_off_s,
-            light.analyser_deg,
-            light.led_shares,
+            light.pattern, light.level, light.t_on_s, t_off_s, light.analyser_deg, light.led_shares
         )
 
     def _ended(self, lit: Lit) -> None:

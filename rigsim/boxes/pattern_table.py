@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.devices.wire import Code
 from capture.plan.steps import PATTERNS
 from capture.rig import Light
+from rigsim.arrays import Float64Array
 from rigsim.boxes.controller import Refused, number
 from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch
 
@@ -80,7 +80,7 @@ def parse_patterns(text: str, *, cameras: int, most_us: int) -> list[PatternRow]
     return rows
 
 
-def pattern_shares(lights: Sequence[Light]) -> dict[str, NDArray[np.float64]]:
+def pattern_shares(lights: Sequence[Light]) -> dict[str, Float64Array]:
     """Return what each pattern asks of each LED, 0 to 1: pattern -> (L,).
 
     Examples

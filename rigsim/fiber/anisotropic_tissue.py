@@ -17,14 +17,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigsim.arrays import Float64Array
 from rigsim.fiber import photon_splitting as splitting
 from rigsim.fiber import profile as profiles
 from rigsim.fiber.anisotropic_walk import walk_anisotropic
 from rigsim.fiber.rings import KERNEL_NODES, disc_overlap
 from rigsim.tissue import tissue_mc
 from rigsim.tissue.tissue_mc import TransportError
-
-FloatArray = NDArray[np.float64]
 
 OVERLAP_NODES: Final = 2000
 
@@ -144,14 +143,30 @@ def anisotropic_profile(
         starts = np.searchsorted(line + both, edges[:-1], side="right")
         counts = np.maximum(np.searchsorted(line - both, edges[1:], side="left") - starts, 0)
 
-    def run(window: FloatArray, traced: int, seed: NDArray[np.uint64]) -> tuple[FloatArray, ...]:
+    def run(
+        window: Float64Array, traced: int, seed: NDArray[np.uint64]
+    ) -> tuple[Float64Array, ...]:
         tally = np.zeros(shape)
         visited = np.zeros((2, window.size))
         walk_anisotropic(
-            medium, fibres.source_numerical_aperture, fibres.numerical_aperture, places, overlap,
-            per_mm, starts.astype(np.int64), counts.astype(np.int64), bins_per_mm, rings,
-            window, splitting.WINDOW_CELLS / reach, deeper, traced, seed.copy(), tally, visited,
-        )  # fmt: skip
+            medium,
+            fibres.source_numerical_aperture,
+            fibres.numerical_aperture,
+            places,
+            overlap,
+            per_mm,
+            starts.astype(np.int64),
+            counts.astype(np.int64),
+            bins_per_mm,
+            rings,
+            window,
+            splitting.WINDOW_CELLS / reach,
+            deeper,
+            traced,
+            seed.copy(),
+            tally,
+            visited,
+        )
         return tally / traced, visited
 
     window = splitting.flat_window(reach, farthest)
@@ -170,7 +185,7 @@ def anisotropic_profile(
     return profiles.summary(radii, each, count * batches)
 
 
-def _overlap(fibres: profiles.Fibres) -> tuple[FloatArray, float]:
+def _overlap(fibres: profiles.Fibres) -> tuple[Float64Array, float]:
     """Return the density of (point in one core - point in the other) and its nodes per mm."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     if source == 0.0:
@@ -182,7 +197,7 @@ def _overlap(fibres: profiles.Fibres) -> tuple[FloatArray, float]:
     return density, (OVERLAP_NODES - 1) / apart[-1]
 
 
-def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> FloatArray:
+def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> Float64Array:
     """Return the even harmonics of a fibre's density over the direction to the exit, by radius."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     both = detector + source

@@ -23,9 +23,24 @@ def _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walk_anisotropic(  # type: ignore[no-untyped-def]
-    medium, source_sine, fibre_sine, places, overlap, overlap_per_mm, starts, counts, bins_per_mm,
-    rings, window, per_mm, deeper_per_mm, photons, seed, tally, visited,
-):  # fmt: skip
+    medium,
+    source_sine,
+    fibre_sine,
+    places,
+    overlap,
+    overlap_per_mm,
+    starts,
+    counts,
+    bins_per_mm,
+    rings,
+    window,
+    per_mm,
+    deeper_per_mm,
+    photons,
+    seed,
+    tally,
+    visited,
+):
     """Trace photons from a point source in a cone and score fibres where they stand.
 
     Parameters
@@ -191,6 +206,14 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
             z = waiting[alive, 2]
             weight = waiting[alive, 6]
             s0, s1, s2, s3, ux, uy, uz = _turn(
-                s0, s1, s2, s3, waiting[alive, 3], waiting[alive, 4], waiting[alive, 5],
-                g, strength, most,
-            )  # fmt: skip
+                s0,
+                s1,
+                s2,
+                s3,
+                waiting[alive, 3],
+                waiting[alive, 4],
+                waiting[alive, 5],
+                g,
+                strength,
+                most,
+            )

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from rigsim.arrays import Float64Array
 from rigsim.fiber.profile import Fibres
 from rigsim.fiber.white_fiber import WhiteFibre
-
-FloatArray = NDArray[np.float64]
 
 FAINTEST_PER_MM2: Final = 1e-7
 """R_f that gives a tenth of an electron per pixel and exposure of 30 s for each electron of read
@@ -34,8 +33,14 @@ FEWEST: Final = 4
 """Fibres that must be bright enough."""
 
 STARTS: Final = (
-    (0.03, 1.0), (0.1, 2.0), (0.4, 3.0), (1.0, 1.0), (0.01, 8.0), (0.005, 20.0), (0.004, 60.0),
-)  # fmt: skip
+    (0.03, 1.0),
+    (0.1, 2.0),
+    (0.4, 3.0),
+    (1.0, 1.0),
+    (0.01, 8.0),
+    (0.005, 20.0),
+    (0.004, 60.0),
+)
 """sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
 fibres less than far ones, which looks like more scattering than tissue has."""
 MOST_SCATTERING: Final = 200.0
@@ -112,16 +117,19 @@ def nearest_medium(
         )
     table = WhiteFibre.load()
     used = Fibres(
-        tuple(np.array(fibres.radii_mm)[use].tolist()), fibres.core_mm, fibres.source_core_mm,
-        fibres.numerical_aperture, fibres.source_numerical_aperture,
-    )  # fmt: skip
+        tuple(np.array(fibres.radii_mm)[use].tolist()),
+        fibres.core_mm,
+        fibres.source_core_mm,
+        fibres.numerical_aperture,
+        fibres.source_numerical_aperture,
+    )
     target = np.log(profile[use])
     both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
     low = table.distance[0] / (min(used.radii_mm) - both)
     # sigma_a / sigma_s' rather than sigma_a, as the table ends there
     bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MOST_SCATTERING]])
 
-    def misfit(logs: FloatArray) -> FloatArray:
+    def misfit(logs: Float64Array) -> Float64Array:
         scattering = math.exp(logs[1])
         if not table.holds(math.exp(logs[0]) * scattering, scattering, used):
             return UNHELD * np.cos(np.arange(target.size))

@@ -10,9 +10,8 @@ from math import inf
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array
 
 WINDOW_CELLS: Final = 256
 SMOOTHED_CELLS: Final = 8  # to each side
@@ -24,15 +23,15 @@ SCORED_DEPTH: Final = 1.5
 """Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
 
 
-def flat_window(reach_mm: float, farthest_mm: float) -> FloatArray:
+def flat_window(reach_mm: float, farthest_mm: float) -> Float64Array:
     """Return weights of 1 up to the farthest fibre, and more beyond."""
     s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
     return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
 
 
 def learned_window(
-    visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
-) -> FloatArray:
+    visited: Float64Array, used: Float64Array, reach_mm: float, farthest_mm: float
+) -> Float64Array:
     """Return target weights in proportion to how much weight passes each distance."""
     s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
     kernel = np.ones(2 * SMOOTHED_CELLS + 1)
@@ -49,7 +48,7 @@ def learned_window(
     return window
 
 
-def _falling(weight: FloatArray, tracks: FloatArray) -> tuple[FloatArray, int]:
+def _falling(weight: Float64Array, tracks: Float64Array) -> tuple[Float64Array, int]:
     """Return weights by distance over their largest, and where that is.
 
     From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
@@ -70,7 +69,7 @@ def _falling(weight: FloatArray, tracks: FloatArray) -> tuple[FloatArray, int]:
     return relative, peak
 
 
-def transport_depth_mm(table: FloatArray) -> float:
+def transport_depth_mm(table: Float64Array) -> float:
     """Return the depth to which light goes before it has turned or been absorbed once."""
     left = 1.0
     for top, bottom, sigma_t, albedo, g in table[1:-1, :5]:
@@ -82,7 +81,7 @@ def transport_depth_mm(table: FloatArray) -> float:
     return bottom if bottom < inf else 1.0
 
 
-def scoring_chances(table: FloatArray) -> tuple[FloatArray, float]:
+def scoring_chances(table: Float64Array) -> tuple[Float64Array, float]:
     """Return the probability to score a collision by its depth, and the levels per mm."""
     depths, optical = [0.0], [0.0]
     for row in table[1:-1]:

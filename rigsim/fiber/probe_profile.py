@@ -9,17 +9,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Fibre, Probe, Rig
 from model import spectra
+from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import anisotropic_profile
 from rigsim.fiber.probe_tissue import FibrousTissue, ProbedTissue, TissueError, TissueOptics
 from rigsim.fiber.profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
 from rigsim.fiber.profile_smoothing import smooth_profile
 from rigsim.fiber.white_fiber import ETA, G, WhiteFibre
-
-FloatArray = NDArray[np.float64]
 
 KEPT: Final = 64
 """Profiles and runs of photons that are kept."""
@@ -36,9 +34,9 @@ SUCTION_STEP_MBAR: Final = 0.1
 class Profile:
     """Reflectance in the fibres in the camera's bands."""
 
-    reflectance_per_mm2: FloatArray
+    reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F, 3), >= 0."""
-    stderr: FloatArray
+    stderr: Float64Array
     """Standard error of the Monte Carlo, same shape."""
 
 
@@ -69,7 +67,7 @@ class Profiles:
         self.photons, self.seed, self.threads = photons, seed, threads
         self.probe: Probe = rig.probe
         self._runs: OrderedDict[tuple[object, ...], FibrePaths | Profile] = OrderedDict()
-        self._by_turn: FloatArray | None = None
+        self._by_turn: Float64Array | None = None
         self._profiles: OrderedDict[tuple[object, ...], Profile] = OrderedDict()
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
@@ -149,9 +147,13 @@ class Profiles:
         kind = fibres_of(self.probe)
         if optics.absorber is not None:
             return fibre_paths(
-                stack, kind, photons=self.photons, rng=rng, absorber=optics.absorber,
+                stack,
+                kind,
+                photons=self.photons,
+                rng=rng,
+                absorber=optics.absorber,
                 threads=self.threads,
-            )  # fmt: skip
+            )
         stored = self._stored(optics, kind)
         if stored is not None:
             return stored
@@ -211,6 +213,9 @@ def fibres_of(probe: Probe) -> Fibres:
         if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
             raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")
     return Fibres(
-        probe.radius_mm, first.core_mm, probe.source_core_mm, first.numerical_aperture,
+        probe.radius_mm,
+        first.core_mm,
+        probe.source_core_mm,
+        first.numerical_aperture,
         probe.source_numerical_aperture,
-    )  # fmt: skip
+    )

@@ -12,15 +12,14 @@ from importlib import resources
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.tissue import skin_layers
 from rigsim.tissue.skin_layers import ANISOTROPY, ETA
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
-FloatArray = NDArray[np.float64]
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
 
 LEAST_SIGMA_A_PER_MM: Final = 1e-7
@@ -28,8 +27,11 @@ LEAST_SIGMA_A_PER_MM: Final = 1e-7
 of 1 m loses a ten-thousandth."""
 
 BLOOD_AT_REST: Final[Mapping[str, float]] = {
-    "forehead": 0.005, "cheek": 0.006, "chin": 0.016, "abdomen": 0.005,
-}  # fmt: skip
+    "forehead": 0.005,
+    "cheek": 0.006,
+    "chin": 0.016,
+    "abdomen": 0.005,
+}
 """Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimetres,
 so less than what colors the face, whose vessels lie under the epidermis."""
 MELANIN_SHARE: Final = 0.25
@@ -62,7 +64,7 @@ class TissueOptics:
     """Wavelengths of the stacks, nm; empty for a gray tissue, which has one stack."""
     stacks: tuple[LayerStack, ...]
     """Layers at each wavelength, with the least of the absorber that comes and goes."""
-    absorber: FloatArray | None
+    absorber: Float64Array | None
     """Absorption of that absorber in each layer per amount, 1/mm, shape (wavelengths, layers);
     None where none does."""
     amount: float
@@ -344,9 +346,12 @@ def make_phantom(
         for name, share in zip(("sigma_a_per_mm", "sigma_s_prime_per_mm"), factor, strict=True)
     )
     return HomogeneousTissue(
-        tuple(sigma_a.tolist()), tuple(scattering.tolist()), certificate["g"], certificate["eta"],
+        tuple(sigma_a.tolist()),
+        tuple(scattering.tolist()),
+        certificate["g"],
+        certificate["eta"],
         PHANTOM_NM,
-    )  # fmt: skip
+    )
 
 
 def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:

@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigsim.arrays import Float32Array, Float64Array, Int64Array
 from rigsim.fiber.photon_splitting import (
     WINDOW_CELLS,
     flat_window,
@@ -31,8 +32,6 @@ from rigsim.fiber.rings import ring_kernels
 from rigsim.fiber.walk import walk_to_fibres
 from rigsim.tissue import tissue_mc
 from rigsim.tissue.tissue_mc import LayerStack, TransportError
-
-FloatArray = NDArray[np.float64]
 
 PATH_SCALE_MM: Final = 0.05
 """Path length above which the nodes of a path histogram are spaced by their logarithm."""
@@ -87,7 +86,7 @@ class SpectralStack:
     """Wavelengths, nm, at least one."""
     stacks: tuple[LayerStack, ...]
     """The layers at each wavelength; as many in each."""
-    band_weights: FloatArray
+    band_weights: Float64Array
     """Share of each wavelength in each band, >= 0, shape (wavelengths, bands): the light source's
     spectrum times the band's sensitivity, each column of sum 1 for a reflectance."""
 
@@ -115,13 +114,13 @@ class SpectralStack:
 class FibreProfile:
     """Reflectance in the fibre by distance, with one-sigma standard errors."""
 
-    radii_mm: FloatArray
+    radii_mm: Float64Array
     """Distances as asked for, mm, shape (F,)."""
-    reflectance_per_mm2: FloatArray
+    reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F,), or (F, bands) of a `SpectralStack`."""
-    stderr: FloatArray
+    stderr: Float64Array
     """Standard error of `reflectance_per_mm2`, same shape. Neighbours' errors are correlated."""
-    batch_reflectance_per_mm2: FloatArray
+    batch_reflectance_per_mm2: Float64Array
     """`reflectance_per_mm2` of each independent batch, shape (batches, F[, bands])."""
     photons: int
     """Photons traced, those of the pilot left out."""
@@ -140,11 +139,11 @@ class FibrePaths:
     one run serves every concentration above that of the run.
     """
 
-    radii_mm: FloatArray
+    radii_mm: Float64Array
     """Distances as asked for, mm, shape (F,)."""
-    path_mm: FloatArray
+    path_mm: Float64Array
     """Nodes of the path in the counted absorber, mm, increasing from 0, shape (nodes,)."""
-    score: NDArray[np.float32]
+    score: Float32Array
     """R_f in 1/mm^2 that took each path, shape (batches, F, nodes[, bands])."""
     photons: int
     """Photons traced."""
@@ -233,8 +232,11 @@ def fibre_profile(
     """
     fibres = Fibres(
         tuple(np.atleast_1d(np.asarray(radii_mm, np.float64)).tolist()),
-        core_mm, source_core_mm, numerical_aperture, source_numerical_aperture,
-    )  # fmt: skip
+        core_mm,
+        source_core_mm,
+        numerical_aperture,
+        source_numerical_aperture,
+    )
     each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
     return summary(np.array(fibres.radii_mm), each, traced)
 
@@ -311,7 +313,7 @@ def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
     return SpectralStack((0.0,), (stack,), np.ones((1, 1)))
 
 
-def summary(radii_mm: FloatArray, each: FloatArray, photons: int) -> FibreProfile:
+def summary(radii_mm: Float64Array, each: Float64Array, photons: int) -> FibreProfile:
     """Return mean and standard error of independent batches, shape (batches, F, ...)."""
     error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     return FibreProfile(radii_mm, each.mean(axis=0), error, each, photons)
@@ -324,8 +326,8 @@ def _trace(
     rng: np.random.Generator,
     batches: int,
     threads: int,
-    absorber: FloatArray | None,
-) -> tuple[FloatArray, int]:
+    absorber: Float64Array | None,
+) -> tuple[Float64Array, int]:
     """Return scores by batch, shape (batches, F[, nodes][, bands]), and the photons traced."""
     spectral = _spectral(stack)
     tissue_mc.photons_per_batch(photons, batches, threads)
@@ -351,8 +353,13 @@ def _trace(
         for seed in seeds[batches:]:
             window = plan.learned(window, pilot, seed)
 
-        def run(batch: int, plan: _Plan = plan, window: FloatArray = window,
-                count: int = count, seeds: NDArray[np.uint64] = seeds) -> FloatArray:  # fmt: skip
+        def run(
+            batch: int,
+            plan: _Plan = plan,
+            window: Float64Array = window,
+            count: int = count,
+            seeds: NDArray[np.uint64] = seeds,
+        ) -> Float64Array:
             return plan.run(window, count, seeds[batch])[0]
 
         for batch, score in enumerate(tissue_mc.in_threads(run, batches, threads)):
@@ -371,10 +378,10 @@ class _Plan:
         self,
         stack: LayerStack,
         fibres: Fibres,
-        kernels: FloatArray,
-        starts: NDArray[np.int64],
-        counts: NDArray[np.int64],
-        absorber: FloatArray | None,
+        kernels: Float64Array,
+        starts: Int64Array,
+        counts: Int64Array,
+        absorber: Float64Array | None,
         index: int,
     ) -> None:
         self.fibres = fibres
@@ -396,25 +403,39 @@ class _Plan:
         self.chances, self.chances_per_mm = scoring_chances(self.table)
         self.deeper_per_mm = 1.0 / transport_depth_mm(self.table)
 
-    def learned(self, window: FloatArray, photons: int, seed: NDArray[np.uint64]) -> FloatArray:
+    def learned(self, window: Float64Array, photons: int, seed: NDArray[np.uint64]) -> Float64Array:
         """Return weights at which every distance is visited alike, learned from some photons."""
         visited = self.run(window, photons, seed)[1]
         return learned_window(visited, window, self.reach_mm, self.farthest_mm)
 
     def run(
-        self, window: FloatArray, photons: int, seed: NDArray[np.uint64]
-    ) -> tuple[FloatArray, FloatArray]:
+        self, window: Float64Array, photons: int, seed: NDArray[np.uint64]
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the sums of the fibres' scores and of the weights that visited each distance."""
         fibres = len(self.kernels)
         tally = np.zeros(fibres)
         histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
         visited = np.zeros((2, len(window)))
         walk_to_fibres(
-            self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
-            self.kernels, self.starts, self.counts, window, self.chances,
-            WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm,
-            PATH_STEP, PATH_SCALE_MM, photons, seed.copy(), tally, histogram, visited,
-        )  # fmt: skip
+            self.table,
+            self.fibres.source_numerical_aperture,
+            self.fibres.numerical_aperture,
+            self.kernels,
+            self.starts,
+            self.counts,
+            window,
+            self.chances,
+            WINDOW_CELLS / self.reach_mm,
+            self.deeper_per_mm,
+            self.chances_per_mm,
+            PATH_STEP,
+            PATH_SCALE_MM,
+            photons,
+            seed.copy(),
+            tally,
+            histogram,
+            visited,
+        )
         return (histogram if self.counts_paths else tally), visited
 
 

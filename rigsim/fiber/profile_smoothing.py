@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array
 
 PIECES = 6
 """Pieces of the cubic spline through the logarithm of a profile."""
@@ -16,7 +15,9 @@ FEWEST = 14
 """Fibres that a spline is fitted to at least."""
 
 
-def smooth_profile(radii_mm: FloatArray, batches: FloatArray) -> tuple[FloatArray, FloatArray]:
+def smooth_profile(
+    radii_mm: Float64Array, batches: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return profiles with the noise between neighbours taken out.
 
     Parameters
@@ -68,7 +69,7 @@ def smooth_profile(radii_mm: FloatArray, batches: FloatArray) -> tuple[FloatArra
     return value, spread
 
 
-def _fit(basis: FloatArray, mean: FloatArray, relative: FloatArray) -> FloatArray:
+def _fit(basis: Float64Array, mean: Float64Array, relative: Float64Array) -> Float64Array:
     """Return coefficients of the logarithm by Gauss-Newton on relative residuals."""
     beta = np.linalg.lstsq(basis / relative[:, None], np.log(mean) / relative, rcond=None)[0]
     for _ in range(4):

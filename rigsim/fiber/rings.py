@@ -10,17 +10,16 @@ from math import pi
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array, Int64Array
 
 KERNEL_NODES: Final = 400
 """Nodes of a fibre's density over the distance that it takes light from."""
 
 
 def ring_kernels(
-    radii_mm: FloatArray, detector_mm: float, source_mm: float
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    radii_mm: Float64Array, detector_mm: float, source_mm: float
+) -> tuple[Float64Array, Int64Array, Int64Array]:
     """Return the densities with which fibres take light by its distance from the entry."""
     both = detector_mm + source_mm
     radii = radii_mm
@@ -44,8 +43,8 @@ def ring_kernels(
 
 
 def _ring_share(
-    rho_mm: FloatArray, radius_mm: float, detector_mm: float, source_mm: float
-) -> FloatArray:
+    rho_mm: Float64Array, radius_mm: float, detector_mm: float, source_mm: float
+) -> Float64Array:
     """Return the mean over directions of the density of (point in one core - point in the other).
 
     That density, in 1/mm^2, is the overlap of the two discs at that displacement over the product
@@ -76,7 +75,7 @@ def _ring_share(
     return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
 
 
-def disc_overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
+def disc_overlap(apart: Float64Array, a: float, b: float) -> Float64Array:
     """Return the area that two discs of radii a and b share at a distance of their centres."""
     small = min(a, b)
     d = np.clip(apart, abs(a - b) + 1e-12, a + b)

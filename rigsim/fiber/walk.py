@@ -64,9 +64,25 @@ def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, 
     error_model="numpy",
 )
 def walk_to_fibres(  # type: ignore[no-untyped-def]
-    table, source_sine, fibre_sine, kernels, starts, counts, window, chances, per_mm,
-    deeper_per_mm, chances_per_mm, log_step, path_scale, photons, seed, tally, histogram, visited,
-):  # fmt: skip
+    table,
+    source_sine,
+    fibre_sine,
+    kernels,
+    starts,
+    counts,
+    window,
+    chances,
+    per_mm,
+    deeper_per_mm,
+    chances_per_mm,
+    log_step,
+    path_scale,
+    photons,
+    seed,
+    tally,
+    histogram,
+    visited,
+):
     """Trace photons from a point source in a cone and score what fibres take.
 
     Parameters
@@ -200,9 +216,17 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                     value *= 1.0 - reflected
                             value *= exp(-tau)
                             _on_fibres(
-                                sqrt(x_out * x_out + y_out * y_out), value, out_path, kernels,
-                                starts, counts, log_step, path_scale, tally, histogram,
-                            )  # fmt: skip
+                                sqrt(x_out * x_out + y_out * y_out),
+                                value,
+                                out_path,
+                                kernels,
+                                starts,
+                                counts,
+                                log_step,
+                                path_scale,
+                                tally,
+                                histogram,
+                            )
 
                     deeper = min(1.0 + z * deeper_per_mm, DEEPEST)
                     target = window[cell] * deeper
@@ -272,8 +296,15 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                         _on_fibres(
                             sqrt(x * x + y * y),
                             share * weight * eta_above * eta_above / (fibre_sine * fibre_sine),
-                            path, kernels, starts, counts, log_step, path_scale, tally, histogram,
-                        )  # fmt: skip
+                            path,
+                            kernels,
+                            starts,
+                            counts,
+                            log_step,
+                            path_scale,
+                            tally,
+                            histogram,
+                        )
                     break
                 if beyond == last:
                     break

@@ -18,12 +18,11 @@ from importlib import resources
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 
+from rigsim.arrays import Float64Array
 from rigsim.fiber.profile import Fibres
-
-FloatArray = NDArray[np.float64]
 
 G: Final = 0.8
 ETA: Final = 1.4
@@ -51,7 +50,7 @@ class WhiteFibreError(ValueError):
     """A medium or a distance outside the table."""
 
 
-def decay(absorption: ArrayLike) -> FloatArray:
+def decay(absorption: ArrayLike) -> Float64Array:
     """Return about what the logarithm of F falls by per unit of distance, far away.
 
     Parameters
@@ -63,12 +62,12 @@ def decay(absorption: ArrayLike) -> FloatArray:
     return np.asarray(np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a))
 
 
-def distance_axis(distance: ArrayLike) -> FloatArray:
+def distance_axis(distance: ArrayLike) -> Float64Array:
     """Return the coordinate in which F is smooth, of distances in 1 / sigma_s'."""
     return np.asarray(np.log(np.asarray(distance, np.float64) + 0.4))
 
 
-def absorption_axis(absorption: ArrayLike) -> FloatArray:
+def absorption_axis(absorption: ArrayLike) -> Float64Array:
     """Return the coordinate in which F is smooth, of sigma_a / sigma_s'."""
     return np.asarray(np.log1p(20.0 * np.sqrt(np.asarray(absorption, np.float64))))
 
@@ -77,13 +76,13 @@ def absorption_axis(absorption: ArrayLike) -> FloatArray:
 class WhiteFibre:
     """The table."""
 
-    distance: FloatArray
+    distance: Float64Array
     """Nodes in 1 / sigma_s', increasing, > 0, shape (D,)."""
-    absorption: FloatArray
+    absorption: Float64Array
     """Nodes of sigma_a / sigma_s', increasing from 0, shape (A,)."""
-    shape: FloatArray
+    shape: Float64Array
     """log(F distance) + decay(absorption) distance, shape (D, A)."""
-    relative_error: FloatArray
+    relative_error: Float64Array
     """Relative standard error of F, shape (D, A)."""
     recipe: Mapping[str, Any]
     """What it was made with."""
@@ -122,7 +121,7 @@ class WhiteFibre:
 
     def profile(
         self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibres: Fibres
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Float64Array, Float64Array]:
         """Return what fibres take.
 
         Parameters
@@ -171,7 +170,7 @@ class WhiteFibre:
         return value, np.asarray((relative * each).sum(axis=1) / each.sum(axis=1) * value)
 
 
-def diffused(distance: FloatArray, absorption: float) -> FloatArray:
+def diffused(distance: Float64Array, absorption: float) -> Float64Array:
     """Return the logarithm of diffused light far from its source, up to a constant.
 
     That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 + `DEPTH2`, and
@@ -190,7 +189,7 @@ def diffused(distance: FloatArray, absorption: float) -> FloatArray:
     return np.asarray(np.log1p(k * d) - k * d - 3.0 * np.log(d))
 
 
-def _of_all(table: WhiteFibre) -> tuple[FloatArray, FloatArray]:
+def _of_all(table: WhiteFibre) -> tuple[Float64Array, Float64Array]:
     """Return shape and error with far nodes of weak absorption told by all of them together."""
     shape, error = table.shape.copy(), table.relative_error.copy()
     near, far = DIFFUSED_FROM
@@ -217,7 +216,7 @@ def _splines() -> tuple[RectBivariateSpline, RegularGridInterpolator]:
 
 
 @lru_cache(maxsize=8)
-def distances(fibres: Fibres) -> tuple[FloatArray, FloatArray]:
+def distances(fibres: Fibres) -> tuple[Float64Array, Float64Array]:
     """Return distances of pairs of points, one in each core, and their shares.
 
     Parameters
@@ -246,7 +245,7 @@ def distances(fibres: Fibres) -> tuple[FloatArray, FloatArray]:
     return apart, np.broadcast_to(share, apart.shape)
 
 
-def disc_points(rings: int, turns: int) -> tuple[FloatArray, FloatArray]:
+def disc_points(rings: int, turns: int) -> tuple[Float64Array, Float64Array]:
     """Return points in the unit disc, shape (rings turns, 2), and their shares of its area.
 
     Examples

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh
-
-BoolArray = NDArray[np.bool_]
+from rigsim.arrays import BoolArray, Float32Array, Int32Array
+from rigsim.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True, slots=True)

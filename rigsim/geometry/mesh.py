@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float32Array = NDArray[np.float32]
-Int32Array = NDArray[np.int32]
+from rigsim.arrays import Float32Array, Int32Array
 
 EXTENT_RANGE_MM: Final = (1.0, 5000.0)
 """Longest side of a mesh that is believed to be in millimetres."""

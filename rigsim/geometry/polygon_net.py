@@ -10,10 +10,8 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
+from rigsim.arrays import Float32Array, Float64Array
 
 
 def polygon_net(

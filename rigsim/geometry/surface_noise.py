@@ -10,11 +10,8 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array
-
-FloatArray = NDArray[np.floating]
+from rigsim.arrays import Float32Array, FloatArray
 
 _GRADIENT_RMS = 0.191
 """Root mean square of the gradient noise with unit gradients; measured over 400,000 points."""

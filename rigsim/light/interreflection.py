@@ -21,8 +21,8 @@ import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.surface_brdf import through
 from rigsim.render import OFFSET_MM, Caster
 
@@ -74,10 +74,7 @@ class SkinBounce:
 
     def surface(self) -> tuple[Float32Array, Float32Array]:
         """Return the patches' middles in mm and their normals, shape (1, P, 3) each."""
-        return (
-            self.atlas.position_mm[self._covered][None],
-            self.atlas.normal[self._covered][None],
-        )
+        return (self.atlas.position_mm[self._covered][None], self.atlas.normal[self._covered][None])
 
     def indirect(
         self, entered: Float32Array, r_d: Float32Array, *, enough: float = ENOUGH

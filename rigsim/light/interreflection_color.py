@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import View
 from model import spectra
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.light.interreflection import ENOUGH, SkinBounce
 from rigsim.subject import Subject
 from rigsim.tissue.skin_table import SkinTable
@@ -116,7 +115,7 @@ class BounceColor:
         return sample(filled, uv, np.ones((size, size), np.bool_))
 
 
-def color_error(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+def color_error(subject: Subject, state: str, view: View, illuminant: str) -> Float64Array:
     """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
 
     Of typical skin.
@@ -129,9 +128,7 @@ def color_error(subject: Subject, state: str, view: View, illuminant: str) -> ND
     return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
 
 
-def step_error(
-    subject: Subject, state: str, camera: str, light: str, step: int
-) -> NDArray[np.float64]:
+def step_error(subject: Subject, state: str, camera: str, light: str, step: int) -> Float64Array:
     """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
 
     Parameters
@@ -158,7 +155,7 @@ def step_error(
     melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
     skin = table.spectra(melanin, blood)
 
-    def bounced(every: int) -> NDArray[np.float64]:
+    def bounced(every: int) -> Float64Array:
         weights = spectra.band_weights(camera, light, table.wavelength_nm[::every])
         some = skin[:, ::every]
         twice = np.einsum("al,bl,lc->abc", some, some, weights)

@@ -19,10 +19,10 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
-from rigsim.geometry.mesh import Float32Array
 
 STEPS: Final = 6
 """Implicit steps between two widths."""
@@ -89,7 +89,7 @@ def spread_light(
     return total
 
 
-def line_spread_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> NDArray[np.float64]:
+def line_spread_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
     """Return how wide a sum of Gaussians blurs an edge: from 10 to 90 % of the step.
 
     Parameters

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from rigsim import shading
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import spread
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import lateral
 from rigsim.light.interreflection import SkinBounce
 from rigsim.light.interreflection_color import BounceColor
@@ -75,9 +75,16 @@ class SkinBleeding:
         self._bounce = bounce
         if bounce is not None:
             self._color = BounceColor(
-                bounce, subject, "neutral", surface.r_d, surface.reflectance,
-                camera=camera, light=light, spectral=spectral, enough=enough,
-            )  # fmt: skip
+                bounce,
+                subject,
+                "neutral",
+                surface.r_d,
+                surface.reflectance,
+                camera=camera,
+                light=light,
+                spectral=spectral,
+                enough=enough,
+            )
         if subsurface:
             blood = subject.hemoglobin("neutral")
             clear = skin_color(camera, light).rgb(np.zeros_like(subject.melanin), blood)

@@ -6,12 +6,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Light, View
 from model import spectra
-
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array
 
 METER_RATE_PER_S: Final = 12.0
 """Full scales per second in the strongest channel of a perfect white that faces the LED of
@@ -21,7 +19,7 @@ METER_LED: Final = (1.0, 40.0, 700.0)
 """Power in W, half-intensity angle in degrees and distance in mm of the LED that defines it."""
 
 
-def white_intensity(light: Light, view: View) -> FloatArray:
+def white_intensity(light: Light, view: View) -> Float64Array:
     """Return what a camera sees of a perfect white before an LED, shape (3,).
 
     A Lambertian white of reflectance 1 that faces the light on its axis at d mm gives

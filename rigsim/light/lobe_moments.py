@@ -28,13 +28,11 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rigsim import shading
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
-from rigsim.geometry.mesh import Float32Array
-
-FloatArray = NDArray[np.float64]
 
 STEEPEST_DEG: Final = 70.0
 """Tilt of normals up to which the table is used."""
@@ -81,7 +79,7 @@ class Moments:
 
 def irradiance_share(
     sphere: BuiltSphere, places_mm: ArrayLike, led: int
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return where an LED is seen, and its irradiance across the beam, its film aside.
 
     Parameters
@@ -106,8 +104,11 @@ def irradiance_share(
     to_light = way / np.sqrt(square)[:, None]
     off = np.clip(to_light @ (place / np.linalg.norm(place)), 0.0, 1.0)
     half_deg = sphere.nominal.lights[led].half_intensity_deg
-    lobe = 1.0 if half_deg is None else off ** (math.log(0.5) / math.log(math.cos(
-        math.radians(half_deg))))  # fmt: skip
+    lobe = (
+        1.0
+        if half_deg is None
+        else off ** (math.log(0.5) / math.log(math.cos(math.radians(half_deg))))
+    )
     return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
 
 
@@ -210,14 +211,14 @@ class MomentTable:
 
     values: Float32Array
     """Shape (alphas, fields, fields, size, size, `CHANNELS`): y, x, then p_y, p_x, all upwards."""
-    alphas: FloatArray
+    alphas: Float64Array
     """Roughnesses, evenly spaced, 1 or 3 of them; in between by a parabola."""
     half_field_mm: float
     """The field's nodes go from minus to plus this."""
     reach: float
     """The nodes of p go from minus to plus this."""
 
-    def covers(self, normals: Float32Array) -> NDArray[np.bool_]:
+    def covers(self, normals: Float32Array) -> BoolArray:
         """Return which normals the table holds, shape (N,)."""
         return np.asarray(normals[:, 2] >= np.float32(math.cos(math.radians(STEEPEST_DEG))))
 
@@ -312,9 +313,12 @@ def build_table(
     values = np.zeros((len(alphas), fields, fields, size, size, CHANNELS), np.float32)
     # few long sums: one for each LED, over all nodes
     k, row, column, node = np.meshgrid(
-        np.arange(len(alphas)), np.arange(fields), np.arange(fields), np.arange(len(normals)),
+        np.arange(len(alphas)),
+        np.arange(fields),
+        np.arange(fields),
+        np.arange(len(normals)),
         indexing="ij",
-    )  # fmt: skip
+    )
     places = np.stack([nodes[column], nodes[row], np.zeros(row.shape)], axis=-1).reshape(-1, 3)
     found = direct_moments(
         normals[node.ravel()], places, sphere, surface, leds=leds, alpha=alphas[k.ravel()]

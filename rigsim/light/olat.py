@@ -17,16 +17,12 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
-from rigsim.geometry.mesh import Float32Array, Int32Array
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array, UInt16Array
 from rigsim.light.surface_brdf import R_D_LIMIT, boundary, coated_terms, ggx, surface_terms, through
 from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
 from rigsim.render.depth_of_field import LensPicture, before_focus, lens_spread
 
-FloatArray = NDArray[np.float64]
-UInt16Array = NDArray[np.uint16]
-UInt8Array = NDArray[np.uint8]
-
-LookUp = Callable[[GBuffer, NDArray[np.int32]], tuple[Float32Array, Float32Array]]
+LookUp = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
 """Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
 with a coating (n, 11)."""
 
@@ -59,16 +55,16 @@ ETA_COLUMN: Final = 9
 class Lamp:
     """A light in the frame of the mesh."""
 
-    position_mm: FloatArray
+    position_mm: Float64Array
     """Centre of the emitting disc, shape (3,)."""
-    axis: FloatArray
+    axis: Float64Array
     """Unit vector in which the disc shines, shape (3,)."""
     exponent: float
     """Exponent of the cosine off the axis that the intensity follows; nothing shines backwards."""
     radius_mm: float
     """Radius of the disc, 0 for a point."""
 
-    def radii(self) -> tuple[FloatArray, FloatArray]:
+    def radii(self) -> tuple[Float64Array, Float64Array]:
         """Return two perpendicular radii of the disc, mm, shape (3,) each."""
         axis = np.asarray(self.axis, np.float64)
         helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
@@ -103,7 +99,7 @@ class Hits:
     """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; with a
     coating also film, its alpha, its index - 1, powder; times `FULL`; shape (n, 7) or (n, 11). Matt
     rows hold their reflectance as r_d, metal ones too and their alpha as roughness."""
-    camera_mm: FloatArray
+    camera_mm: Float64Array
     """Centre of projection, shape (3,)."""
     kind: int
     """`SKIN`, `MATT` or `METAL`."""
@@ -114,9 +110,15 @@ class Hits:
     def megabytes(self) -> float:
         """Memory held by the rows."""
         arrays = (
-            self.pixel, self.first, self.position_mm, self.normal, self.prim, self.slot, self.uv,
+            self.pixel,
+            self.first,
+            self.position_mm,
+            self.normal,
+            self.prim,
+            self.slot,
+            self.uv,
             self.surface,
-        )  # fmt: skip
+        )
         return sum(array.nbytes for array in arrays) / 1e6
 
     def scatter(self, rows: Float32Array) -> Float32Array:
@@ -252,7 +254,7 @@ def _extremes(values: Float32Array) -> tuple[float, float]:
 
 
 def pixel_order(
-    mask: NDArray[np.bool_], subpixels: int
+    mask: BoolArray, subpixels: int
 ) -> tuple[Int32Array, Int32Array, Int32Array, UInt8Array]:
     """Return the samples that meet something, those of one pixel together.
 
@@ -302,7 +304,7 @@ def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
     return begin, min(max(end, begin + 1), view.height_px)
 
 
-def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
+def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     """Tell which rows see their point of a light.
 
     Every row has its own point on the disc; neighbours' points are spread evenly over it. Only
@@ -337,9 +339,19 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
     way = np.empty((count[-1], 3), np.float32)
     length = np.empty(count[-1], np.float32)
     _aim(
-        hits.position_mm, hits.normal, hits.prim, caster.mesh.vertices_mm, caster.mesh.faces,
-        center, targets, count, index, start, way, length,
-    )  # fmt: skip
+        hits.position_mm,
+        hits.normal,
+        hits.prim,
+        caster.mesh.vertices_mm,
+        caster.mesh.faces,
+        center,
+        targets,
+        count,
+        index,
+        start,
+        way,
+        length,
+    )
     visible = np.zeros(len(hits.position_mm), np.bool_)
     visible[index] = ~caster.blocked(start, way, length)
     return visible
@@ -366,7 +378,7 @@ def sum_rows(
 def light_up(
     hits: Hits,
     lamp: Lamp,
-    visible: NDArray[np.bool_],
+    visible: BoolArray,
     color: Float32Array,
     glow: Float32Array | None = None,
     *,
@@ -403,10 +415,20 @@ def light_up(
     center = np.ascontiguousarray(lamp.position_mm, np.float64)
     axis = np.ascontiguousarray(lamp.axis, np.float64)
     _shade(
-        hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind, center, axis,
-        float(lamp.exponent), visible, extra, diffuse,
-        np.ones(0, np.float32) if relief is None else relief, rows,
-    )  # fmt: skip
+        hits.position_mm,
+        hits.normal,
+        hits.surface,
+        hits.camera_mm,
+        hits.kind,
+        center,
+        axis,
+        float(lamp.exponent),
+        visible,
+        extra,
+        diffuse,
+        np.ones(0, np.float32) if relief is None else relief,
+        rows,
+    )
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 
@@ -455,8 +477,8 @@ def _count_facing(position, normal, center, count):  # type: ignore[no-untyped-d
 
 @njit(parallel=True, cache=True)
 def _aim(  # type: ignore[no-untyped-def]
-    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length,
-):  # fmt: skip
+    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length
+):
     for chunk in prange(count.shape[0] - 1):
         at = count[chunk]
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
@@ -488,9 +510,20 @@ def _aim(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _shade(  # type: ignore[no-untyped-def]
-    position, normal, surface, camera, kind, center, axis, exponent, visible, glow, diffuse,
-    relief, out,
-):  # fmt: skip
+    position,
+    normal,
+    surface,
+    camera,
+    kind,
+    center,
+    axis,
+    exponent,
+    visible,
+    glow,
+    diffuse,
+    relief,
+    out,
+):
     has_glow = glow.shape[0] > 0
     for i in prange(position.shape[0]):
         if not visible[i] and not has_glow:
@@ -546,9 +579,18 @@ def _shade(  # type: ignore[no-untyped-def]
         oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
         if surface.shape[1] > BARE:
             lobe = coated_terms(
-                nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz, surface[i, 7] / FULL,
-                surface[i, 8] / FULL, 1.0 + surface[i, 9] / FULL, surface[i, 10] / FULL,
-            )  # fmt: skip
+                nl,
+                nv,
+                nh,
+                0.5 * length,
+                rough,
+                oil,
+                FUZZ_LIMIT * fuzz,
+                surface[i, 7] / FULL,
+                surface[i, 8] / FULL,
+                1.0 + surface[i, 9] / FULL,
+                surface[i, 10] / FULL,
+            )
         else:
             lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
         gloss = math.pi * strength * bare * lobe

@@ -11,9 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.light.olat import (
     BARE,
     DISC_POINTS,
@@ -91,7 +90,7 @@ class VectorLight:
         def number(value: float) -> Any:
             return dr.opaque(mi.Float, float(value))
 
-        def vector(values: NDArray[np.float64]) -> Any:
+        def vector(values: Float64Array) -> Any:
             return mi.Vector3f(*(number(v) for v in values))
 
         side, other = lamp.radii()

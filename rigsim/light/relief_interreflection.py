@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numba import njit, prange
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.light.self_shadow import horizon_tangent
 from rigsim.light.surface_brdf import through
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.light.self_shadow import horizon_tangent
 from rigsim.subject import Subject
 
@@ -76,9 +76,15 @@ class ReliefShadow:
         out = np.empty(len(uv), np.float32)
         light = np.asarray(light_mm, np.float64)
         _seen(
-            np.ascontiguousarray(uv, np.float32), np.ascontiguousarray(position_mm, np.float32),
-            light, radius_mm, self._du, self._dv, self._horizon, out,
-        )  # fmt: skip
+            np.ascontiguousarray(uv, np.float32),
+            np.ascontiguousarray(position_mm, np.float32),
+            light,
+            radius_mm,
+            self._du,
+            self._dv,
+            self._horizon,
+            out,
+        )
         return out
 
     def on_texture(

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 
 
 class HorizonError(ValueError):

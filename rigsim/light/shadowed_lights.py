@@ -7,10 +7,9 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
+from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.lobe_moments import Surface
 from rigsim.shading import entry_one, specular_one
 
@@ -35,7 +34,7 @@ class Elements(Protocol):
         """Roughness, shape (H, W)."""
 
     @property
-    def skin(self) -> NDArray[np.bool_]:
+    def skin(self) -> BoolArray:
         """Where light is taken away, shape (H, W)."""
 
 
@@ -101,9 +100,28 @@ def remove_hidden(
 
 @njit(parallel=True, cache=True)
 def _remove(  # type: ignore[no-untyped-def]
-    packed, normals, x, y, alpha, skin, first, second, between, low, elevation, radius,
-    place, absorbs, intensity, exponent, weights, eye, right, eta, leak,
-):  # fmt: skip
+    packed,
+    normals,
+    x,
+    y,
+    alpha,
+    skin,
+    first,
+    second,
+    between,
+    low,
+    elevation,
+    radius,
+    place,
+    absorbs,
+    intensity,
+    exponent,
+    weights,
+    eye,
+    right,
+    eta,
+    leak,
+):
     distance = math.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
     for i in prange(normals.shape[0]):
         tangent = first[i] + between * (second[i] - first[i])

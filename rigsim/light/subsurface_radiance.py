@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Light
 from model import spectra
 from rigsim import shading
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Films, absorbing_axis
 from rigsim.geometry.atlas import Atlas
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import lateral
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
@@ -69,7 +68,7 @@ class SkinGlow:
 def light_surface(
     subject: Subject,
     lights: tuple[Light, ...],
-    weights: NDArray[np.float64],
+    weights: Float64Array,
     films: Films,
     *,
     caster: Caster,
@@ -191,9 +190,17 @@ def light_skin(
 
         outside = scale * ((1.0 - hair) * reflectance + covering)
         color = BounceColor(
-            bounce, subject, state, outside, reflectance,
-            camera=camera, light=illuminant, spectral=spectral, step=step, enough=enough,
-        )  # fmt: skip
+            bounce,
+            subject,
+            state,
+            outside,
+            reflectance,
+            camera=camera,
+            light=illuminant,
+            spectral=spectral,
+            step=step,
+            enough=enough,
+        )
         covered = subject.atlas.covered
         sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
         direct = np.asarray(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), np.float32)

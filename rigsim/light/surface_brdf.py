@@ -47,7 +47,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from rigsim import shading
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.subject import Subject
 from rigsim.tissue.skin_color import skin_color

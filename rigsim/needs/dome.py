@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, Vector, View
 from model import spectra
+from rigsim.arrays import FloatArray
 from rigsim.light.interreflection_color import color_error
 from rigsim.light.subsurface_radiance import typical_kernels
 from rigsim.needs.effect_sizes import (
@@ -46,7 +46,7 @@ def dome_needs(
     *,
     caster: Caster,
     noise: Noise,
-    white_rgb: NDArray[np.floating] | None,
+    white_rgb: FloatArray | None,
     movement: bool,
     motion: HeadMotion | None,
     subsurface: bool | None,
@@ -107,28 +107,37 @@ def dome_needs(
     more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
+        BOUNCES,
+        float(unseen.max()),
+        interreflections,
+        switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
-    )  # fmt: skip
+    )
     off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
         *textures(subject, view, illuminant),
         Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
         decide(
-            LATERAL, float(spread_over_noise(lost, level, noise).max()), subsurface,
+            LATERAL,
+            float(spread_over_noise(lost, level, noise).max()),
+            subsurface,
             switch="subsurface",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
         decide(
-            SPECTRAL, float(off.max()), spectral, switch="spectral",
+            SPECTRAL,
+            float(off.max()),
+            spectral,
+            switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
-            if bounces.built else "there is no such light",
+            if bounces.built
+            else "there is no such light",
         ),
         further_bounces(bounces, share * float(brightest.max())),
         focus,
         wrinkles(subject, noise, 1.0, relief_shadows),
-    ]  # fmt: skip
+    ]
     made += _movement(subject, movement, motion, view)
     made += absent(
         [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]

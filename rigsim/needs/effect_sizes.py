@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh
 from rigsim.needs.effects import Noise
 from rigsim.render import Caster
@@ -20,7 +21,7 @@ EXCHANGE_PATCHES = 32
 """Texels along one side of the coarse texture on which exchange between skin is estimated."""
 
 
-def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> NDArray[np.float64]:
+def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Float64Array:
     """Return how much of a lit pixel's light spreads out of it across the edge of a shadow.
 
     Parameters
@@ -63,7 +64,7 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> NDAr
     return np.asarray(weight @ mean, np.float64)
 
 
-def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> NDArray[np.float64]:
+def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> Float64Array:
     """Return how much spreading across a shadow's edge changes a pixel, over its noise.
 
     Parameters
@@ -140,7 +141,7 @@ def bounced(share: float, reflectance: float) -> float:
     return once / (1.0 - once)
 
 
-def steepest_slope(slope_x: NDArray[np.floating], slope_y: NDArray[np.floating]) -> float:
+def steepest_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
     """Return the steepest slope of a relief: a light above that elevation shines everywhere.
 
     Examples

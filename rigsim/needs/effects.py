@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan import Plan
 from capture.plan.rows import lights_of
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.sensor import Sensor
 
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
@@ -68,7 +68,7 @@ class Noise:
         """
         return cls(*sensor.noise_profile(exposure_s))
 
-    def sigma(self, level: NDArray[np.floating] | float) -> NDArray[np.float64]:
+    def sigma(self, level: FloatArray | float) -> Float64Array:
         """Return the standard deviation at signals of any shape; below 0 as at 0.
 
         Examples

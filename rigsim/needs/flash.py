@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from rigsim import shading
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.light.interreflection_color import STEPS, color_error, step_error
 from rigsim.light.subsurface_radiance import typical_kernels
 from rigsim.needs.effect_sizes import (
@@ -62,8 +62,8 @@ def flash_needs(
     view: View,
     caster: Caster,
     noise: Noise,
-    white_rgb: NDArray[np.floating],
-    weights_mm2: NDArray[np.floating],
+    white_rgb: FloatArray,
+    weights_mm2: FloatArray,
     movement: bool,
     lateral: bool | None,
     interreflections: bool | None,
@@ -130,29 +130,42 @@ def flash_needs(
     more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
+        BOUNCES,
+        float(unseen.max()),
+        interreflections,
+        switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
-    )  # fmt: skip
+    )
     off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
         *textures(subject, view, illuminant),
         Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
         decide(
-            LATERAL, float(spread_over_noise(lost, level, noise).max()), lateral, switch="lateral",
+            LATERAL,
+            float(spread_over_noise(lost, level, noise).max()),
+            lateral,
+            switch="lateral",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
         decide(
-            SPECTRAL, float(off.max()), spectral, switch="spectral",
+            SPECTRAL,
+            float(off.max()),
+            spectral,
+            switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
-            if bounces.built else "there is no such light",
+            if bounces.built
+            else "there is no such light",
         ),
-        _finer(bounces, bool(off.max() >= ENOUGH) if spectral is None else spectral,
-               spectral_step(subject, state, view, illuminant, bounces)),
+        _finer(
+            bounces,
+            bool(off.max() >= ENOUGH) if spectral is None else spectral,
+            spectral_step(subject, state, view, illuminant, bounces),
+        ),
         further_bounces(bounces, share * float(brightest.max())),
         lens(view, illuminant, caster, noise, peak, subpixels, optics),
         wrinkles(subject, noise, peak, relief_shadows),
-    ]  # fmt: skip
+    ]
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 
 
@@ -173,9 +186,12 @@ def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -
     # a light as low as the relief is steep shines with that sine, and may be hidden
     most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
     return decide(
-        WRINKLES, most / float(noise.sigma(0.0)), asked, switch="relief_shadows",
+        WRINKLES,
+        most / float(noise.sigma(0.0)),
+        asked,
+        switch="relief_shadows",
         because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
-    )  # fmt: skip
+    )
 
 
 FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
@@ -213,10 +229,13 @@ def lens(
     far = max(abs(depth) for depth in depths)
     gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
     return decide(
-        LENS, gained / float(noise.sigma(gained)), asked, switch="optics",
+        LENS,
+        gained / float(noise.sigma(gained)),
+        asked,
+        switch="optics",
         because=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "
         f"{100 * spilled:.0f} % of a pixel's light falls on others",
-    )  # fmt: skip
+    )
 
 
 def polarization(rig: Rig, view: View) -> Effect:
@@ -259,13 +278,14 @@ def textures(subject: Subject, view: View, illuminant: str) -> list[Effect]:
     return [
         Effect(RELIEF, "negligible" if flat else "built", f"it tilts up to {tilt:.0f} degrees"),
         Effect(
-            PIGMENT, "negligible" if even else "built",
+            PIGMENT,
+            "negligible" if even else "built",
             f"reflectance is {least:.2g} to {most:.2g} times its median's",
         ),
-    ]  # fmt: skip
+    ]
 
 
-def brightest_rgb(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+def brightest_rgb(subject: Subject, state: str, view: View, illuminant: str) -> Float64Array:
     """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
     covered = subject.atlas.covered
     melanin, blood = subject.melanin[covered][::EVERY], subject.hemoglobin(state)[covered][::EVERY]
@@ -345,11 +365,7 @@ def _movement(subject: Subject, movement: bool) -> list[Effect]:
     if subject.pose is None:
         return [Effect(name, "absent", "at rest nothing moves", switch="movement")]
     out = [Effect(name, "built", "the state moves the face", switch="movement")]
-    out += unmodeled(
-        [
-            ("parted lips and open eyes", "a mesh without an opening stretches instead"),
-        ]
-    )
+    out += unmodeled([("parted lips and open eyes", "a mesh without an opening stretches instead")])
     if subject.pose.wrinkles.left_out:
         zones = ", ".join(subject.pose.wrinkles.left_out)
         out += unmodeled([(f"fine wrinkles ({zones})", "the texture's texels are too coarse")])

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
 from capture.rig import Rig
 from rigsim import shading
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
@@ -19,8 +19,6 @@ from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS, bands, polarization
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
-
-FloatArray = NDArray[np.float64]
 
 OPTICS: Final = "diffraction and defocus"
 RELIEF: Final = "relief of the skin"
@@ -105,9 +103,12 @@ def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:
     nyquist_per_mm = 500.0 / lens.pixel_on_subject_um
     kept = float(lens.transfer(np.array([nyquist_per_mm]))[0])
     return decide(
-        OPTICS, noise.share(1.0 - kept), asked, switch="optics",
+        OPTICS,
+        noise.share(1.0 - kept),
+        asked,
+        switch="optics",
         because=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
-    )  # fmt: skip
+    )
 
 
 def _of_skin(
@@ -132,9 +133,13 @@ def _of_skin(
     length = np.sqrt(1.0 + right**2 + down**2)
     normals = np.stack([-right / length, down / length, 1.0 / length], axis=-1)
     hidden = shading.interior_scale(ETA) * hidden_share(
-        part, normals.astype(np.float32), margin=0, pixel_um=skin.texel_um, sectors=SECTORS,
+        part,
+        normals.astype(np.float32),
+        margin=0,
+        pixel_um=skin.texel_um,
+        sectors=SECTORS,
         boundaries=True,
-    )  # fmt: skip
+    )
     sigmas, weights = lateral_kernel(skin)
     if lateral is not False:  # what comes from other walls spreads as all light does
         hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
@@ -149,24 +154,32 @@ def _of_skin(
     return [
         Effect(RELIEF, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
         decide(
-            SHADOWS, noise.share(1.0) if steepest > lowest else 0.0, shadows, switch="shadows",
+            SHADOWS,
+            noise.share(1.0) if steepest > lowest else 0.0,
+            shadows,
+            switch="shadows",
             because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
         decide(
-            LATERAL, noise.share(lost, level), lateral, switch="lateral",
+            LATERAL,
+            noise.share(lost, level),
+            lateral,
+            switch="lateral",
             because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
         decide(
-            BOUNCES, noise.share(more, level), interreflections,
+            BOUNCES,
+            noise.share(more, level),
+            interreflections,
             switch="interreflections",
             because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _spread(
-    hidden: NDArray[np.floating], sigmas_mm: FloatArray, weights: FloatArray, texel_mm: float
-) -> FloatArray:
+    hidden: FloatArray, sigmas_mm: Float64Array, weights: Float64Array, texel_mm: float
+) -> Float64Array:
     """Return the light of a part of the patch after it has spread; beyond it goes on mirrored."""
     axis = np.arange(len(hidden)) / (2.0 * len(hidden) * texel_mm)
     square = 2.0 * np.pi**2 * (axis[:, None] ** 2 + axis[None, :] ** 2)

@@ -42,7 +42,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.light.surface_brdf import Coating, SkinSurface, skin_surface
 from rigsim.shading import interior_scale

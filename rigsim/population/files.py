@@ -47,8 +47,9 @@ MELANIN_RANGE: Final = (0.005, 0.45)
 """That of the presets: what tables of light in skin are made for."""
 _FILES: Final = ("mesh", *MAP_RANGES)
 _UNUSED: Final[Mapping[str, tuple[str, ...]]] = {
-    "gradient": ("blood", "freckles", "oil", *_FILES), "probe": ("freckles", "oil", *_FILES),
-}  # fmt: skip
+    "gradient": ("blood", "freckles", "oil", *_FILES),
+    "probe": ("freckles", "oil", *_FILES),
+}
 """Keys that say nothing of what a rig sees: a patch of plain skin, and skin by its layers."""
 
 
@@ -80,9 +81,11 @@ class SubjectFile:
         known = ", ".join(PRESETS)
         checks.that("preset", self.preset, self.preset in PRESETS, f"one of {known}")
         for name, low, high in (
-            ("melanin", *MELANIN_RANGE), ("blood", 0.1, 4.0), ("freckles", 0.0, 1.0),
+            ("melanin", *MELANIN_RANGE),
+            ("blood", 0.1, 4.0),
+            ("freckles", 0.0, 1.0),
             ("oil", 0.0, 3.0),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             good = value is None or low <= value <= high
             checks.that(name, value, good, f"{low:g} to {high:g}")
@@ -139,9 +142,12 @@ class SubjectFile:
             melanin = texture("melanin_map", self.melanin_map, size)
         else:
             melanin = pigment.melanin_map(
-                perfusion.points_mm, perfusion.regions, self.fraction, seed=seed,
+                perfusion.points_mm,
+                perfusion.regions,
+                self.fraction,
+                seed=seed,
                 freckles=self.freckles,
-            )  # fmt: skip
+            )
         if self.hemoglobin_map is not None:
             blood = texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
             # the fold of `Perfusion.blood`, backwards: compartments keep their shares

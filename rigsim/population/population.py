@@ -35,10 +35,10 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigsim.arrays import BoolArray, Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
-from rigsim.geometry.mesh import Float32Array, Mesh
+from rigsim.geometry.mesh import Mesh
 from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.conditions import checked, conditioned_surface
@@ -179,7 +179,7 @@ class Member:
         """
         return conditioned_surface(self.face(size), camera, light, dict(self.applied))
 
-    def r_d(self, size: int, camera: str, light: str) -> tuple[Float32Array, NDArray[np.bool_]]:
+    def r_d(self, size: int, camera: str, light: str) -> tuple[Float32Array, BoolArray]:
         """Return the texture of R_d.
 
         Parameters

@@ -13,13 +13,14 @@ from scipy.ndimage import zoom
 from scipy.sparse import csr_array
 
 from capture.documents import InputError
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.subject import pigment
 from rigsim.subject.person import SIZE_RANGE
 
 MAP_RANGES: Final[Mapping[str, tuple[float, float]]] = {
-    "melanin_map": (0.0005, pigment.MELANIN_LIMIT), "hemoglobin_map": (0.0, 0.31),
-}  # fmt: skip
+    "melanin_map": (0.0005, pigment.MELANIN_LIMIT),
+    "hemoglobin_map": (0.0, 0.31),
+}
 """Of blood just below the limit that vessels fill at most, where the compartments would be
 without end."""
 

@@ -10,8 +10,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigsim.geometry.atlas import BoolArray
-from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh
+from rigsim.arrays import BoolArray, Float32Array, Int32Array
+from rigsim.geometry.mesh import Mesh
 from rigsim.render.renderer import load, with_slack
 from rigsim.render.variant import VariantChoice, choose_variant
 

@@ -26,14 +26,12 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import View
-from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh
+from rigsim.arrays import Float32Array, Float64Array, Int32Array, UInt8Array
+from rigsim.geometry.mesh import Mesh
 from rigsim.render.lens_blur import BlurError, Lens, lens_of
-
-FloatArray = NDArray[np.float64]
-UInt8Array = NDArray[np.uint8]
 
 STEP_PX: Final = 0.1
 MOST_EXACT: Final = 33
@@ -82,7 +80,7 @@ class LensSpread:
     gap_mm: float
     """Gap in depth at which one surface stands before another."""
 
-    def off_focus(self, toward_mm: ArrayLike) -> FloatArray:
+    def off_focus(self, toward_mm: ArrayLike) -> Float64Array:
         """Return what the circle of confusion goes with, of points so far before the focus."""
         depth = np.asarray(toward_mm, np.float64)
         return depth / (self.distance_mm - depth)
@@ -191,7 +189,7 @@ def _few_colors(lens: Lens) -> Lens:
     )
 
 
-def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> FloatArray:
+def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float64Array:
     """Return the table at one depth, shape ((2 r + 1)^2, k^2)."""
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     wide = 2 * radius + 1
@@ -264,9 +262,17 @@ class LensPicture:
         self._cut = np.full(shape, np.inf, np.float32)
         self._far = np.zeros(shape, np.float32)
         _layers(
-            self._lookup, self._first, self._slot, self._slice, self._toward, spread.table,
-            spread.radius, np.float32(spread.gap_mm), self._cut, self._far,
-        )  # fmt: skip
+            self._lookup,
+            self._first,
+            self._slot,
+            self._slice,
+            self._toward,
+            spread.table,
+            spread.radius,
+            np.float32(spread.gap_mm),
+            self._cut,
+            self._far,
+        )
 
     def see(self, rows: Float32Array) -> Float32Array:
         """Return the picture of samples of some radiance.
@@ -284,17 +290,25 @@ class LensPicture:
         out = np.zeros((*self.shape, rows.shape[1]), np.float32)
         if len(rows):
             _gather(
-                self._lookup, self._first, self._slot, self._slice, self._toward,
-                self.spread.table, self.spread.radius, self._cut, self._far,
-                np.ascontiguousarray(rows, np.float32), out,
-            )  # fmt: skip
+                self._lookup,
+                self._first,
+                self._slot,
+                self._slice,
+                self._toward,
+                self.spread.table,
+                self.spread.radius,
+                self._cut,
+                self._far,
+                np.ascontiguousarray(rows, np.float32),
+                out,
+            )
         return out
 
 
 @njit(parallel=True, cache=True)
 def _layers(  # type: ignore[no-untyped-def]
     lookup, first, slot, slices, toward, table, radius, gap, cut, far
-):  # fmt: skip
+):
     """Find for each pixel which depths are far, and what their weights are multiplied with."""
     height, width = lookup.shape
     wide = 2 * radius + 1
@@ -359,7 +373,7 @@ def _layers(  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True)
 def _gather(  # type: ignore[no-untyped-def]
     lookup, first, slot, slices, toward, table, radius, cut, far, rows, out
-):  # fmt: skip
+):
     height, width = lookup.shape
     wide = 2 * radius + 1
     channels = rows.shape[1]

@@ -21,9 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from model import spectra
-from rigsim.geometry.mesh import Float32Array
-
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float32Array, Float64Array
 
 WAVELENGTHS: Final = 9
 """Wavelengths that stand for the spectrum."""
@@ -94,7 +92,7 @@ class Lens:
         aperture = self.working_f_number / self.magnification
         return 1e3 * depth_mm / (8.0 * aperture**2)
 
-    def transfer(self, per_mm: ArrayLike, *, depth_mm: float = 0.0) -> FloatArray:
+    def transfer(self, per_mm: ArrayLike, *, depth_mm: float = 0.0) -> Float64Array:
         """Return the lens's OTF, without pixels.
 
         Parameters
@@ -267,7 +265,7 @@ def _slices(depth_mm: Float32Array | None) -> list[tuple[float, Float32Array | N
     ]
 
 
-def _defocused_circle(nodes: FloatArray, waves: float) -> FloatArray:
+def _defocused_circle(nodes: Float64Array, waves: float) -> Float64Array:
     """Return the OTF of a circle at frequencies 0 to 2 (cutoff) with a defocus in waves."""
     x, w = np.polynomial.legendre.leggauss(96)
     half = 0.5 * nodes

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.rig import View
+from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.as_built.dome import unbend
-from rigsim.geometry.atlas import BoolArray, interpolate
-from rigsim.geometry.mesh import Float32Array, Int32Array
+from rigsim.geometry.atlas import interpolate
 from rigsim.render.caster import Caster, unit
 from rigsim.render.renderer import RenderError
 

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh
 from rigsim.render.caster import Caster
 from rigsim.render.rays import OFFSET_MM, GBuffer, camera_rays, g_buffer, trace, visibility
@@ -40,12 +41,8 @@ __all__ = [
 
 
 def radiance(
-    description: Mapping[str, Any],
-    *,
-    kind: Kind,
-    samples: int,
-    seed: int = 0,
-) -> NDArray[np.float32]:
+    description: Mapping[str, Any], *, kind: Kind, samples: int, seed: int = 0
+) -> Float32Array:
     """Render a described scene.
 
     Parameters
@@ -123,7 +120,7 @@ class MovedLight:
         self._scene = mi.load_dict(_with_transforms(mi, description))
         self._parameters = mi.traverse(self._scene)
 
-    def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> NDArray[np.float32]:
+    def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> Float32Array:
         """Render with the light at a place, shape (H, W, channels).
 
         Parameters
@@ -145,7 +142,7 @@ class MovedLight:
         return image
 
 
-def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Float64Array:
     """Return the transform that puts a sensor or a rectangle somewhere, facing somewhere.
 
     Parameters

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-FloatArray = NDArray[np.float64]
-Faces = NDArray[np.int32]
+from rigsim.arrays import Float64Array, FloatArray, Int32Array, Int64Array
 
 
 def add_flaws(
-    vertices_mm: FloatArray, faces: Faces, *, edge_mm: float, rng: np.random.Generator
-) -> tuple[FloatArray, Faces]:
+    vertices_mm: Float64Array, faces: Int32Array, *, edge_mm: float, rng: np.random.Generator
+) -> tuple[Float64Array, Int32Array]:
     """Return a mesh with holes, islands, doubled vertices, degenerate and surplus triangles.
 
     Parameters
@@ -49,9 +47,7 @@ def add_flaws(
     return vertices[order], shuffled.astype(np.int32)
 
 
-def binary_ply(
-    vertices_mm: NDArray[np.floating], faces: Faces, uv: NDArray[np.floating] | None = None
-) -> bytes:
+def binary_ply(vertices_mm: FloatArray, faces: Int32Array, uv: FloatArray | None = None) -> bytes:
     """Return a mesh as the bytes of a little-endian binary PLY with float32 positions.
 
     With ``uv``, shape (V, 2), its vertices have texture coordinates s and t.
@@ -61,13 +57,19 @@ def binary_ply(
     corners["count"] = 3
     corners["index"] = faces
     lines = (
-        "ply", "format binary_little_endian 1.0", "comment unit: mm",
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment unit: mm",
         f"element vertex {len(vertices_mm)}",
-        "property float x", "property float y", "property float z",
+        "property float x",
+        "property float y",
+        "property float z",
         *(() if uv is None else ("property float s", "property float t")),
-        f"element face {len(faces)}", "property list uchar int vertex_indices",
-        "end_header", "",
-    )  # fmt: skip
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    )
     return (
         "\n".join(lines).encode("ascii")
         + np.ascontiguousarray(rows, "<f4").tobytes()
@@ -76,12 +78,12 @@ def binary_ply(
 
 
 def _punch(
-    vertices: FloatArray,
-    faces: NDArray[np.int64],
+    vertices: Float64Array,
+    faces: Int64Array,
     count: int,
     radius_mm: tuple[float, float],
     rng: np.random.Generator,
-) -> NDArray[np.int64]:
+) -> Int64Array:
     """Take away discs of triangles, as where a highlight outshines the stripes."""
     centers = vertices[faces].mean(axis=1)
     lost = np.zeros(len(faces), np.bool_)
@@ -91,12 +93,8 @@ def _punch(
 
 
 def _fins(
-    vertices: FloatArray,
-    faces: NDArray[np.int64],
-    count: int,
-    edge_mm: float,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, NDArray[np.int64]]:
+    vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array]:
     """Raise triangles on edges that have two already."""
     base = faces[rng.choice(len(faces), count)]
     corners = vertices[base]
@@ -108,12 +106,8 @@ def _fins(
 
 
 def _islands(
-    vertices: FloatArray,
-    faces: NDArray[np.int64],
-    count: int,
-    edge_mm: float,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, NDArray[np.int64]]:
+    vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array]:
     """Let scraps of surface float before the face."""
     parts, rows = [vertices], []
     first = len(vertices)
@@ -129,8 +123,8 @@ def _islands(
 
 
 def _slivers(
-    vertices: FloatArray, faces: NDArray[np.int64], count: int, rng: np.random.Generator
-) -> tuple[FloatArray, NDArray[np.int64]]:
+    vertices: Float64Array, faces: Int64Array, count: int, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array]:
     """Lay triangles without area along edges."""
     base = faces[rng.choice(len(faces), count)]
     middle = vertices[base[:, :2]].mean(axis=1)
@@ -139,12 +133,8 @@ def _slivers(
 
 
 def _pinch(
-    vertices: FloatArray,
-    faces: NDArray[np.int64],
-    count: int,
-    edge_mm: float,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, NDArray[np.int64]]:
+    vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array]:
     """Join a corner of a triangle to a vertex nearby that is none of its neighbours."""
     tree = cKDTree(vertices)
     out = faces.copy()
@@ -161,8 +151,8 @@ def _pinch(
 
 
 def _unweld(
-    vertices: FloatArray, faces: NDArray[np.int64], count: int, rng: np.random.Generator
-) -> tuple[FloatArray, NDArray[np.int64]]:
+    vertices: Float64Array, faces: Int64Array, count: int, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array]:
     """Give some triangles vertices of their own at the same places."""
     rows = rng.choice(len(faces), count, replace=False)
     out = faces.copy()

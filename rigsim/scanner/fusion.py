@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array, Int32Array, Int64Array
 
 TRUNCATION: Final = 3.0
 """Voxels that lie deeper under the surface than this many sides know nothing of it."""
@@ -26,19 +25,19 @@ TRUNCATION: Final = 3.0
 class RangeImage:
     """Distances from a pinhole camera to what it sees."""
 
-    center_mm: FloatArray
-    axes: FloatArray
+    center_mm: Float64Array
+    axes: Float64Array
     """Unit vectors right, up and back, shape (3, 3)."""
     pitch: float
     """Side of a pixel at unit distance."""
-    range_mm: FloatArray
+    range_mm: Float64Array
     """Distance along the ray, shape (N, N), row 0 at the top; NaN where there is none."""
-    weight: FloatArray
+    weight: Float64Array
     """Trust in each range, shape (N, N), 0 to 1; also the slope of distance to the surface."""
 
     @classmethod
     def looking(
-        cls, center_mm: FloatArray, target_mm: FloatArray, side: int, pitch: float
+        cls, center_mm: Float64Array, target_mm: Float64Array, side: int, pitch: float
     ) -> RangeImage:
         """Return an image that sees nothing yet."""
         back = (center_mm - target_mm) / np.linalg.norm(center_mm - target_mm)
@@ -48,7 +47,7 @@ class RangeImage:
         nothing = np.full((side, side), np.nan)
         return cls(center_mm, axes, pitch, nothing, np.zeros((side, side)))
 
-    def rays(self) -> FloatArray:
+    def rays(self) -> Float64Array:
         """Return the unit vector of each pixel's ray, shape (N, N, 3)."""
         side = len(self.range_mm)
         x = self.pitch * (np.arange(side) - 0.5 * (side - 1))
@@ -56,16 +55,16 @@ class RangeImage:
         way = local @ self.axes
         return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
-    def filled(self, range_mm: FloatArray, weight: FloatArray) -> RangeImage:
+    def filled(self, range_mm: Float64Array, weight: Float64Array) -> RangeImage:
         """Return the image with ranges."""
         return replace(self, range_mm=range_mm, weight=weight)
 
-    def points(self) -> FloatArray:
+    def points(self) -> Float64Array:
         """Return the points seen, shape (K, 3)."""
         seen = np.isfinite(self.range_mm)
         return self.center_mm + self.range_mm[seen][:, None] * self.rays()[seen]
 
-    def distances(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def distances(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return how far each point lies before the surface, and its weight; NaN where unseen."""
         local = (points - self.center_mm) @ self.axes.T
         middle = 0.5 * (len(self.range_mm) - 1)
@@ -78,7 +77,7 @@ class RangeImage:
         return before * np.sqrt(weight), weight
 
 
-def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[FloatArray, NDArray[np.int32]]:
+def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[Float64Array, Int32Array]:
     """Join range images into a triangle mesh.
 
     Parameters
@@ -119,12 +118,12 @@ def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[FloatArray, NDA
 
 
 def _surface_net(
-    distance: FloatArray, low: FloatArray, voxel_mm: float, deep: float
-) -> tuple[FloatArray, NDArray[np.int32]]:
+    distance: Float64Array, low: Float64Array, voxel_mm: float, deep: float
+) -> tuple[Float64Array, Int32Array]:
     shape = np.array(distance.shape) - 1
     corners = list(itertools.product((0, 1), repeat=3))
 
-    def at(corner: tuple[int, ...]) -> FloatArray:
+    def at(corner: tuple[int, ...]) -> Float64Array:
         return distance[tuple(slice(c, c + n) for c, n in zip(corner, shape, strict=True))]
 
     near = np.ones(shape, np.bool_)
@@ -174,7 +173,7 @@ def _surface_net(
     return vertices, _cut(vertices, np.concatenate(quads))
 
 
-def _cut(vertices: FloatArray, quads: NDArray[np.int64]) -> NDArray[np.int32]:
+def _cut(vertices: Float64Array, quads: Int64Array) -> Int32Array:
     """Cut quads along their shorter diagonals."""
     a, b, c, d = (vertices[quads[:, k]] for k in range(4))
     along = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)

@@ -12,17 +12,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from rigsim.geometry.atlas import interpolate, sample
-from rigsim.geometry.mesh import Float32Array, Mesh, MeshError, build_mesh
+from rigsim.geometry.mesh import Mesh, MeshError, build_mesh
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.render import Caster
 from rigsim.scanner.flaws import add_flaws, binary_ply
 from rigsim.scanner.fusion import RangeImage, fuse
-
-FloatArray = NDArray[np.float64]
 
 POD_AZIMUTH_DEG: Final = (-38.0, 38.0)
 """Where the pods stand around the subject, from the front."""
@@ -83,11 +81,11 @@ class Scan:
 
     ply: bytes
     """The mesh in the scanner's frame, mm: a binary PLY."""
-    to_dome: FloatArray
+    to_dome: Float64Array
     """Truth: takes points of the scan into the rig frame, shape (4, 4)."""
     vertices_mm: Float32Array
     """Positions in the PLY, shape (V, 3), scanner frame."""
-    faces: NDArray[np.int32]
+    faces: Int32Array
     """Triangles in the PLY, shape (F, 3)."""
     edge_mm: float
     """Typical length of an edge."""
@@ -205,7 +203,7 @@ def _edge_for(images: list[RangeImage], triangles: int) -> float:
     return float((-rim + math.sqrt(rim**2 + 4.0 * triangles * area)) / (2.0 * triangles))
 
 
-def _place(azimuth_deg: float, elevation_deg: float) -> FloatArray:
+def _place(azimuth_deg: float, elevation_deg: float) -> Float64Array:
     a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
     way = np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
     return np.array(TARGET_MM) + DISTANCE_MM * way
@@ -213,8 +211,8 @@ def _place(azimuth_deg: float, elevation_deg: float) -> FloatArray:
 
 def _range_image(
     caster: Caster,
-    projector: FloatArray,
-    camera: FloatArray,
+    projector: Float64Array,
+    camera: Float64Array,
     scanner: Scanner,
     relief_um: Float32Array | None,
     skin_faces: int,
@@ -257,7 +255,7 @@ def _range_image(
     )
 
 
-def _smooth_around(ranges: FloatArray, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _smooth_around(ranges: Float64Array, good: BoolArray) -> BoolArray:
     """Return the pixels whose good neighbours are at about the same range."""
     far = ndimage.maximum_filter(np.where(good, ranges, -np.inf), 3)
     near = ndimage.minimum_filter(np.where(good, ranges, np.inf), 3)
@@ -289,7 +287,7 @@ def _with_collar(mesh: Mesh) -> Mesh:
     )
 
 
-def _offset(scanner: Scanner, rng: np.random.Generator) -> FloatArray:
+def _offset(scanner: Scanner, rng: np.random.Generator) -> Float64Array:
     """Draw the motion from the rig frame to the scanner's: fixed size, random direction."""
     axis, shift = rng.standard_normal(3), rng.standard_normal(3)
     x, y, z = axis / np.linalg.norm(axis)

@@ -33,11 +33,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import brentq
 
+from rigsim.arrays import ComplexArray, Float32Array, Float64Array
 from rigsim.skin_patch.stretch_kernels import bending, gather, membrane, spread, tissue
 
-Float64Array = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-ComplexArray = NDArray[np.complex128]
 Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
 

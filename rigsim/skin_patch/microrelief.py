@@ -21,18 +21,15 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.polygon_net import polygon_net
 from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
 from rigsim.subject.pigment import MELANIN_LIMIT, MELANIN_PRESETS
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_layers import MAX_C_HD
 from rigsim.tissue.skin_table import SkinTable
-
-Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 SiteName = Literal["forehead", "cheek", "chin"]
 BLOOD: Final = 0.035
@@ -75,15 +72,66 @@ class _Site:
 
 _SITES: Final[dict[str, _Site]] = {
     # Long furrows across the brow: elongated polygons, along x.
-    "forehead": _Site(0.42, 44.0, 0.095, 1.7, 4.0, 0.75, 13.0, 3.5, 7.0, 0.8, 0.20, 28.0,
-                      6.5, 0.60, 2.0, 0.20, 0.22),
+    "forehead": _Site(
+        0.42,
+        44.0,
+        0.095,
+        1.7,
+        4.0,
+        0.75,
+        13.0,
+        3.5,
+        7.0,
+        0.8,
+        0.20,
+        28.0,
+        6.5,
+        0.60,
+        2.0,
+        0.20,
+        0.22,
+    ),
     # An even, finer net with many pores.
-    "cheek": _Site(0.34, 30.0, 0.080, 1.15, 65.0, 0.9, 10.0, 3.0, 5.0, 0.7, 0.45, 34.0,
-                   6.0, 0.65, 2.0, 0.20, 0.26),
+    "cheek": _Site(
+        0.34,
+        30.0,
+        0.080,
+        1.15,
+        65.0,
+        0.9,
+        10.0,
+        3.0,
+        5.0,
+        0.7,
+        0.45,
+        34.0,
+        6.0,
+        0.65,
+        2.0,
+        0.20,
+        0.26,
+    ),
     # Coarse, deep and irregular.
-    "chin": _Site(0.55, 56.0, 0.125, 1.3, -35.0, 1.0, 17.0, 4.5, 9.0, 1.0, 0.60, 40.0,
-                  7.0, 0.70, 2.0, 0.20, 0.24),
-}  # fmt: skip
+    "chin": _Site(
+        0.55,
+        56.0,
+        0.125,
+        1.3,
+        -35.0,
+        1.0,
+        17.0,
+        4.5,
+        9.0,
+        1.0,
+        0.60,
+        40.0,
+        7.0,
+        0.70,
+        2.0,
+        0.20,
+        0.24,
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,8 +300,7 @@ def _relief(
         # Rounded at the bottom, then like the flank of a fold.
         round_mm = 0.35 * width_mm
         return np.asarray(
-            np.exp(-(np.sqrt(distance**2 + round_mm**2) - round_mm) / (0.5 * width_mm)),
-            np.float32,
+            np.exp(-(np.sqrt(distance**2 + round_mm**2) - round_mm) / (0.5 * width_mm)), np.float32
         )
 
     first, _ = net(1.0, 2)

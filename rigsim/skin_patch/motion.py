@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 
 DRIFT_HZ: Final = (0.11, 0.23, 0.37)
 """Frequencies of slow drift: breath and muscle tone."""

@@ -11,16 +11,15 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.ndimage import spline_filter
 
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from rigsim.skin_patch.equilibrium import Convergence, LayerProblem, find_equilibrium
 from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.skin_patch.stretch_kernels import spline
 
-Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 Compensation = Literal["volume", "none"] | float
 
 STRETCH_RANGE: Final = (0.5, 2.0)
@@ -48,7 +47,7 @@ class SurfaceSample:
     """Diffuse reflectance, 0 to 1."""
     alpha: Float32Array
     """GGX roughness of what is finer than 10 um."""
-    inside: NDArray[np.bool_]
+    inside: BoolArray
     """Whether the patch reaches the point."""
 
 
@@ -285,10 +284,21 @@ def deform(
     if s == 1.0 and t == 1.0:
         still = np.zeros((*skin.height_um.shape, 2), np.float32)
         return StretchedSkin(
-            skin, s, t, angle_deg, gradient, skin.height_um, skin.albedo, skin.alpha, still,
-            before, before, Convergence(0, 0.0, (), ()),
-            _coefficients(skin.height_um), _coefficients(skin.albedo),
-        )  # fmt: skip
+            skin,
+            s,
+            t,
+            angle_deg,
+            gradient,
+            skin.height_um,
+            skin.albedo,
+            skin.alpha,
+            still,
+            before,
+            before,
+            Convergence(0, 0.0, (), ()),
+            _coefficients(skin.height_um),
+            _coefficients(skin.albedo),
+        )
     count = skin.height_um.shape[0]
     mean = float(skin.height_um.mean())
     problem = layer_problem(skin, gradient)
@@ -376,7 +386,7 @@ def _periodic(values: Float64Array, texel_um: float) -> Float64Array:
     return np.ascontiguousarray(values)
 
 
-def _coefficients(values: NDArray[np.floating]) -> Float64Array:
+def _coefficients(values: FloatArray) -> Float64Array:
     return np.asarray(spline_filter(np.asarray(values, np.float64), mode="mirror"))
 
 
@@ -434,7 +444,7 @@ def _bilinear(values: Float32Array, row: Float64Array, column: Float64Array) -> 
 
 
 def _excess_length(
-    height_um: NDArray[np.floating], texel_um: float, gradient: Float64Array, angle_deg: float
+    height_um: FloatArray, texel_um: float, gradient: Float64Array, angle_deg: float
 ) -> float:
     """Return mean sqrt(1 + slope^2) - 1 of the slope along the jaws' axis."""
     h = height_um.astype(np.float64)

@@ -3,10 +3,4 @@
 from rigsim.subject.perfusion import STATES
 from rigsim.subject.person import PRESETS, Subject, SubjectError, make_subject
 
-__all__ = [
-    "PRESETS",
-    "STATES",
-    "Subject",
-    "SubjectError",
-    "make_subject",
-]
+__all__ = ["PRESETS", "STATES", "Subject", "SubjectError", "make_subject"]

@@ -17,14 +17,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
-from rigsim.geometry.mesh import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.subject.face_regions import soft_step
 from rigsim.subject.wrinkle_zones import ZONES, Zone
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 TENSION_RANGE: Final = (0.05, 0.10)
 """Part of its length by which a person's skin at rest is stretched."""
@@ -48,11 +45,11 @@ class ZoneLines:
     zone: Zone
     texel: NDArray[np.intp]
     """Flat indices of the texels, shape (n,)."""
-    phase_rad: FloatArray
+    phase_rad: Float64Array
     """2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
-    slope: FloatArray
+    slope: Float64Array
     """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
-    share: FloatArray
+    share: Float64Array
     """Part of the excess length that goes into the zone's wrinkles, shape (n,)."""
 
 
@@ -197,7 +194,7 @@ def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
     )
 
 
-def depth_of(excess: ArrayLike) -> FloatArray:
+def depth_of(excess: ArrayLike) -> Float64Array:
     """Return how deep a wave is that takes in an excess of length.
 
     Parameters
@@ -218,13 +215,13 @@ def depth_of(excess: ArrayLike) -> FloatArray:
     return np.interp(np.asarray(excess, np.float64), _EXCESS, _DEPTH)
 
 
-def _profile(phase: FloatArray) -> FloatArray:
+def _profile(phase: Float64Array) -> Float64Array:
     """Return the height of a wave of depth 1, with zero mean and its furrow at phase 0."""
     low, high = math.exp(-2.0 * FURROW), 1.0
     return np.asarray((_BELL_MEAN - np.exp(FURROW * (np.cos(phase) - 1.0))) / (high - low))
 
 
-def _waves() -> tuple[float, FloatArray, FloatArray]:
+def _waves() -> tuple[float, Float64Array, Float64Array]:
     """Return the mean of the furrow's bell, and excess of length against depth."""
     phase = 2.0 * math.pi * (np.arange(_STEPS) + 0.5) / _STEPS
     bell = np.exp(FURROW * (np.cos(phase) - 1.0))
@@ -237,7 +234,7 @@ def _waves() -> tuple[float, FloatArray, FloatArray]:
 _BELL_MEAN, _EXCESS, _DEPTH = _waves()
 
 
-def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
+def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> Float64Array:
     """Return the inverse metric of the texture, (n, 3): of du du, du dv, dv dv."""
     du = atlas.dp_du_mm.reshape(-1, 3)[texel].astype(np.float64)
     dv = atlas.dp_dv_mm.reshape(-1, 3)[texel].astype(np.float64)
@@ -247,7 +244,7 @@ def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
     return np.stack([g, -f, e], axis=-1) / determinant[:, None]
 
 
-def _density(inverse: FloatArray, slope: FloatArray) -> FloatArray:
+def _density(inverse: Float64Array, slope: Float64Array) -> Float64Array:
     """Return the length of a phase's gradient on the surface, rad/mm."""
     u, v = slope[:, 0], slope[:, 1]
     squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v

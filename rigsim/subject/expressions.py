@@ -19,13 +19,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rigsim.geometry.mesh import Float32Array, Int32Array, Mesh, build_mesh, vertex_normals
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array
+from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
 from rigsim.subject.face_regions import mean_head_scale, on_mean_head
 from rigsim.subject.perfusion import STATES
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 AMOUNT_RANGE: Final = (0.0, 1.5)
@@ -224,7 +224,7 @@ def moved(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
 
 def principal_stretches(
     rest_mm: ArrayLike, posed_mm: ArrayLike, faces: Int32Array
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[Float64Array, BoolArray]:
     """Return how the triangles of a surface are stretched.
 
     Parameters
@@ -258,7 +258,7 @@ def principal_stretches(
     return np.sqrt(squares), whole & (np.sum(a * b, axis=-1) <= 0.0)
 
 
-def _edges(points: FloatArray, faces: Int32Array) -> FloatArray:
+def _edges(points: Float64Array, faces: Int32Array) -> Float64Array:
     corners = points[faces]
     return np.asarray(corners[:, 1:] - corners[:, :1])
 
@@ -276,12 +276,12 @@ def _sides(seed: int) -> dict[str, tuple[float, float]]:
 
 def _own_shapes(
     shapes: Mapping[str, Float32Array], action: str, left: float, right: float
-) -> FloatArray | None:
+) -> Float64Array | None:
     """Return an action made of a mesh's own shapes, or None where it has none.
 
     The names' ``_L`` and ``_R`` are the person's left and right, the image's right and left.
     """
-    found: list[FloatArray] = []
+    found: list[Float64Array] = []
     for name, weight in _OWN_SHAPES[action].items():
         middle = 0.5 * (left + right)
         for full, side in (
@@ -294,7 +294,7 @@ def _own_shapes(
     return np.sum(found, axis=0) if found else None
 
 
-def _field(points: FloatArray, action: str, left: float, right: float) -> FloatArray:
+def _field(points: Float64Array, action: str, left: float, right: float) -> Float64Array:
     """Return an action's movement at points of the mean head, mm, shape (..., 3)."""
     if action == _JAW:
         return 0.5 * (left + right) * _jaw(points)
@@ -308,12 +308,14 @@ def _field(points: FloatArray, action: str, left: float, right: float) -> FloatA
     return total
 
 
-def _bump(points: FloatArray, center: Vector, reach: Sequence[float], way: Vector) -> FloatArray:
+def _bump(
+    points: Float64Array, center: Vector, reach: Sequence[float], way: Vector
+) -> Float64Array:
     q = (points - np.array(center)) / np.array(reach)
     return np.asarray(np.exp(-np.sum(q * q, axis=-1))[..., None] * np.array(way))
 
 
-def _jaw(points: FloatArray) -> FloatArray:
+def _jaw(points: Float64Array) -> Float64Array:
     """Turn the chin and the lower lip about the joints of the jaw; the neck stays."""
     below = 0.5 * (1.0 + np.tanh((-44.0 - points[..., 1]) / 8.0))
     above_neck = 0.5 * (1.0 + np.tanh((points[..., 1] + 94.0) / 12.0))

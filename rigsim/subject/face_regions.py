@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array, Mesh
+from rigsim.arrays import Float32Array, Float64Array, FloatArray
+from rigsim.geometry.mesh import Mesh
 from rigsim.subject.head import LANDMARKS_MM, lip_outline
 
 REGION_NAMES: Final = (
@@ -31,10 +31,7 @@ REGION_NAMES: Final = (
 # Landmarks and radii along x, y, z in mm of each region's soft balls.
 _BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] = {
     "forehead": (("forehead", (42.0, 22.0, 40.0)),),
-    "cheeks": (
-        ("cheek left", (18.0, 17.0, 25.0)),
-        ("cheek right", (18.0, 17.0, 25.0)),
-    ),
+    "cheeks": (("cheek left", (18.0, 17.0, 25.0)), ("cheek right", (18.0, 17.0, 25.0))),
     "nose": (
         ("nose tip", (13.0, 11.0, 18.0)),
         ("nose wing left", (8.0, 8.0, 10.0)),
@@ -83,7 +80,7 @@ def on_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
     return np.asarray((points_mm - tip) * scale + mean_tip, np.float32)
 
 
-def from_mean_head(points_mm: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
+def from_mean_head(points_mm: FloatArray, mesh: Mesh) -> Float64Array:
     """Move points of the mean head to a face mesh, the inverse of `on_mean_head`.
 
     Parameters
@@ -108,7 +105,7 @@ def mean_head_scale(mesh: Mesh) -> float:
     return _tip_and_scale(mesh)[1]
 
 
-def _tip_and_scale(mesh: Mesh) -> tuple[NDArray[np.float64], float]:
+def _tip_and_scale(mesh: Mesh) -> tuple[Float64Array, float]:
     vertices = mesh.vertices_mm.astype(np.float64)
     tip = vertices[np.argmax(vertices[:, 2])]
     level = np.abs(vertices[:, 1] - tip[1]) < 25.0
@@ -168,7 +165,7 @@ def _lips_within(points: Float32Array) -> Float32Array:
     return np.asarray(inside * soft_step((z + 22.0) / 4.0), np.float32)
 
 
-def soft_step(t: NDArray[np.floating]) -> NDArray[np.floating]:
+def soft_step(t: FloatArray) -> FloatArray:
     """Return how far each place lies inside a border: 0 far below 0, 1 far above, smooth between.
 
     Parameters

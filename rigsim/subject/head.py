@@ -15,11 +15,10 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh, build_mesh
 
-FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 PHI_MAX_RAD: Final = 2.0
@@ -120,7 +119,7 @@ def build_head(rng: np.random.Generator, *, columns: int = 168, rows: int = 178)
     return build_mesh(points, faces, uv.reshape(-1, 2), normals)
 
 
-def _rays(u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _rays(u: Float64Array, v: Float64Array) -> tuple[Float64Array, Float64Array]:
     s = 2.0 * u - 1.0
     phi = PHI_MAX_RAD * (CENTER_SHARE * s + (1.0 - CENTER_SHARE) * s**3)
     low, high = Y_RANGE_MM
@@ -208,7 +207,7 @@ def _anatomy(rng: np.random.Generator) -> tuple[list[_Part], list[_Groove]]:
     return parts, grooves
 
 
-def lip_outline(x_mm: NDArray[np.floating]) -> tuple[FloatArray, FloatArray]:
+def lip_outline(x_mm: FloatArray) -> tuple[Float64Array, Float64Array]:
     """Return the heights of the lips' upper and lower border on the mean head.
 
     Parameters
@@ -227,7 +226,7 @@ def lip_outline(x_mm: NDArray[np.floating]) -> tuple[FloatArray, FloatArray]:
     return upper[..., 1] + 0.8 * above - beyond, lower[..., 1] - 0.75 * below + beyond
 
 
-def _lip_arcs(across: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
+def _lip_arcs(across: Float64Array) -> tuple[tuple[Float64Array, Float64Array], ...]:
     """Return middle line and half thickness of both lips, across the mouth from -1 to 1."""
     bow = np.exp(-((np.abs(across) - 0.28) ** 2) / 0.045)
     full = np.maximum(1.0 - across**2, 0.0) ** 0.6
@@ -239,7 +238,7 @@ def _lip_arcs(across: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
     return (upper, 1.0 + 3.4 * full), (lower, 1.0 + 4.6 * full)
 
 
-def _point(row: FloatArray) -> Point:
+def _point(row: Float64Array) -> Point:
     return (float(row[0]), float(row[1]), float(row[2]))
 
 
@@ -252,7 +251,7 @@ def _flipped(solid: _Solid) -> _Solid:
 
 def _pack(
     parts: list[_Part], grooves: list[_Groove]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Return the anatomy as arrays: solids, parts, segments of grooves, grooves.
 
     A part's row holds blend, carve, first and last solid, centre and radius of a ball around it; a

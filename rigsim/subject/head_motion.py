@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigsim.arrays import Float64Array
 from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
 from rigsim.subject.head import LANDMARKS_MM
-
-FloatArray = NDArray[np.float64]
 
 SPAN_S: Final = 25.0
 """Time within which the drift reaches its stated size: that of a capture."""
@@ -46,11 +44,11 @@ class MotionError(ValueError):
 class HeadMotion:
     """Drift and twitch of one capture; see `head_motion`."""
 
-    amplitude: FloatArray
+    amplitude: Float64Array
     """Waves of shift x, y, z in mm and of turn about x, y, z in rad, shape (WAVES, 6)."""
-    frequency_hz: FloatArray
+    frequency_hz: Float64Array
     """Shape (WAVES, 6)."""
-    phase_rad: FloatArray
+    phase_rad: Float64Array
     """Shape (WAVES, 6)."""
     twitch_start_s: float
     """When the twitch begins; inf for none."""
@@ -70,7 +68,7 @@ class HeadMotion:
         if self.twitch_side not in ("left", "right"):
             raise MotionError(f"twitch_side: got {self.twitch_side!r}, expected left or right")
 
-    def pose(self, t_s: float) -> tuple[FloatArray, FloatArray]:
+    def pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         """Return where the head is.
 
         Parameters
@@ -179,7 +177,7 @@ def head_motion(
     )
 
 
-def _turn(vector: FloatArray) -> FloatArray:
+def _turn(vector: Float64Array) -> Float64Array:
     """Return the rotation about a vector by its length in rad (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import View
+from rigsim.arrays import BoolArray, Float64Array, Int32Array
 from rigsim.geometry.mesh import Mesh
 from rigsim.render import Caster
 from rigsim.subject.face_regions import from_mean_head
 from rigsim.subject.head import LANDMARKS_MM
-
-FloatArray = NDArray[np.float64]
 
 _PAIRS: Final[Mapping[str, tuple[float, float]]] = {
     "brow inner": (15.0, 41.0),
@@ -57,17 +55,17 @@ class SurfacePoints:
     """Points on a mesh, that go with it when its vertices move."""
 
     names: tuple[str, ...]
-    corners: NDArray[np.int32]
+    corners: Int32Array
     """Vertices of each point's triangle, shape (n, 3)."""
-    weights: FloatArray
+    weights: Float64Array
     """Their weights, shape (n, 3)."""
 
-    def on(self, mesh: Mesh) -> FloatArray:
+    def on(self, mesh: Mesh) -> Float64Array:
         """Return where the points are on a mesh of the same triangles, shape (n, 3), mm."""
         corners = mesh.vertices_mm[self.corners].astype(np.float64)
         return np.einsum("nk,nkc->nc", self.weights, corners)
 
-    def uv(self, mesh: Mesh) -> FloatArray:
+    def uv(self, mesh: Mesh) -> Float64Array:
         """Return the points' texture coordinates, shape (n, 2)."""
         return np.einsum("nk,nkc->nc", self.weights, mesh.uv[self.corners].astype(np.float64))
 
@@ -109,7 +107,7 @@ def find(mesh: Mesh) -> SurfacePoints:
     )
 
 
-def project(points_mm: FloatArray, view: View) -> FloatArray:
+def project(points_mm: Float64Array, view: View) -> Float64Array:
     """Return where a camera sees points, px.
 
     Parameters
@@ -132,7 +130,7 @@ def project(points_mm: FloatArray, view: View) -> FloatArray:
     return np.stack([x, y], axis=-1)
 
 
-def seen(points_mm: FloatArray, view: View, caster: Caster) -> NDArray[np.bool_]:
+def seen(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray:
     """Tell which points a camera sees, shape (n,).
 
     Parameters
@@ -154,7 +152,7 @@ def seen(points_mm: FloatArray, view: View, caster: Caster) -> NDArray[np.bool_]
     return np.asarray(inside.all(axis=1) & ~before)
 
 
-def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
+def _barycentric(triangles: Float64Array, point: Float64Array) -> Float64Array:
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     ab, ac, ap = b - a, c - a, point - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]

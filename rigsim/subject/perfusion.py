@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import line_network, smooth_noise
 
 HEMOGLOBIN_LIMIT: Final = 0.32
@@ -149,11 +149,7 @@ class Perfusion:
 
 
 def perfuse(
-    points_mm: Float32Array,
-    regions: Mapping[str, Float32Array],
-    *,
-    seed: int,
-    amount: float = 1.0,
+    points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int, amount: float = 1.0
 ) -> Perfusion:
     """Draw the vessels of a face and what each state does to them.
 

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array
 from rigsim.subject.perfusion import STATES, Perfusion, StateError
 from rigsim.subject.person import Subject
 

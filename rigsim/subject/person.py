@@ -11,8 +11,9 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
-from rigsim.geometry.mesh import Float32Array, Mesh, centered, load_mesh
+from rigsim.geometry.mesh import Mesh, centered, load_mesh
 from rigsim.subject import (
     expression_wrinkles,
     expressions,

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array, FloatArray
 from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
 from rigsim.subject.face_regions import soft_step
 
@@ -77,7 +76,7 @@ def melanin_map(
     return np.asarray(MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
 
 
-def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> NDArray[np.floating]:
+def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
     """Sun everywhere but under a cap or behind glasses; half a tan is in the base already."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
@@ -99,7 +98,7 @@ def _freckles(
     seed: int,
     rng: np.random.Generator,
     amount: float | None,
-) -> NDArray[np.floating]:
+) -> FloatArray:
     where = 0.9 * regions["cheeks"] + 0.9 * regions["nose"] + 0.25 * regions["forehead"] + 0.03
     where = where * (1.0 - regions["lips"])
     # Freckles belong to pale skin.
@@ -111,9 +110,7 @@ def _freckles(
     return 0.9 * spots
 
 
-def _moles(
-    points: Float32Array, base: float, *, seed: int, rng: np.random.Generator
-) -> NDArray[np.floating]:
+def _moles(points: Float32Array, base: float, *, seed: int, rng: np.random.Generator) -> FloatArray:
     spots = scattered_spots(
         points,
         np.full(points.shape[:-1], 0.16),

@@ -5,20 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from rigsim.geometry.atlas import Atlas
-from rigsim.geometry.mesh import Float32Array
 from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
 from rigsim.subject.face_regions import soft_step
 
 
 def height_um(
-    points_mm: Float32Array,
-    regions: Mapping[str, Float32Array],
-    *,
-    texel_mm: float,
-    seed: int,
+    points_mm: Float32Array, regions: Mapping[str, Float32Array], *, texel_mm: float, seed: int
 ) -> Float32Array:
     """Draw pores, folds and fine wrinkles.
 
@@ -138,7 +133,7 @@ def roughness_map(
     return np.asarray(np.clip(alpha, 0.15, 0.5), np.float32)
 
 
-def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
+def relief_normals(atlas: Atlas, height: FloatArray) -> Float32Array:
     """Tilt the normals of a surface by a height map.
 
     Parameters
@@ -171,7 +166,7 @@ def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
     return np.where(length > 0.0, tilted / np.maximum(length, 1e-12), 0.0).astype(np.float32)
 
 
-def _slope(h: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _slope(h: Float64Array, valid: BoolArray) -> Float64Array:
     """Return the change per column: central, at borders of what is valid one-sided, else 0."""
     step = np.where(valid[:, 1:] & valid[:, :-1], h[:, 1:] - h[:, :-1], 0.0)
     total, count = np.zeros_like(h), np.zeros(h.shape)

@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigsim.arrays import Float64Array
 from rigsim.subject.face_regions import soft_step
-
-FloatArray = NDArray[np.float64]
 
 MODULUS_RATIO: Final = 100.0
 """Stiffness of the layer that buckles over that of what lies below it."""
@@ -33,9 +31,9 @@ class Zone:
     name: str
     thickness_mm: float
     """Thickness of the layer that buckles."""
-    across_mm: Callable[[FloatArray], FloatArray]
+    across_mm: Callable[[Float64Array], Float64Array]
     """Distance across the lines, of points on the mean head with x >= 0, mm."""
-    share: Callable[[FloatArray], FloatArray]
+    share: Callable[[Float64Array], Float64Array]
     """Part of the shortening beyond the tension that goes into wrinkles, 0 to 1."""
     mirrored: bool = True
     """Whether both halves of the face have lines of their own kind; else lines cross the middle."""
@@ -50,17 +48,19 @@ class Zone:
         return 2.0 * math.pi * self.thickness_mm * (MODULUS_RATIO / 3.0) ** (1.0 / 3.0)
 
 
-def _plateau(points: FloatArray, center: tuple[float, ...], reach: tuple[float, ...]) -> FloatArray:
+def _plateau(
+    points: Float64Array, center: tuple[float, ...], reach: tuple[float, ...]
+) -> Float64Array:
     """Return 1 well inside a ball of unequal radii, 0 well outside."""
     q = (points - np.array(center)) / np.array(reach)
     return np.asarray(soft_step((1.0 - np.sqrt(np.sum(q * q, axis=-1))) / 0.22))
 
 
-def _x(p: FloatArray) -> FloatArray:
+def _x(p: Float64Array) -> Float64Array:
     return np.asarray(p[..., 0])
 
 
-def _y(p: FloatArray) -> FloatArray:
+def _y(p: Float64Array) -> Float64Array:
     return np.asarray(p[..., 1])
 
 
@@ -68,7 +68,7 @@ _FOLD = (np.array([17.0, -10.0]), np.array([31.0, -41.0]))
 """Ends of the fold between nose and cheek, mm on the mean head."""
 
 
-def _off_fold(p: FloatArray) -> FloatArray:
+def _off_fold(p: Float64Array) -> Float64Array:
     way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
     along = (p[..., :2] - _FOLD[0]) @ way
     # a slight bow towards the cheek
@@ -76,14 +76,14 @@ def _off_fold(p: FloatArray) -> FloatArray:
     return np.asarray(side - 2.5 * np.sin(np.pi * np.clip(along / 34.0, 0.0, 1.0)))
 
 
-def _near_fold(p: FloatArray) -> FloatArray:
+def _near_fold(p: Float64Array) -> Float64Array:
     way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
     along = (p[..., :2] - _FOLD[0]) @ way
     inside = soft_step((along - 1.0) / 3.0) * soft_step((32.0 - along) / 3.0)
     return np.asarray(inside * (p[..., 2] > -25.0))
 
 
-def _fan(p: FloatArray) -> FloatArray:
+def _fan(p: Float64Array) -> Float64Array:
     """Return the distance along circles about the corner of the eye, counted at 12 mm from it."""
     return np.asarray(12.0 * np.arctan2(p[..., 1] - 24.0, np.maximum(p[..., 0] - 42.0, 1.0)))
 
@@ -116,12 +116,7 @@ ZONES: Final = (
         lambda p: 0.86 * _y(p) - 0.5 * _x(p),
         lambda p: _plateau(p, (9.0, 7.0, 11.0), (7.0, 9.0, 25.0)),
     ),
-    Zone(
-        "crow's feet",
-        0.13,
-        _fan,
-        lambda p: _plateau(p, (55.0, 23.0, -26.0), (11.0, 15.0, 30.0)),
-    ),
+    Zone("crow's feet", 0.13, _fan, lambda p: _plateau(p, (55.0, 23.0, -26.0), (11.0, 15.0, 30.0))),
     Zone(
         "lower lids",
         0.13,

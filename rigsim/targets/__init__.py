@@ -8,10 +8,4 @@ from rigsim.targets.flat import (
     patch_centers_mm,
 )
 
-__all__ = [
-    "Target",
-    "TargetError",
-    "chart_reflectances",
-    "make_target",
-    "patch_centers_mm",
-]
+__all__ = ["Target", "TargetError", "chart_reflectances", "make_target", "patch_centers_mm"]

@@ -8,14 +8,12 @@ from functools import cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import spectra
-from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
+from rigsim.arrays import Float32Array, Float64Array, Int32Array
+from rigsim.geometry.mesh import Mesh, build_mesh
 
-FloatArray = NDArray[np.float64]
-
-WAVELENGTH_NM: Final[FloatArray] = spectra.WAVELENGTH_NM
+WAVELENGTH_NM: Final[Float64Array] = spectra.WAVELENGTH_NM
 """Wavelengths at which targets are described, nm."""
 
 WHITE_REFLECTANCE: Final = 0.99
@@ -53,9 +51,9 @@ class Target:
     """How light comes back, see above."""
     mesh: Mesh
     """A rectangle in mm, rig frame."""
-    palette: FloatArray
+    palette: Float64Array
     """Reflectance spectra, shape (P, n_wavelength), 0 to 1."""
-    index: NDArray[np.int32]
+    index: Int32Array
     """Entry of the palette under each texel, shape (N, N); row 0 is the top."""
     alpha: float
     """GGX roughness of metal; 0 for the other kinds."""
@@ -101,7 +99,7 @@ def make_target(name: str) -> Target:
     return _MAKERS[name]()
 
 
-def patch_centers_mm() -> FloatArray:
+def patch_centers_mm() -> Float64Array:
     """Return where the chart's patches are, shape (24, 2): x, y in mm, row-major from the top."""
     x = (np.arange(CHART_COLUMNS) - 0.5 * (CHART_COLUMNS - 1)) * PATCH_PITCH_MM
     y = (0.5 * (CHART_ROWS - 1) - np.arange(CHART_ROWS)) * PATCH_PITCH_MM
@@ -109,7 +107,7 @@ def patch_centers_mm() -> FloatArray:
 
 
 @cache
-def chart_reflectances() -> FloatArray:
+def chart_reflectances() -> Float64Array:
     """Return the reflectances of the chart's 24 patches, shape (24, n_wavelength), row-major.
 
     References

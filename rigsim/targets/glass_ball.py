@@ -12,15 +12,12 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from capture.rig import View
 from rigsim import shading
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
-from rigsim.geometry.mesh import Float32Array
 from rigsim.targets.mirror_ball import reflection_point
-
-FloatArray = NDArray[np.float64]
 
 RADIUS_MM: Final = 6.0
 ETA: Final = 1.52
@@ -37,7 +34,7 @@ PUPIL_POINTS: Final = 37
 SUBPIXELS: Final = 4
 
 
-def ball_center_mm(seed: int) -> FloatArray:
+def ball_center_mm(seed: int) -> Float64Array:
     """Return where the ball's middle is, mm, rig frame, shape (3,)."""
     rng = np.random.default_rng([seed, 12])
     return np.array(CENTER_MM) + HAND_MM * rng.standard_normal(3)
@@ -48,7 +45,7 @@ def ball_stokes(
     sphere: BuiltSphere,
     *,
     extinction: float,
-    center_mm: FloatArray,
+    center_mm: Float64Array,
     radius_mm: float = RADIUS_MM,
 ) -> Float32Array:
     """Return the picture of the ball for each moment of the light, each pixel averaged.
@@ -98,7 +95,7 @@ def ball_stokes(
     return out
 
 
-def _pupil(view: View) -> FloatArray:
+def _pupil(view: View) -> Float64Array:
     """Return points of the entrance pupil relative to its middle, even per area, (n, 3)."""
     magnification = view.focal_mm / view.distance_mm
     radius = 0.5 * view.focal_mm / (view.f_number * (1.0 + magnification))
@@ -112,14 +109,14 @@ def _pupil(view: View) -> FloatArray:
 
 
 def _mirrored(
-    eye: FloatArray,
-    place: FloatArray,
-    center: FloatArray,
+    eye: Float64Array,
+    place: Float64Array,
+    center: Float64Array,
     radius: float,
-    absorbs: FloatArray,
+    absorbs: Float64Array,
     view: View,
     extinction: float,
-) -> FloatArray:
+) -> Float64Array:
     """Return the Stokes vector of an LED's reflection over the radiance before its film."""
     point = reflection_point(eye, place, center, radius)
     to_light, to_camera = place - point, eye - point
@@ -146,11 +143,11 @@ def _mirrored(
 
 
 def _box(
-    pupil: FloatArray,
-    place: FloatArray,
-    beam: FloatArray,
+    pupil: Float64Array,
+    place: Float64Array,
+    beam: Float64Array,
     lamp_radius: float,
-    center: FloatArray,
+    center: Float64Array,
     radius: float,
     pitch: float,
     shape: tuple[int, int],

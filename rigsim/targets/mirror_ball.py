@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float32Array, Float64Array, Int64Array
 
 REFLECTANCE: Final = 0.62
 """Of polished chromium in the visible, at all angles (Fresnel's rise near the rim is left out)."""
@@ -26,8 +25,11 @@ CLOTH_ROWS: Final = 48
 
 @njit(cache=True, nogil=True)
 def light_on_cloth(
-    lamp_mm: FloatArray, lamp_axis: FloatArray, lamp_exponent: FloatArray, strength: FloatArray
-) -> FloatArray:
+    lamp_mm: Float64Array,
+    lamp_axis: Float64Array,
+    lamp_exponent: Float64Array,
+    strength: Float64Array,
+) -> Float64Array:
     """Return the light that the cloth sends back, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
 
     In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
@@ -58,8 +60,8 @@ def light_on_cloth(
 
 @njit(cache=True, nogil=True)
 def reflection_point(
-    eye_mm: FloatArray, lamp_mm: FloatArray, ball_mm: FloatArray, radius_mm: float
-) -> FloatArray:
+    eye_mm: Float64Array, lamp_mm: Float64Array, ball_mm: Float64Array, radius_mm: float
+) -> Float64Array:
     """Return where a ball shows a lamp to an eye, by halving the angle (Alhazen's problem)."""
     to_eye, to_lamp = eye_mm - ball_mm, lamp_mm - ball_mm
     e = to_eye / np.sqrt(np.sum(to_eye**2))
@@ -85,7 +87,7 @@ def reflection_point(
 
 
 @njit(cache=True, nogil=True)
-def _cloth_at(place: FloatArray, direction: FloatArray, cloth: FloatArray) -> float:
+def _cloth_at(place: Float64Array, direction: Float64Array, cloth: Float64Array) -> float:
     """Return the cloth's light where a ray from inside it ends; bilinear."""
     length = np.sqrt(np.sum(direction * direction))
     along = np.sum(place * direction) / length
@@ -106,7 +108,9 @@ def _cloth_at(place: FloatArray, direction: FloatArray, cloth: FloatArray) -> fl
 
 
 @njit(cache=True, nogil=True)
-def _ball_distance(eye: FloatArray, ray: FloatArray, ball: FloatArray, radius: float) -> float:
+def _ball_distance(
+    eye: Float64Array, ray: Float64Array, ball: Float64Array, radius: float
+) -> float:
     """Return the distance in lengths of ``ray`` to the ball; negative: the ray passes it."""
     ox, oy, oz = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
     a = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
@@ -120,7 +124,12 @@ def _ball_distance(eye: FloatArray, ray: FloatArray, ball: FloatArray, radius: f
 
 @njit(cache=True, nogil=True)
 def _bounce(
-    eye: FloatArray, ray: FloatArray, t: float, ball: FloatArray, place: FloatArray, out: FloatArray
+    eye: Float64Array,
+    ray: Float64Array,
+    t: float,
+    ball: Float64Array,
+    place: Float64Array,
+    out: Float64Array,
 ) -> None:
     """Write where a ray meets the ball and where it goes from there."""
     n0, n1, n2 = 0.0, 0.0, 0.0
@@ -136,14 +145,14 @@ def _bounce(
 
 @njit(cache=True, nogil=True)
 def surroundings(
-    rays: FloatArray,
-    eye_mm: FloatArray,
-    ball_mm: FloatArray,
+    rays: Float64Array,
+    eye_mm: Float64Array,
+    ball_mm: Float64Array,
     radius_mm: float,
     reflectance: float,
-    cloth: FloatArray,
+    cloth: Float64Array,
     subpixels: int,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return the cloth as each pixel sees it, past the ball and in it; without the LEDs.
 
     Parameters
@@ -193,15 +202,15 @@ def surroundings(
 
 @njit(cache=True, nogil=True)
 def add_lamp(
-    image: NDArray[np.float32],
-    rays: FloatArray,
-    box: NDArray[np.int64],
-    eye_mm: FloatArray,
-    ball_mm: FloatArray,
+    image: Float32Array,
+    rays: Float64Array,
+    box: Int64Array,
+    eye_mm: Float64Array,
+    ball_mm: Float64Array,
     radius_mm: float,
     reflectance: float,
-    lamp_mm: FloatArray,
-    lamp_axis: FloatArray,
+    lamp_mm: Float64Array,
+    lamp_axis: Float64Array,
     lamp_exponent: float,
     lamp_radius_mm: float,
     strength: float,

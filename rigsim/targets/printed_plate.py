@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 
 CELL_MM: Final = 4.5
 """Side of a lattice cell, and of one bit of a marker."""
@@ -27,11 +26,47 @@ WHITE_REFLECTANCE: Final = 0.99
 """Of sintered PTFE between 400 and 700 nm, Weidner and Hsia 1981, doi:10.1364/JOSA.71.000856."""
 
 DICT_4X4_50: Final = (
-    0xB532, 0x0F9A, 0x332D, 0x9946, 0x549E, 0x79CD, 0x9E2E, 0xC4F2, 0xFEDA, 0xCF56,
-    0xF991, 0x11A7, 0x0EB7, 0x2A0F, 0x24B1, 0x263E, 0x4665, 0x6600, 0x6C5E, 0x76AF,
-    0x868B, 0xB02B, 0xCCD5, 0xDD82, 0xFE47, 0x9471, 0xACE4, 0xA554, 0x2123, 0x346F,
-    0x4415, 0x57B2, 0x9ECF, 0xF0CB, 0x08AE, 0x0929, 0x1875, 0x04FF, 0x0DF6, 0x1C5A,
-)  # fmt: skip
+    0xB532,
+    0x0F9A,
+    0x332D,
+    0x9946,
+    0x549E,
+    0x79CD,
+    0x9E2E,
+    0xC4F2,
+    0xFEDA,
+    0xCF56,
+    0xF991,
+    0x11A7,
+    0x0EB7,
+    0x2A0F,
+    0x24B1,
+    0x263E,
+    0x4665,
+    0x6600,
+    0x6C5E,
+    0x76AF,
+    0x868B,
+    0xB02B,
+    0xCCD5,
+    0xDD82,
+    0xFE47,
+    0x9471,
+    0xACE4,
+    0xA554,
+    0x2123,
+    0x346F,
+    0x4415,
+    0x57B2,
+    0x9ECF,
+    0xF0CB,
+    0x08AE,
+    0x0929,
+    0x1875,
+    0x04FF,
+    0x0DF6,
+    0x1C5A,
+)
 """Bits of the first markers of the ArUco dictionary of that name, rows from the top, white is 1;
 the dictionary is made as in Garrido-Jurado et al. 2014, doi:10.1016/j.patcog.2014.01.005."""
 
@@ -47,9 +82,9 @@ PLATE_MARGIN_CELLS: Final = 1
 class Plate:
     """A flat diffuse target; x right, y down as seen from its front, z into it."""
 
-    reflectance: FloatArray
+    reflectance: Float64Array
     """Of each lattice cell, shape (rows, columns); row 0 is the top."""
-    waviness: FloatArray
+    waviness: Float64Array
     """Amplitude of slope, wave vector in 1/mm (2) and phase of waves of the surface, (n, 4)."""
 
     @property
@@ -114,7 +149,7 @@ def white_plate(*, slope_deg: float, rng: np.random.Generator) -> Plate:
     )
 
 
-def _stamp(light: NDArray[np.bool_], number: int, top: int, left: int) -> None:
+def _stamp(light: BoolArray, number: int, top: int, left: int) -> None:
     """Print a marker into a raster, in place."""
     light[top : top + MARKER_CELLS, left : left + MARKER_CELLS] = False
     bits = DICT_4X4_50[number]
@@ -125,19 +160,19 @@ def _stamp(light: NDArray[np.bool_], number: int, top: int, left: int) -> None:
 
 @njit(cache=True, nogil=True)
 def plate_light(
-    rays: FloatArray,
-    eye_mm: FloatArray,
-    rotation: FloatArray,
-    place_mm: FloatArray,
-    reflectance: FloatArray,
+    rays: Float64Array,
+    eye_mm: Float64Array,
+    rotation: Float64Array,
+    place_mm: Float64Array,
+    reflectance: Float64Array,
     cell_mm: float,
-    waviness: FloatArray,
-    lamp_mm: FloatArray,
-    lamp_axis: FloatArray,
-    lamp_exponent: FloatArray,
-    lamp_strength: FloatArray,
+    waviness: Float64Array,
+    lamp_mm: Float64Array,
+    lamp_axis: Float64Array,
+    lamp_exponent: Float64Array,
+    lamp_strength: Float64Array,
     subpixels: int,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return what each pixel sees of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
 
     Parameters

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
-FloatArray = NDArray[np.float64]
+from rigsim.arrays import Float64Array
 
 GAUSSIAN_SIGMAS_MM = (0.004, 0.01, 0.025, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 """Default widths for `LateralKernels.gaussians`, common to all channels and all skins."""
@@ -27,11 +27,11 @@ class GaussianSum:
     weights sum to 1.
     """
 
-    sigmas_mm: FloatArray
+    sigmas_mm: Float64Array
     """Standard deviations along one axis in mm, shape (k,)."""
-    weights: FloatArray
+    weights: Float64Array
     """Non-negative weights, shape (channels, k)."""
-    worst_encircled: FloatArray
+    worst_encircled: Float64Array
     """Largest error of the encircled fraction over all radii, shape (channels,)."""
 
 
@@ -39,15 +39,15 @@ class GaussianSum:
 class LateralKernels:
     """Where light leaves that entered at a point: radial densities, normalised to 1."""
 
-    ring_edges_mm: FloatArray
+    ring_edges_mm: Float64Array
     """Edges of the rings in mm, shape (n + 1,)."""
-    radius_mm: FloatArray
+    radius_mm: Float64Array
     """Radius of each ring in mm that halves its area, shape (n,)."""
-    density_per_mm2: FloatArray
+    density_per_mm2: Float64Array
     """Mean density in each ring in 1/mm^2, shape (channels, n); times ring area it sums to 1."""
-    encircled: FloatArray
+    encircled: Float64Array
     """Fraction within the outer edge of each ring, in [0, 1], shape (channels, n)."""
-    rms_mm: FloatArray
+    rms_mm: Float64Array
     """Root mean square radius in mm, shape (channels,); per axis it is that over sqrt(2)."""
 
     @classmethod

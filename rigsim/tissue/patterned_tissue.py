@@ -12,20 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rigsim.arrays import Float64Array
 from rigsim.tissue import skin_layers
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatternedReflectance:
     """Diffuse reflectance of an evenly lit patch."""
 
-    reflectance: FloatArray
+    reflectance: Float64Array
     """Light that leaves each pixel over light that falls on each, shape (P, P)."""
-    standard_error: FloatArray
+    standard_error: Float64Array
     """Standard error from independent batches, shape (P, P)."""
 
 

@@ -13,11 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim.arrays import Float32Array, Float64Array, UInt32Array
 from rigsim.render import load
 from rigsim.render.variant import choose_variant
 from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL, TALLIES
-
-FloatArray = NDArray[np.float64]
 
 PHOTONS_PER_LANE: Final = (32, 256)
 """Fewest and most photons that a lane traces in turn: with more, lanes wait less at the end."""
@@ -40,7 +39,7 @@ _UNIT: Final = 2.0**-23
 class LaneTallies:
     """Sums over the photons of each batch, as `rigsim.tissue.photon_walk.walk` gives them."""
 
-    tally: FloatArray
+    tally: Float64Array
     """Shape (batches, TALLIES + layers + rings)."""
     photons: int
     """Photons in each batch."""
@@ -52,10 +51,7 @@ def is_usable() -> bool:
 
 
 def walk_lanes(
-    table: FloatArray,
-    ring_edges2: FloatArray,
-    photons: int,
-    seed: NDArray[np.uint64],
+    table: Float64Array, ring_edges2: Float64Array, photons: int, seed: NDArray[np.uint64]
 ) -> LaneTallies:
     """Trace photons that enter at the origin along +z.
 
@@ -83,7 +79,7 @@ def walk_lanes(
 
 
 def _batches(
-    table: FloatArray, ring_edges2: FloatArray, photons: int, seed: NDArray[np.uint64], of: int
+    table: Float64Array, ring_edges2: Float64Array, photons: int, seed: NDArray[np.uint64], of: int
 ) -> LaneTallies:
     """Trace some of all batches; lanes are shared out by the number of all."""
     import drjit as dr
@@ -123,8 +119,8 @@ def _batches(
 
 
 def _run(
-    dr: Any, table: FloatArray, words: NDArray[np.uint32], per_lane: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], list[FloatArray], FloatArray]:
+    dr: Any, table: Float64Array, words: UInt32Array, per_lane: int
+) -> tuple[Float32Array, Float32Array, list[Float64Array], Float64Array]:
     """Return each photon's exit weight (negative: never scattered) and r^2 (negative: below)."""
     from drjit.llvm import Bool, Float, Float64, UInt32
 
@@ -160,9 +156,23 @@ def _run(
         return dr.fma(Float(word >> 9), _UNIT, 0.5 * _UNIT)
 
     def body(
-        s0: Any, s1: Any, s2: Any, s3: Any, x: Any, y: Any, z: Any, ux: Any, uy: Any, uz: Any,
-        weight: Any, layer: Any, scattered: Any, at: Any, lost: Any, *absorbed: Any,
-    ) -> tuple[Any, ...]:  # fmt: skip
+        s0: Any,
+        s1: Any,
+        s2: Any,
+        s3: Any,
+        x: Any,
+        y: Any,
+        z: Any,
+        ux: Any,
+        uy: Any,
+        uz: Any,
+        weight: Any,
+        layer: Any,
+        scattered: Any,
+        at: Any,
+        lost: Any,
+        *absorbed: Any,
+    ) -> tuple[Any, ...]:
         s = [s0, s1, s2, s3]
         if single:
             thick, free_mm, albedo, g, eta, half_by_g = only
@@ -236,10 +246,12 @@ def _run(
             return UInt32(0)
 
         dr.if_stmt(
-            (dr.select(scattered, weight, -weight),
-             dr.select(beyond == 0, x * x + y * y, -1.0)),
-            leaves, leave, lambda w, r2: UInt32(0), mode="symbolic",
-        )  # fmt: skip
+            (dr.select(scattered, weight, -weight), dr.select(beyond == 0, x * x + y * y, -1.0)),
+            leaves,
+            leave,
+            lambda w, r2: UInt32(0),
+            mode="symbolic",
+        )
 
         ends = leaves | dies
         bent = dr.select(matched, uz, dr.copysign(cos_t, uz))
@@ -278,14 +290,20 @@ def _run(
     zero = dr.zeros(Float, lanes)
     state = (
         *(UInt32(word) for word in words),
-        zero, Float(zero), Float(zero), Float(zero), Float(zero), dr.full(Float, 1.0, lanes),
-        Float(zero) + start, dr.full(UInt32, 1, lanes), dr.full(Bool, False, lanes),
-        end - per_lane, dr.zeros(Float64, lanes),
+        zero,
+        Float(zero),
+        Float(zero),
+        Float(zero),
+        Float(zero),
+        dr.full(Float, 1.0, lanes),
+        Float(zero) + start,
+        dr.full(UInt32, 1, lanes),
+        dr.full(Bool, False, lanes),
+        end - per_lane,
+        dr.zeros(Float64, lanes),
         *(dr.zeros(Float64, lanes) for _ in range(n_layers)),
-    )  # fmt: skip
+    )
     done = dr.while_loop(state, lambda *v: v[13] < end, body, mode="symbolic", label="photons")
     lost, absorbed = done[14], list(done[15:])
     dr.eval(lost, absorbed, out_weight, out_r2)
-    return (
-        out_weight.numpy(), out_r2.numpy(), [part.numpy() for part in absorbed], lost.numpy(),
-    )  # fmt: skip
+    return (out_weight.numpy(), out_r2.numpy(), [part.numpy() for part in absorbed], lost.numpy())

@@ -12,10 +12,9 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
 from model import spectra
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
 from rigsim.tissue.skin_table import SkinTable
 
@@ -31,7 +30,7 @@ class SkinColor:
     """Name of the camera's sensitivity."""
     light: str
     """Name of the light's spectrum."""
-    log_rgb: NDArray[np.float64]
+    log_rgb: Float64Array
     """Logarithm of the reflectance per channel, shape (NODES, NODES, 3), over cube roots."""
 
     def rgb(self, c_m: Float32Array, c_hd: Float32Array) -> Float32Array:
@@ -114,7 +113,7 @@ def skin_color(camera: str, light: str) -> SkinColor:
     return SkinColor(camera, light, log_rgb)
 
 
-def _flat(fraction: Float32Array, limit: float) -> NDArray[np.float64]:
+def _flat(fraction: Float32Array, limit: float) -> Float64Array:
     """Return cube-root positions in [0, 1]."""
     values = np.asarray(fraction, np.float64).reshape(-1)
     if values.size and not (values.min() >= 0.0 and values.max() <= limit * (1.0 + 1e-6)):

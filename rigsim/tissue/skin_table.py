@@ -30,10 +30,9 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from rigsim.arrays import Float64Array
 from rigsim.tissue.lateral_kernels import LateralKernels
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
-
-FloatArray = NDArray[np.float64]
 
 _FILE = "skin_reflectance_mc.npz"
 EMPTY_RING = 1e-9  # share that stands for a far ring that no photon reached
@@ -43,12 +42,12 @@ class SkinTableError(ValueError):
     """A request outside the table."""
 
 
-def c_m_axis(nodes: int) -> FloatArray:
+def c_m_axis(nodes: int) -> Float64Array:
     """Return melanin fractions from 0 to 0.5, equally spaced in their cube root."""
     return np.asarray(MAX_C_M * np.linspace(0.0, 1.0, nodes) ** 3)
 
 
-def c_hd_axis(nodes: int) -> FloatArray:
+def c_hd_axis(nodes: int) -> Float64Array:
     """Return dermal blood fractions from 0 to 0.32, equally spaced in their cube root."""
     return np.asarray(MAX_C_HD * np.linspace(0.0, 1.0, nodes) ** 3)
 
@@ -57,33 +56,33 @@ def c_hd_axis(nodes: int) -> FloatArray:
 class SkinTable:
     """Diffuse reflectance of two-layer skin over melanin, blood and wavelength."""
 
-    wavelength_nm: FloatArray
+    wavelength_nm: Float64Array
     """Wavelengths in nm, 400 to 700 in steps of 10, shape (n_wavelength,)."""
-    c_m: FloatArray
+    c_m: Float64Array
     """Nodes of the volume fraction of melanosomes in the epidermis, 0 to 0.5, shape (n_m,)."""
-    c_hd: FloatArray
+    c_hd: Float64Array
     """Nodes of the volume fraction of blood in the dermis, 0 to 0.32, shape (n_h,)."""
-    reflectance: FloatArray
+    reflectance: Float64Array
     """Diffuse reflectance at normal incidence without the specular part, in (0, 1),
     shape (n_m, n_h, n_wavelength)."""
-    standard_error: FloatArray
+    standard_error: Float64Array
     """Standard error of `reflectance`, same shape. Errors of different wavelengths are independent,
     those of different fractions are strongly correlated (same photons)."""
-    lateral_c_m: FloatArray
+    lateral_c_m: Float64Array
     """Nodes of melanin of the lateral profiles, shape (k_m,)."""
-    lateral_c_hd: FloatArray
+    lateral_c_hd: Float64Array
     """Nodes of blood of the lateral profiles, shape (k_h,)."""
-    ring_edges_mm: FloatArray
+    ring_edges_mm: Float64Array
     """Edges of the rings around the point of entry in mm, shape (rings + 1,)."""
-    lateral: FloatArray
+    lateral: Float64Array
     """Reflectance that leaves within each ring, shape (k_m, k_h, rings, n_wavelength)."""
-    lateral_standard_error: FloatArray
+    lateral_standard_error: Float64Array
     """Standard error of `lateral`, same shape."""
     provenance: Mapping[str, Any]
     """Recipe version, seed, photons, optical constants and library versions."""
-    _patches: FloatArray
+    _patches: Float64Array
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
-    _log_shares: FloatArray
+    _log_shares: Float64Array
     """log of each ring's share of `lateral`, shape (k_m, k_h, rings, n_wavelength)."""
 
     @classmethod
@@ -91,7 +90,7 @@ class SkinTable:
         """Return the table of the package; it is read once."""
         return _load()
 
-    def spectra(self, c_m: ArrayLike, c_hd: ArrayLike) -> FloatArray:
+    def spectra(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
         """Return reflectance spectra by smooth, monotone interpolation.
 
         Parameters
@@ -207,12 +206,12 @@ def _load() -> SkinTable:
     return SkinTable(provenance=provenance, _patches=patches, _log_shares=log_shares, **arrays)
 
 
-def _log_shares(rings: FloatArray) -> FloatArray:
+def _log_shares(rings: Float64Array) -> Float64Array:
     shares = rings / rings.sum(axis=2, keepdims=True)
     return np.log(np.maximum(shares, EMPTY_RING))
 
 
-def _hermite_patches(reflectance: FloatArray) -> FloatArray:
+def _hermite_patches(reflectance: Float64Array) -> Float64Array:
     """Value, two slopes and twist of log R at the nodes, per unit of node index."""
     value = np.log(reflectance)
     by_m, by_h = (
@@ -226,7 +225,7 @@ def _hermite_patches(reflectance: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.stack([value, by_m, by_h, twist], axis=2))
 
 
-def _fractions(name: str, values: NDArray[Any], limit: float) -> FloatArray:
+def _fractions(name: str, values: NDArray[Any], limit: float) -> Float64Array:
     flat = np.ascontiguousarray(values, dtype=np.float64).ravel()
     # The largest float32 of a fraction may lie half a unit in the last place above the limit.
     allowed = max(limit, float(np.float32(limit)))

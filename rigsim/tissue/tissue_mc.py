@@ -18,9 +18,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigsim.arrays import Float64Array
 from rigsim.tissue.photon_walk import TALLIES, walk
 
-FloatArray = NDArray[np.float64]
 _T = TypeVar("_T")
 
 WORTH_LANES = 100_000  # photons above which Dr.Jit's start pays
@@ -109,17 +109,17 @@ class Transport:
     """Left downwards, scattered or not, in [0, 1]; 0 for a semi-infinite stack."""
     transmittance_stderr: float
     """Standard error of `transmittance`."""
-    absorbed: FloatArray
+    absorbed: Float64Array
     """Absorbed in each layer, shape (layers,)."""
-    absorbed_stderr: FloatArray
+    absorbed_stderr: Float64Array
     """Standard error of `absorbed`, shape (layers,)."""
     roulette: float
     """Weight removed minus weight added by the roulette: 0 within its error."""
-    ring_edges_mm: FloatArray
+    ring_edges_mm: Float64Array
     """Edges of the scoring rings around the beam in mm, shape (rings + 1,)."""
-    ring_reflectance: FloatArray
+    ring_reflectance: Float64Array
     """Part of `reflectance` that left within each ring, shape (rings,)."""
-    ring_reflectance_stderr: FloatArray
+    ring_reflectance_stderr: Float64Array
     """Standard error of `ring_reflectance`, shape (rings,)."""
     photons: int
     """Photons traced."""
@@ -127,12 +127,12 @@ class Transport:
     """Independent batches behind the standard errors."""
 
     @property
-    def reflectance_per_mm2(self) -> FloatArray:
+    def reflectance_per_mm2(self) -> Float64Array:
         """Mean radial density R(r) of each ring in 1/mm^2, shape (rings,)."""
         return np.asarray(self.ring_reflectance / _ring_areas(self.ring_edges_mm))
 
     @property
-    def reflectance_per_mm2_stderr(self) -> FloatArray:
+    def reflectance_per_mm2_stderr(self) -> Float64Array:
         """Standard error of `reflectance_per_mm2` in 1/mm^2, shape (rings,)."""
         return np.asarray(self.ring_reflectance_stderr / _ring_areas(self.ring_edges_mm))
 
@@ -152,16 +152,16 @@ class EscapePaths:
     scattering: both have the same collisions and the ratio of the path probabilities is that.
     """
 
-    weight: FloatArray
+    weight: Float64Array
     """Weight relative to one incident photon, shape (n,)."""
-    radius_mm: FloatArray
+    radius_mm: Float64Array
     """Distance of the exit point from the beam in mm, shape (n,)."""
-    path_mm: FloatArray
+    path_mm: Float64Array
     """Path length in each layer in mm, shape (n, layers)."""
     photons: int
     """Photons that were traced for them."""
 
-    def reflectance_at(self, extra_sigma_a_per_mm: ArrayLike) -> FloatArray:
+    def reflectance_at(self, extra_sigma_a_per_mm: ArrayLike) -> Float64Array:
         """Return the diffuse reflectance of this batch with absorption added to the layers.
 
         Parameters
@@ -329,8 +329,8 @@ def _lanes_work() -> bool:
 
 
 def _walk_lanes(
-    table: FloatArray, edges2: FloatArray, count: int, seeds: NDArray[np.uint64]
-) -> tuple[FloatArray, int]:
+    table: Float64Array, edges2: Float64Array, count: int, seeds: NDArray[np.uint64]
+) -> tuple[Float64Array, int]:
     from rigsim.tissue import photon_lanes  # starts the renderer: only for those who want it
 
     if not photon_lanes.is_usable():
@@ -339,7 +339,7 @@ def _walk_lanes(
     return run.tally, run.photons
 
 
-def layer_table(stack: LayerStack) -> FloatArray:
+def layer_table(stack: LayerStack) -> Float64Array:
     """Return what `rigsim.tissue.photon_walk.walk` needs of the layers and the media around them.
 
     Columns top, bottom, sigma_t, albedo, g, eta; shape (layers + 2, 6).
@@ -381,7 +381,7 @@ def photons_per_batch(photons: int, batches: int, threads: int) -> int:
     return -(-photons // batches)
 
 
-def _ring_edges(edges_mm: ArrayLike) -> FloatArray:
+def _ring_edges(edges_mm: ArrayLike) -> Float64Array:
     edges = np.array(edges_mm, dtype=np.float64)
     if edges.ndim != 1 or edges.size < 2 or not np.all(np.diff(edges) > 0.0) or edges[0] < 0.0:
         raise TransportError(
@@ -391,7 +391,7 @@ def _ring_edges(edges_mm: ArrayLike) -> FloatArray:
     return edges
 
 
-def _ring_areas(edges_mm: Sequence[float] | FloatArray) -> FloatArray:
+def _ring_areas(edges_mm: Sequence[float] | Float64Array) -> Float64Array:
     return np.asarray(np.pi * np.diff(np.square(edges_mm)))
 
 

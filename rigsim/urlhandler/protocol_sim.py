@@ -18,12 +18,7 @@ import termios
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from serial.serialutil import (
-    PortNotOpenError,
-    SerialBase,
-    SerialException,
-    SerialTimeoutException,
-)
+from serial.serialutil import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
 from capture.rig import load_rig
 from rigsim import world as worlds

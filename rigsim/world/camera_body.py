@@ -11,16 +11,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from capture.devices.camera import (
-    CameraError,
-    Exposure,
-    Frame,
-    FrameTimeout,
-    Trigger,
-)
+from capture.devices.camera import CameraError, Exposure, Frame, FrameTimeout, Trigger
 from capture.rig import View
+from rigsim.arrays import UInt16Array
 from rigsim.world.faults import Faults
 from rigsim.world.light_record import Light
 
@@ -78,7 +72,7 @@ class CameraWorld(Protocol):
         *,
         seed: int,
         pops: Sequence[Light],
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Return the pixels of an exposure."""
 
 
@@ -196,11 +190,7 @@ class CameraBody:
             exposure = dataclasses.replace(exposure, exposure_s=2.0 * exposure.exposure_s)
         light = self.world.light_between(shot.start_s, shot.start_s + exposure.exposure_s)
         image = self.world.expose(
-            self.view.name,
-            exposure,
-            shot.start_s,
-            seed=int(rng.integers(0, 2**63)),
-            pops=light,
+            self.view.name, exposure, shot.start_s, seed=int(rng.integers(0, 2**63)), pops=light
         )
         return Frame(
             serial=FOREIGN_SERIAL if foreign else self.view.serial,

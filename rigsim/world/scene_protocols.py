@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rigsim.arrays import UInt16Array
 from rigsim.world.suction import HeadState
 from rigsim.world.taped_skin import GripState
 
@@ -19,7 +17,7 @@ class Scene(Protocol):
 
     def exposure(
         self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Return the DN, shape (H, W), of one exposure lit by `pops`.
 
         They are what the rig's box gives: `FlashPop` of the flash, `LedPulse` of the dome, or
@@ -31,14 +29,8 @@ class CaliperScene(Protocol):
     """What is in front of the cameras of a rig with a caliper."""
 
     def exposure(
-        self,
-        view_name: str,
-        *,
-        pops: Sequence[Any],
-        exposure_s: float,
-        seed: int,
-        grip: GripState,
-    ) -> NDArray[np.uint16]:
+        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int, grip: GripState
+    ) -> UInt16Array:
         """Return the DN, shape (H, W), of one exposure, see `Scene`; of skin held by `grip`."""
 
 
@@ -46,12 +38,6 @@ class ProbeScene(Protocol):
     """What is in front of the fibres of a rig with a contact probe."""
 
     def exposure(
-        self,
-        view_name: str,
-        *,
-        pops: Sequence[Any],
-        exposure_s: float,
-        seed: int,
-        head: HeadState,
-    ) -> NDArray[np.uint16]:
+        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int, head: HeadState
+    ) -> UInt16Array:
         """Return the DN, shape (H, W), of one exposure, see `Scene`; `head` is of its start."""

@@ -18,10 +18,10 @@ from collections.abc import Iterable, Mapping
 from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.devices.camera import Exposure
 from capture.rig import Rig, View, load_rig
+from rigsim.arrays import UInt16Array
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.dome import LedPulse
 from rigsim.boxes.flash import FlashPop
@@ -312,7 +312,7 @@ class World:
         *,
         seed: int,
         pops: Iterable[Light] | None = None,
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Return the DN, shape (H, W), of an exposure that began at `t_start`.
 
         Parameters
@@ -404,7 +404,7 @@ def get_by_name_or_box(name: str) -> World:
     return _BENCH[unnamed[0]]
 
 
-def _dark_frame(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:
+def _dark_frame(view: View, rng: np.random.Generator) -> UInt16Array:
     noise = rng.normal(view.black_level, view.read_noise_e / view.gain_e_per_dn, _shape(view))
     return np.rint(np.clip(noise, 0, 2**view.bit_depth - 1)).astype(np.uint16)
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.texture_statistics import histograms as texture_histograms
 from model.texture_statistics.histograms import GroupHistograms
@@ -23,13 +22,12 @@ from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.fitting import traits
 from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
-
-Floats = NDArray[np.float64]
 
 BINS: Final = 128
 EVERYBODY: Final = "all"
@@ -60,8 +58,8 @@ class AlbedoAnalysis:
     """
 
     histograms: Mapping[str, GroupHistograms]
-    explained: Mapping[str, Floats]
-    scores: Mapping[str, Floats]
+    explained: Mapping[str, Float64Array]
+    scores: Mapping[str, Float64Array]
     names: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     source: str = "simulated"
@@ -196,7 +194,7 @@ def analyse_simulated(
     return _write(out, analyse(samples, names, groups, regions, vectors))
 
 
-def complements(binary: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.bool_]]:
+def complements(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
     """Return each group that has members, and of those with a trait also those without."""
     out = {}
     for name, flags in binary.items():
@@ -209,8 +207,8 @@ def complements(binary: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np
 def analyse(
     samples: Sequence[AlbedoSample],
     names: tuple[str, ...],
-    groups: Mapping[str, NDArray[np.bool_]],
-    regions: Mapping[str, NDArray[np.bool_]],
+    groups: Mapping[str, BoolArray],
+    regions: Mapping[str, BoolArray],
     vectors: VectorKind,
 ) -> AlbedoAnalysis:
     """Analyse albedo maps that lie in one common map."""
@@ -227,8 +225,15 @@ def analyse(
         if fewest < traits.LEAST_PIXELS:
             left_out.append((region, f"a face shows {fewest} pixels of it"))
             continue
-        reach = (0.0, float(np.ceil(10 * max(np.quantile(i[m], 0.999) for i, m in
-                                             zip(images, masks, strict=True))) / 10))  # fmt: skip
+        reach = (
+            0.0,
+            float(
+                np.ceil(
+                    10 * max(np.quantile(i[m], 0.999) for i, m in zip(images, masks, strict=True))
+                )
+                / 10
+            ),
+        )
         histograms[region] = texture_histograms.rgb_histograms(
             images, groups, valid=masks, reach=reach, bins=BINS
         )
@@ -269,18 +274,26 @@ def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
 def _histogram_rows(found: AlbedoAnalysis) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["region", "group", "members", "channel", "r_d_low", "r_d_high", "share",
-                   "stderr"])  # fmt: skip
+    rows.writerow(
+        ["region", "group", "members", "channel", "r_d_low", "r_d_high", "share", "stderr"]
+    )
     for region, one in found.histograms.items():
         for g, group in enumerate(one.names):
             for c, channel in enumerate(SHOWN):
                 for b, share in enumerate(one.mean[g, c]):
                     error = one.stderr[g, c, b]
                     rows.writerow(
-                        [region, group, int(one.members[g]), channel, f"{one.edges[b]:.6g}",
-                         f"{one.edges[b + 1]:.6g}", f"{share:.6g}",
-                         f"{error:.3g}" if np.isfinite(error) else ""]
-                    )  # fmt: skip
+                        [
+                            region,
+                            group,
+                            int(one.members[g]),
+                            channel,
+                            f"{one.edges[b]:.6g}",
+                            f"{one.edges[b + 1]:.6g}",
+                            f"{share:.6g}",
+                            f"{error:.3g}" if np.isfinite(error) else "",
+                        ]
+                    )
     return text.getvalue()
 
 
@@ -311,8 +324,14 @@ def _figure(found: AlbedoAnalysis) -> bytes:
         for c, color in enumerate(("tab:red", "tab:green", "tab:blue")):
             axes.plot(middle, one.mean[g, c], color=color, lw=1.0)
             error = np.nan_to_num(one.stderr[g, c])
-            axes.fill_between(middle, one.mean[g, c] - error, one.mean[g, c] + error,
-                              color=color, alpha=0.25, lw=0)  # fmt: skip
+            axes.fill_between(
+                middle,
+                one.mean[g, c] - error,
+                one.mean[g, c] + error,
+                color=color,
+                alpha=0.25,
+                lw=0,
+            )
         axes.set_ylim(0, top)
         axes.set_xlim(one.edges[0], one.edges[-1])
         axes.set_title(f"{name} ({one.members[g]})", fontsize=9)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from model.brdf import tables as brdf_tables
@@ -24,11 +23,10 @@ from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.errors import UnusableError
 from skinrig.next_steps import named
 from skinrig.traits import labels as trait_labels
-
-FloatArray = NDArray[np.float64]
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
 BASIS_FILE: Final = "brdf_basis.npz"
@@ -54,7 +52,7 @@ class Analysis:
     curve: SpaceCurve
     held_out: str
     """What the mixtures were not made of: "points" or "people"."""
-    means: Mapping[str, FloatArray]
+    means: Mapping[str, Float64Array]
     """Mean shares of the materials by label, (K,) each."""
 
     @property
@@ -94,7 +92,7 @@ def analyse(
     basis: BrdfBasis,
     *,
     by_label: bool,
-    groups: Mapping[str, NDArray[np.bool_]] | None = None,
+    groups: Mapping[str, BoolArray] | None = None,
     ranks: Sequence[int] = brdf_space.RANKS,
     method: brdf_space.Method = "shares",
     rng: np.random.Generator,
@@ -256,18 +254,31 @@ def analyse_measured(
         sets.append(Dataset("all", every, label, tuple(names), np.nan, lost))
     groups = None if table is None else dict(table.binary)
     done = tuple(
-        _up_to(analyse(data, materials, by_label=False, method=method, rng=rng,
-                       ranks=[rank for rank in brdf_space.RANKS if rank <= kept]), kept)
+        _up_to(
+            analyse(
+                data,
+                materials,
+                by_label=False,
+                method=method,
+                rng=rng,
+                ranks=[rank for rank in brdf_space.RANKS if rank <= kept],
+            ),
+            kept,
+        )
         for data, kept in zip(sets, lobes, strict=False)
-    )  # fmt: skip
+    )
     for data in sets[len(lobes) :]:
         done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
     told = [store.read_document(folder) for folder in folders]
     _write(
-        out, done, materials, spheres=done[-1], method=method,
+        out,
+        done,
+        materials,
+        spheres=done[-1],
+        method=method,
         source="measured" if any(one.source == "measured" for one in told) else "simulated",
         agreed=consent.carried(*told),
-    )  # fmt: skip
+    )
     return done
 
 
@@ -281,7 +292,7 @@ def _up_to(one: Analysis, lobes: int) -> Analysis:
 
 def _measured(
     folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
-) -> tuple[FloatArray, int, int]:
+) -> tuple[Float64Array, int, int]:
     """Return shares of the materials at random texels, how many are no use, and its lobes."""
     appearance = store.read(folder)
     weights: list[SkinMap] = []
@@ -350,5 +361,5 @@ def _write(
     (out / "figure-14.png").write_bytes(brdf_space_figures.spheres(spheres.means, basis))
 
 
-def _numbers(values: Sequence[float] | FloatArray) -> list[float | None]:
+def _numbers(values: Sequence[float] | Float64Array) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in values]

@@ -12,20 +12,17 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import load_rig
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import space as brdf_space
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import surface_brdf
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.conditions import CONDITIONS, conditioned_surface
 from rigsim.population.population import HAIR_LIMIT, Member, table_1
-
-FloatArray = NDArray[np.float64]
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 LEAST_COS_LIGHT: Final = 0.12
 LEAST_COS_VIEW: Final = 0.25
@@ -51,19 +48,19 @@ class DatasetError(ValueError):
 class Captured:
     """BRDF samples of P points, as `reconstruction.brdf_basis.surface_samples` takes them."""
 
-    f: FloatArray
+    f: Float64Array
     """(P, M, 3), 1/sr, with noise."""
-    variance: FloatArray
-    light: FloatArray
+    variance: Float64Array
+    light: Float64Array
     """(P, M, 3), unit vectors."""
-    view: FloatArray
-    normals: FloatArray
+    view: Float64Array
+    normals: Float64Array
     """(P, 3)."""
-    r_d: FloatArray
+    r_d: Float64Array
     """The true R_d, (P, 3)."""
-    surface: FloatArray
+    surface: Float64Array
     """The true surface term, (P, M), 1/sr."""
-    clean: FloatArray
+    clean: Float64Array
     """The samples without noise, (P, M, 3), 1/sr."""
 
     def again(self, count: int, *, rng: np.random.Generator) -> Captured:
@@ -79,9 +76,9 @@ class Dataset:
     """Mixtures of the materials at points, and whose they are."""
 
     name: str
-    weights: FloatArray
+    weights: Float64Array
     """(P, K), at least 0."""
-    label: NDArray[np.int64]
+    label: Int64Array
     """Index into `labels` of each point."""
     labels: tuple[str, ...]
     """Conditions or people."""
@@ -95,7 +92,7 @@ class Dataset:
 def capture(
     surface: SkinSurface,
     position_mm: Float32Array,
-    where: NDArray[np.bool_],
+    where: BoolArray,
     count: int,
     *,
     samples: int = SAMPLES,
@@ -160,10 +157,7 @@ def capture(
         surface.packed().reshape(len(where) ** 2, -1)[drawn[chosen]], samples, axis=0
     )
     clean, specular = surface_brdf.evaluate(
-        packed,
-        np.repeat(normal, samples, axis=0),
-        to_light.reshape(-1, 3),
-        to_view.reshape(-1, 3),
+        packed, np.repeat(normal, samples, axis=0), to_light.reshape(-1, 3), to_view.reshape(-1, 3)
     )
     f = clean.astype(np.float64).reshape(count, samples, 3)
     mu = np.einsum("pmc,pc->pm", to_light, normal)[..., None]
@@ -183,13 +177,22 @@ def capture(
 def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.BasisWeights:
     """Fit the materials to what is left of samples after their estimated diffuse part."""
     found = diffuse_albedo.estimate(
-        captured.f, captured.light, captured.view, captured.normals, eta=fresnel.ETA_SKIN,
+        captured.f,
+        captured.light,
+        captured.view,
+        captured.normals,
+        eta=fresnel.ETA_SKIN,
         variance=captured.variance,
-    )  # fmt: skip
+    )
     given = brdf_basis.surface_samples(
-        captured.f, captured.light, captured.view, captured.normals, found.r_d,
-        eta=fresnel.ETA_SKIN, variance=captured.variance,
-    )  # fmt: skip
+        captured.f,
+        captured.light,
+        captured.view,
+        captured.normals,
+        found.r_d,
+        eta=fresnel.ETA_SKIN,
+        variance=captured.variance,
+    )
     return brdf_basis.fit_weights(given, basis)
 
 
@@ -248,9 +251,14 @@ def dataset_a(
     person = table_1()[PERSON] if member is None else member
     share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
     return _gathered(
-        "dataset A", tuple(conditions), share.tolist(),
-        lambda k: _skin(person, {conditions[k]: 1.0}), noise=noise, progress=progress, rng=rng,
-    )  # fmt: skip
+        "dataset A",
+        tuple(conditions),
+        share.tolist(),
+        lambda k: _skin(person, {conditions[k]: 1.0}),
+        noise=noise,
+        progress=progress,
+        rng=rng,
+    )
 
 
 def dataset_b(
@@ -280,12 +288,17 @@ def dataset_b(
     if not people or points < 1:
         raise DatasetError(f"points: got {points} of {len(people)} people, expected 1 of 1 or more")
     return _gathered(
-        "dataset B", tuple(person.name for person in people), [points] * len(people),
-        lambda k: _skin(people[k], None), noise=noise, progress=progress, rng=rng,
-    )  # fmt: skip
+        "dataset B",
+        tuple(person.name for person in people),
+        [points] * len(people),
+        lambda k: _skin(people[k], None),
+        noise=noise,
+        progress=progress,
+        rng=rng,
+    )
 
 
-Skin = tuple[SkinSurface, Float32Array, NDArray[np.bool_]]
+Skin = tuple[SkinSurface, Float32Array, BoolArray]
 
 
 def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
@@ -310,7 +323,7 @@ def _gathered(
 ) -> Dataset:
     basis = brdf_tables.default()
     weights, label = [], []
-    twice: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    twice: tuple[list[Float64Array], list[Float64Array]] = ([], [])
     lost = 0
     for k, count in enumerate(counts):
         if progress is not None:
@@ -343,11 +356,11 @@ def _gathered(
     )
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _above(places_mm: FloatArray, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
+def _above(places_mm: Float64Array, points_mm: Float64Array, normals: Float64Array) -> Float64Array:
     """Return cosines to the normals of the ways from points to places, (points, places)."""
     way = _unit(places_mm[None] - points_mm[:, None])
     return np.einsum("pkc,pc->pk", way, normals)

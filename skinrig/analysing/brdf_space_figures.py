@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
 from reconstruction.brdf_basis.space import SpaceCurve
+from skinrig.arrays import Float64Array
 
-FloatArray = NDArray[np.float64]
-
-LIGHTS: Final = (((-0.5, 0.5, 0.70710678), "light from the left"),
-                 ((0.85, 0.35, -0.39), "light from behind right"))  # fmt: skip
+LIGHTS: Final = (
+    ((-0.5, 0.5, 0.70710678), "light from the left"),
+    ((0.85, 0.35, -0.39), "light from behind right"),
+)
 """The two directions that spheres are lit from."""
 SPHERE_PX: Final = 160
 GAMMA: Final = 2.2
@@ -48,8 +48,15 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
         rank = curve.plateau()
         at = curve.error[curve.ranks.index(rank)] / scale
         plot.plot([rank], [at], "o", ms=10, mfc="none", mec=color)
-        plot.annotate(str(rank), (rank, at), xytext=(0, 8), textcoords="offset points",
-                      color=color, fontsize=8, ha="center")  # fmt: skip
+        plot.annotate(
+            str(rank),
+            (rank, at),
+            xytext=(0, 8),
+            textcoords="offset points",
+            color=color,
+            fontsize=8,
+            ha="center",
+        )
     plot.set_xlabel("common mixtures")
     plot.set_ylabel("relative error over that of one mixture")
     plot.set_ylim(bottom=0.0)
@@ -58,7 +65,7 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
     return _png(figure)
 
 
-def spheres(means: Mapping[str, FloatArray], basis: BrdfBasis) -> bytes:
+def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
     """Draw mean BRDFs on spheres, lit from two directions.
 
     Parameters
@@ -88,7 +95,7 @@ def spheres(means: Mapping[str, FloatArray], basis: BrdfBasis) -> bytes:
     return _png(figure)
 
 
-def lit(means: Mapping[str, FloatArray], basis: BrdfBasis) -> dict[str, tuple[FloatArray, ...]]:
+def lit(means: Mapping[str, Float64Array], basis: BrdfBasis) -> dict[str, tuple[Float64Array, ...]]:
     """Return each label's sphere under each of `LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
     return {
         name: tuple(

@@ -107,9 +107,11 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     if double:
         raise DynamicAppearanceError(f"{double[0]}: another part of {out} has a map of that name")
     parts[name] = {
-        "maps": sorted(part.maps), "files": sorted(part.files), "source": part.source,
+        "maps": sorted(part.maps),
+        "files": sorted(part.files),
+        "source": part.source,
         **part.parameters,
-    }  # fmt: skip
+    }
     appearance = SkinAppearance(
         maps={**maps, **part.maps},
         source="simulated" if "simulated" in sources else "measured",

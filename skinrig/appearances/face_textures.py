@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
@@ -22,9 +21,8 @@ from reconstruction.correspondence.common_parameterization import (
     Correspondence,
     ParameterizationError,
 )
+from skinrig.arrays import BoolArray, Float64Array
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Point = tuple[float, float, float]
 Landmarks = dict[str, Point]
 
@@ -63,12 +61,12 @@ class Face:
     marked_by: str
 
     @property
-    def position(self) -> Floats:
+    def position(self) -> Float64Array:
         """Positions, (H, W, 3), mm."""
         return _map(self, "position").values.astype(np.float64)
 
     @property
-    def surface(self) -> Bools:
+    def surface(self) -> BoolArray:
         """Texels that show the surface, (H, W)."""
         return valid_of(_map(self, "position"))
 
@@ -200,7 +198,7 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
     return out
 
 
-def valid_of(one: SkinMap) -> Bools:
+def valid_of(one: SkinMap) -> BoolArray:
     """Return the texels of a map that mean something, (H, W)."""
     finite = np.isfinite(one.values) if one.values.ndim == 2 else np.isfinite(one.values).all(-1)
     return np.asarray(finite if one.valid is None else finite & one.valid, np.bool_)

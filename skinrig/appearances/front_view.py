@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
+
 WIDTH_PX = 220
 """Pixels across."""
 
@@ -32,9 +34,7 @@ class FrontView:
     order: NDArray[np.intp]
 
     @staticmethod
-    def of(
-        position_mm: NDArray[np.floating], box: tuple[NDArray[np.floating], NDArray[np.floating]]
-    ) -> FrontView:
+    def of(position_mm: FloatArray, box: tuple[FloatArray, FloatArray]) -> FrontView:
         """Look along -z at points, shape (N, 3), inside a box given by its two corners."""
         low, high = box
         pixel = max(float(high[0] - low[0]) / WIDTH_PX, 1e-9)
@@ -50,8 +50,8 @@ class FrontView:
         )
 
     def picture(
-        self, values: NDArray[np.floating], *, valid: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        self, values: FloatArray, *, valid: BoolArray | None = None
+    ) -> tuple[Float64Array, BoolArray]:
         """Return the picture of a value at each point, (N,) or (N, 3), and where there is one.
 
         The frontmost point of a pixel is shown; gaps of up to two pixels between points take the

@@ -211,8 +211,11 @@ def apply_expression(
             maps=done.maps,
             source=_source(appearance, expression),
             parameters={
-                "kind": KIND, "weights": dict(expression.weights), "clamp": expression.clamp,
-                "emotional": expression.emotional, "gain": expression.gain,
+                "kind": KIND,
+                "weights": dict(expression.weights),
+                "clamp": expression.clamp,
+                "emotional": expression.emotional,
+                "gain": expression.gain,
                 consent.KEY: consent.carried(*_faces(appearance, expression)),
                 "figures": _without_times(done.figures),
             },
@@ -225,7 +228,7 @@ def apply_expression(
             left_out=tuple(done.left_out),
             seed=appearance.seed,
         ),
-    )  # fmt: skip
+    )
     return done
 
 
@@ -285,9 +288,12 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     good = blend.valid
     held = np.where(good, blend.hemoglobin, 0.0).astype(np.float32)
     done.maps["hemoglobin"] = SkinMap(
-        held, UNITS["hemoglobin"], np.where(good, blend.stderr, 0.0).astype(np.float32), good,
+        held,
+        UNITS["hemoglobin"],
+        np.where(good, blend.stderr, 0.0).astype(np.float32),
+        good,
         "blend of measured states",
-    )  # fmt: skip
+    )
     done.figures[FACIAL_COLOR] = {
         "clipped_fraction": blend.clipped_fraction,
         "valid_fraction": float(good.mean()),
@@ -300,9 +306,12 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     seen = good if melanin.valid is None else good & melanin.valid
     done.maps["melanin"] = melanin
     done.maps["color"] = SkinMap(
-        colors(melanin.values, held, seen), "1", None, seen,
+        colors(melanin.values, held, seen),
+        "1",
+        None,
+        seen,
         f"diffuse reflectance as {OBSERVER} under {LIGHT}, white = 1",
-    )  # fmt: skip
+    )
 
 
 def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinRig:
@@ -340,14 +349,21 @@ def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied)
     weights = wrinkle_weights(model, expression.weights)
     if model.clamp != expression.clamp:
         model = WrinkleModel(
-            model.base, model.layers, expression.clamp, model.valid, model.base_stderr,
+            model.base,
+            model.layers,
+            expression.clamp,
+            model.valid,
+            model.base_stderr,
             model.weight_stderr,
-        )  # fmt: skip
+        )
     shown = model.evaluate(weights)
     done.maps["normals"] = SkinMap(
-        shown.normals.astype(np.float32), "1", None, shown.valid,
+        shown.normals.astype(np.float32),
+        "1",
+        None,
+        shown.valid,
         "tangent space of the texture, +X right, +Y up",
-    )  # fmt: skip
+    )
     done.figures[WRINKLES] = {
         "weights": weights,
         "zone_weights": [zones.tolist() for zones in shown.zone_weights],

@@ -13,17 +13,14 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable
 from model.microstructure.convolution import LineKernels, Sampling, convolve_tiled, tiles_of
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import KernelRegions, rasterize, regional_kernels
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.blend_shapes.meshes import BlendShapeMesh
-
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
@@ -117,7 +114,7 @@ class AppliedMicrostructure:
     report : MicrostructureReport
     """
 
-    height: Float32
+    height: Float32Array
     strain: MeshStrain
     report: MicrostructureReport
 
@@ -190,13 +187,13 @@ def apply_microstructure(
         shown = rasterize(found, mesh.faces, mesh.uv, size, window=window)
         return regional_kernels(shown, regions, size, window=window, extrapolate=extrapolate)
 
-    def valid_at(window: Window) -> Bools:
+    def valid_at(window: Window) -> BoolArray:
         return np.asarray(valid[window.rows, window.columns], bool)
 
     tiles = tiles_of(size, tile)
     journal = None
     if out is None:
-        target: Float32 = np.empty(size, np.float32)
+        target: Float32Array = np.empty(size, np.float32)
     else:
         job = _job(moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile)))
         journal = _Journal.open(Path(out), job, size)
@@ -214,16 +211,28 @@ def apply_microstructure(
 
     begin = time.perf_counter()
     convolve_tiled(
-        neutral_height, target, fields_at, tile=tile, sampling=sampling,
-        valid_at=None if valid is None else valid_at, finished=before, progress=finished,
-    )  # fmt: skip
+        neutral_height,
+        target,
+        fields_at,
+        tile=tile,
+        sampling=sampling,
+        valid_at=None if valid is None else valid_at,
+        finished=before,
+        progress=finished,
+    )
     if journal is not None:
         journal.close()
     convolution_s = time.perf_counter() - begin
     report = _report(
-        found, regions, mesh, size, extrapolate, (strain_s, convolution_s),
-        (len(tiles), len(before)), _shares(found, mesh, regions, size, extrapolate),
-    )  # fmt: skip
+        found,
+        regions,
+        mesh,
+        size,
+        extrapolate,
+        (strain_s, convolution_s),
+        (len(tiles), len(before)),
+        _shares(found, mesh, regions, size, extrapolate),
+    )
     return AppliedMicrostructure(target, found, report)
 
 
@@ -279,10 +288,11 @@ def _report(
         [
             np.hypot(axis[good, 0] * size[1], axis[good, 1] * size[0]) * per_mm[good]
             for axis, per_mm in (
-                (found.axis_s, found.uv_per_mm_s), (found.axis_t, found.uv_per_mm_t)
+                (found.axis_s, found.uv_per_mm_s),
+                (found.axis_t, found.uv_per_mm_t),
             )
         ]
-    )  # fmt: skip
+    )
     return MicrostructureReport(
         size_px=size,
         stretch_s=(float(both[0].min()), float(both[0].max())),
@@ -309,7 +319,7 @@ def _report(
 
 
 def _job(
-    moved: NDArray[np.float64],
+    moved: Float64Array,
     mesh: BlendShapeMesh,
     height: Any,
     valid: Any,

@@ -21,16 +21,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from model import microstructure
 from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
-
-Floats = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
+from skinrig.arrays import Float32Array, Float64Array, Int64Array
 
 REACH: Final = 1.1
 """Half the chart's side, in units of the projection: 1 is the rim that is seen from +z."""
@@ -69,11 +67,11 @@ class Sphere:
         if not 32 <= self.texels <= 16_384:
             raise SphereError(f"texels: got {self.texels}, expected 32...16384")
 
-    def points_mm(self) -> Floats:
+    def points_mm(self) -> Float64Array:
         """Return where the chart's pixels are, (N, N, 3) mm; row 0 is +y."""
         return self._points(*self._chart())
 
-    def pixel_um(self) -> Floats:
+    def pixel_um(self) -> Float64Array:
         """Return the side of the chart's pixels on the neutral sphere, (N, N) um."""
         x, y = self._chart()
         step = 2.0 * REACH / self.texels
@@ -91,17 +89,17 @@ class Sphere:
             patches, self.texels, rng=rng, pixel_um=self.pixel_um(), patch_pixel_um=patch_pixel_um
         )
 
-    def _chart(self) -> tuple[Floats, Floats]:
+    def _chart(self) -> tuple[Float64Array, Float64Array]:
         at = REACH * ((np.arange(self.texels) + 0.5) * 2.0 / self.texels - 1.0)
         x, y = np.meshgrid(at, -at)
         return x, y
 
-    def _points(self, x: Floats, y: Floats) -> Floats:
+    def _points(self, x: Float64Array, y: Float64Array) -> Float64Array:
         square = x * x + y * y
         point = np.stack([2.0 * x, 2.0 * y, 1.0 - square], axis=-1)
         return np.asarray(self.radius_mm * point / (1.0 + square)[..., None])
 
-    def mesh(self) -> tuple[Floats, NDArray[np.int64], Floats]:
+    def mesh(self) -> tuple[Float64Array, Int64Array, Float64Array]:
         """Return vertices (V, 3) mm, triangles (F, 3), texture coordinates (V, 2) of the chart."""
         side = np.linspace(0.0, 1.0, MESH_DIVISIONS + 1)
         u, v = (part.reshape(-1) for part in np.meshgrid(side, side))
@@ -125,7 +123,7 @@ class DeformedSphere:
     strain: strain_fields.TextureStrain
     """Ratios and axes at the chart's pixels."""
 
-    def slopes(self) -> Floats:
+    def slopes(self) -> Float64Array:
         """Return slopes of the relief on the deformed surface along s and t, (N, N, 2).
 
         Mesh and relief follow the skin: a pixel is as long as on the neutral sphere times the
@@ -157,10 +155,13 @@ class DeformedSphere:
         return variance_s, variance_t
 
     def picture(
-        self, *, size_px: int = 256, alpha: float = 0.2, light: tuple[float, float, float] = (
-            -0.35, 0.45, 0.82,
-        ), samples: int = 3,
-    ) -> Floats:  # fmt: skip
+        self,
+        *,
+        size_px: int = 256,
+        alpha: float = 0.2,
+        light: tuple[float, float, float] = (-0.35, 0.45, 0.82),
+        samples: int = 3,
+    ) -> Float64Array:
         """Return what is reflected to +z at the surface, lit from far away.
 
         Parameters

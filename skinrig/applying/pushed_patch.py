@@ -21,16 +21,13 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 
 from model import microstructure
 from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_fields
+from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
-
-Floats = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-Integers = NDArray[np.int64]
 
 DIVISIONS = (23, 23, 8)
 """Boxes of six tetrahedra each: 25,392 in all, as many as the paper's mesh has, about."""
@@ -106,13 +103,13 @@ class Push:
 class PushedPatch:
     """The block's equilibrium."""
 
-    rest_mm: Floats
+    rest_mm: Float64Array
     """(V, 3) nodes before."""
-    deformed_mm: Floats
+    deformed_mm: Float64Array
     """(V, 3) nodes after."""
-    tetrahedra: Integers
+    tetrahedra: Int64Array
     """(T, 4) nodes."""
-    surface: Integers
+    surface: Int64Array
     """(F, 3) nodes of the triangles at z = 0, counterclockwise from outside."""
     width_mm: float
     """Side of the surface, mm."""
@@ -120,7 +117,7 @@ class PushedPatch:
     """Newton's corrections in all."""
 
     @property
-    def uv(self) -> Floats:
+    def uv(self) -> Float64Array:
         """(V, 2) texture coordinates of the nodes: u to the right, v up, 0 to 1."""
         return self.rest_mm[:, :2] / self.width_mm + 0.5
 
@@ -130,7 +127,7 @@ class PushedPatch:
         after, before = (self._volumes(nodes) for nodes in (self.deformed_mm, self.rest_mm))
         return float(after.sum() / before.sum())
 
-    def _volumes(self, nodes: Floats) -> Floats:
+    def _volumes(self, nodes: Float64Array) -> Float64Array:
         corner = nodes[self.tetrahedra]
         return np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1])) / 6.0
 
@@ -279,7 +276,7 @@ def _mesh(block: SkinBlock) -> Any:
     )
 
 
-def _surface(mesh: Any) -> Integers:
+def _surface(mesh: Any) -> Int64Array:
     """Return the triangles at z = 0, counterclockwise from outside."""
     facets = mesh.facets.T
     faces = np.asarray(facets[(mesh.p[2][facets] > -1e-9).all(axis=1)], np.int64)
@@ -324,7 +321,7 @@ class _Tissue:
             np.zeros_like(self.nodes), np.zeros((len(self.corners), 3)), np.zeros(len(self.nodes))
         )
 
-    def equilibrium(self, begin: _State, given: Floats) -> tuple[_State | None, int]:
+    def equilibrium(self, begin: _State, given: Float64Array) -> tuple[_State | None, int]:
         """Return the equilibrium with given displacements, or None, and corrections made."""
         known = np.isfinite(given)
         free = np.concatenate([~known.reshape(-1), np.ones(len(self.nodes), bool)])
@@ -341,9 +338,11 @@ class _Tissue:
             inner = matrix[free][:, free].tocsc()
             step = step.copy()
             factors = splu(
-                inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01,
+                inner,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.01,
                 options={"SymmetricMode": True},
-            )  # fmt: skip
+            )
             step[free] = factors.solve(right[free])
             moves = step[: 3 * len(self.nodes)].reshape(-1, 3)
             local = step[self.places]
@@ -359,7 +358,9 @@ class _Tissue:
                 return state, count
         return None, MOST_ITERATIONS
 
-    def _system(self, state: _State) -> tuple[Any, Floats, tuple[Floats, Floats]] | None:
+    def _system(
+        self, state: _State
+    ) -> tuple[Any, Float64Array, tuple[Float64Array, Float64Array]] | None:
         """Return stiffness, forces, and how bubbles follow; None where an element is turned over.
 
         Of each element, with H the gradients on the deformed block: force
@@ -413,7 +414,7 @@ class _Tissue:
         return whole.tocsr(), np.asarray(total, np.float64), (follows, own)
 
 
-def _inverted(matrices: Floats) -> tuple[Floats, Floats]:
+def _inverted(matrices: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return determinants and inverses of (..., 3, 3) matrices, by the cross products of rows."""
     a, b, c = (matrices[..., row, :] for row in range(3))
     columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
@@ -426,6 +427,6 @@ def _inverted(matrices: Floats) -> tuple[Floats, Floats]:
 class _State:
     """Displacements of nodes (V, 3) and bubbles (T, 3), mm; pressure (V,) per shear modulus."""
 
-    nodes_mm: Floats
-    bubbles_mm: Floats
-    pressure: Floats
+    nodes_mm: Float64Array
+    bubbles_mm: Float64Array
+    pressure: Float64Array

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.displacement_synthesis import growth as displacement_synthesis
@@ -21,6 +20,7 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
 
@@ -173,9 +173,15 @@ class Relief:
                 f"grow the relief of {', '.join(names)} to {self.size_px} x {self.size_px}"
             )
             neutral = displacement_synthesis.grow(
-                patches, self.size_px, rng=rng, regions=regions, out=neutral,
-                pixel_um=scale / self.size_px, patch_pixel_um=float(np.mean(pixels_um)), threads=2,
-            )  # fmt: skip
+                patches,
+                self.size_px,
+                rng=rng,
+                regions=regions,
+                out=neutral,
+                pixel_um=scale / self.size_px,
+                patch_pixel_um=float(np.mean(pixels_um)),
+                threads=2,
+            )
         if large:
             neutral.flush()
             os.replace(growing, self.aside / "displacement_neutral.npy")
@@ -185,10 +191,14 @@ class Relief:
         kernels = tables[0] if regions is None else KernelRegions(tables, regions)
         self.progress("strain and convolution")
         moved = apply_microstructure(
-            self.mesh, self.weights, neutral, kernels, extrapolate=self.extrapolate,
+            self.mesh,
+            self.weights,
+            neutral,
+            kernels,
+            extrapolate=self.extrapolate,
             out=self.aside / "displacement.npy" if large else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
-        )  # fmt: skip
+        )
         made = "noise as high as" if self.source == "noise" else "grown from"
         note = f"um, {made} measured patches; texture of the mesh"
         if large:
@@ -250,13 +260,10 @@ def _with_states(
         return mesh, own
     face = build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv, shapes=dict(mesh.shapes))
     made = {name: displacement_mm(face, name) for name in missing}
-    return (
-        BlendShapeMesh(mesh.vertices_mm, mesh.uv, mesh.faces, {**mesh.shapes, **made}),
-        own,
-    )
+    return (BlendShapeMesh(mesh.vertices_mm, mesh.uv, mesh.faces, {**mesh.shapes, **made}), own)
 
 
-def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> NDArray[np.float32]:
+def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> Float32Array:
     relief = appearance.maps[str(entry["map"])]
     if min(relief.values.shape) < SMALLEST_PATCH_PX:
         raise ApplyError(
@@ -272,11 +279,11 @@ def _noise(
     mesh: BlendShapeMesh,
     size_px: int,
     rms_um: float,
-    scale_um: NDArray[np.float64],
+    scale_um: Float64Array,
     *,
     rng: np.random.Generator,
-    out: NDArray[np.float32] | None,
-) -> NDArray[np.float32]:
+    out: Float32Array | None,
+) -> Float32Array:
     """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
     from rigsim.geometry.atlas import spread, unwrap
 
@@ -306,7 +313,7 @@ def _noise(
     return target
 
 
-def _scale(mesh: BlendShapeMesh) -> NDArray[np.float64]:
+def _scale(mesh: BlendShapeMesh) -> Float64Array:
     """Return how long the texture's side is on the skin, um, by place, (h, w)."""
     atlas = _atlas(mesh)
     area = np.linalg.norm(np.cross(atlas.dp_du_mm, atlas.dp_dv_mm), axis=-1)
@@ -317,7 +324,7 @@ def _scale(mesh: BlendShapeMesh) -> NDArray[np.float64]:
     return np.asarray(1e3 * np.clip(side, *np.percentile(side[seen], [2, 98])), np.float64)
 
 
-def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> NDArray[np.float64] | None:
+def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
         return None

@@ -178,8 +178,9 @@ def _dark_over_light(by_band: Mapping[str, BandError | float]) -> dict[str, Any]
     if len(told) < 2 or not told[0].error > 0.0:
         return None
     (light_low, light_high), (dark_low, dark_high) = (
-        told[0].error_interval, told[-1].error_interval,
-    )  # fmt: skip
+        told[0].error_interval,
+        told[-1].error_interval,
+    )
     return {
         "ratio": told[-1].error / told[0].error,
         "interval": [

@@ -90,14 +90,19 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     if axes.get_legend_handles_labels()[0]:
         legend = axes.legend(fontsize=6, frameon=False)
     point_names.name_points(
-        figure, axes, labels, points=list(zip(seconds.tolist(), error.tolist(), strict=True)),
+        figure,
+        axes,
+        labels,
+        points=list(zip(seconds.tolist(), error.tolist(), strict=True)),
         lines=[
             *(np.column_stack([seconds[best], error[best]]) for best in joined),
-            *np.stack([np.stack([seconds, error - bars[0]], 1),
-                       np.stack([seconds, error + bars[1]], 1)], 1),
+            *np.stack(
+                [np.stack([seconds, error - bars[0]], 1), np.stack([seconds, error + bars[1]], 1)],
+                1,
+            ),
         ],
         legend=legend,
-    )  # fmt: skip
+    )
     told = "; ".join(
         f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
         + (
@@ -151,9 +156,14 @@ def compared_fronts(
         seconds = np.array([p["seconds"] for p in points], float)
         error = np.array([p["error"] for p in points], float)
         axes.plot(
-            seconds, error, "os"[number], mfc="none" if number else None, ms=5,
-            color=figures.COLORS[number], label=label,
-        )  # fmt: skip
+            seconds,
+            error,
+            "os"[number],
+            mfc="none" if number else None,
+            ms=5,
+            color=figures.COLORS[number],
+            label=label,
+        )
         places.append(
             {
                 str(p["knobs"]): (s, e)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import metrics
+from skinrig.arrays import BoolArray, FloatArray
 from skinrig.benchmarks.measurement import BandError
 
 DRAWS = 200
@@ -48,11 +49,7 @@ def mean_error(values: ArrayLike) -> BandError:
 
 
 def tiled_rms(
-    difference: NDArray[np.floating],
-    where: NDArray[np.bool_],
-    *,
-    tile_px: int = TILE_PX,
-    seed: int = 0,
+    difference: FloatArray, where: BoolArray, *, tile_px: int = TILE_PX, seed: int = 0
 ) -> BandError:
     """Return the root mean square of a picture's errors; the interval is over its tiles.
 

@@ -92,12 +92,7 @@ def _measured(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
 
 
 def run_stages(
-    names: Sequence[str] | None,
-    *,
-    budget_s: float,
-    toy: bool,
-    out: Path | None,
-    console: Console,
+    names: Sequence[str] | None, *, budget_s: float, toy: bool, out: Path | None, console: Console
 ) -> dict[str, Any]:
     """Measure stages and return the document of the run.
 

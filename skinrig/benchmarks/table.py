@@ -11,9 +11,7 @@ from typing import Any
 
 from skinrig.console import Console
 
-_COLUMNS = (
-    "seconds", "cold_seconds", "peak_memory_mb", "error", "cramer_rao_bound", "efficiency",
-)  # fmt: skip
+_COLUMNS = ("seconds", "cold_seconds", "peak_memory_mb", "error", "cramer_rao_bound", "efficiency")
 
 BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of light", "which is")
 """Of the table of errors by band: the last but one is the error over that of the lightest band."""
@@ -31,13 +29,21 @@ def show(document: Mapping[str, Any], console: Console) -> None:
     """
     for name, stage in document["stages"].items():
         console.rows(
-            (f"{name} ({stage['size']} size)", "seconds", "cold s", "peak MB",
-             stage["error_name"], "Cramér-Rao", "efficiency", ""),
+            (
+                f"{name} ({stage['size']} size)",
+                "seconds",
+                "cold s",
+                "peak MB",
+                stage["error_name"],
+                "Cramér-Rao",
+                "efficiency",
+                "",
+            ),
             [
                 (knobs(point), *(_cell(point[key]) for key in _COLUMNS), _place(point))
                 for point in stage["points"]
             ],
-        )  # fmt: skip
+        )
         for limit in stage["limits"]:
             word = "kept" if limit["passed"] else "MISSED"
             console.say(
@@ -82,9 +88,17 @@ def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
             low, high = one["error_interval"] or (None, None)
             of_light = one["error"] / first if first else None
             rows.append(
-                (name, one["band"], one["error"], _cell(low), _cell(high),
-                 _cell(one["cramer_rao_bound"]), _cell(of_light), stage["error_name"])
-            )  # fmt: skip
+                (
+                    name,
+                    one["band"],
+                    one["error"],
+                    _cell(low),
+                    _cell(high),
+                    _cell(one["cramer_rao_bound"]),
+                    _cell(of_light),
+                    stage["error_name"],
+                )
+            )
     return rows
 
 
@@ -102,12 +116,19 @@ def write(document: Mapping[str, Any], out: Path) -> None:
 
     out.mkdir(parents=True, exist_ok=True)
     rows = [
-        (name, stage["size"], knobs(point), stage["error_name"],
-         *(point[key] for key in _COLUMNS), *point["error_interval"],
-         point["on_front"], point["knee"])
+        (
+            name,
+            stage["size"],
+            knobs(point),
+            stage["error_name"],
+            *(point[key] for key in _COLUMNS),
+            *point["error_interval"],
+            point["on_front"],
+            point["knee"],
+        )
         for name, stage in document["stages"].items()
         for point in stage["points"]
-    ]  # fmt: skip
+    ]
     head = ("stage", "size", "setting", "error is", *_COLUMNS, "low", "high", "front", "knee")
     write_whole(out / "bench.csv", _csv(head, rows))
     write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
@@ -162,8 +183,13 @@ def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:
     verdict = f"{missed} MISSED" if missed else f"{len(stage['limits'])} kept"
     many = f"{len(knees)}, one a condition" if len(knees) > 1 else ""
     return (
-        name, stage["size"], len(points), len(stage["fronts"]),
+        name,
+        stage["size"],
+        len(points),
+        len(stage["fronts"]),
         min((float(point["error"]) for point in points), default=""),
-        knobs(bend) if bend else many, bend["seconds"] if bend else "",
-        min(known) if known else "", verdict if stage["size"] == "full" else "not judged",
-    )  # fmt: skip
+        knobs(bend) if bend else many,
+        bend["seconds"] if bend else "",
+        min(known) if known else "",
+        verdict if stage["size"] == "full" else "not judged",
+    )

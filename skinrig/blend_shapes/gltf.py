@@ -25,20 +25,25 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import Float64Array, Int64Array
 from skinrig.blend_shapes.errors import BlendShapeFileError
-
-Floats = NDArray[np.float64]
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 COMPONENTS: Final[dict[int, np.dtype[Any]]] = {
-    5120: np.dtype("<i1"), 5121: np.dtype("<u1"), 5122: np.dtype("<i2"),
-    5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4"),
-}  # fmt: skip
+    5120: np.dtype("<i1"),
+    5121: np.dtype("<u1"),
+    5122: np.dtype("<i2"),
+    5123: np.dtype("<u2"),
+    5125: np.dtype("<u4"),
+    5126: np.dtype("<f4"),
+}
 """Types of numbers in buffers, by the standard's codes."""
 WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 COMPRESSED: Final = (
-    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
-)  # fmt: skip
+    "KHR_draco_mesh_compression",
+    "EXT_meshopt_compression",
+    "KHR_meshopt_compression",
+)
 TRIANGLES: Final = 4
 DEEPEST: Final = 1000
 """Nodes above a mesh beyond which a file is taken to go in circles."""
@@ -151,12 +156,14 @@ class _Gltf:
         if "sparse" in entry:
             sparse = entry["sparse"]
             n, at, new = int(sparse["count"]), sparse["indices"], sparse["values"]
-            places = self._rows(int(at["bufferView"]), int(at.get("byteOffset", 0)), n,
-                                int(at["componentType"]), 1)[:, 0]  # fmt: skip
+            places = self._rows(
+                int(at["bufferView"]), int(at.get("byteOffset", 0)), n, int(at["componentType"]), 1
+            )[:, 0]
             if n and int(places.max()) >= count:
                 raise self.wrong(f"accessor {number}: a sparse index is beyond {count - 1}")
-            values[places] = self._rows(int(new["bufferView"]), int(new.get("byteOffset", 0)), n,
-                                        component, width)  # fmt: skip
+            values[places] = self._rows(
+                int(new["bufferView"]), int(new.get("byteOffset", 0)), n, component, width
+            )
         if entry.get("normalized") and values.dtype.kind in "iu":
             top = float(np.iinfo(values.dtype).max)
             return np.asarray(np.maximum(values.astype(np.float64) / top, -1.0))
@@ -165,7 +172,7 @@ class _Gltf:
 
 def read(
     path: Path, part: str | None
-) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
     """Read the mesh with morph targets of a glTF file.
 
     Parameters
@@ -196,7 +203,7 @@ def read(
 
 def _read(
     gltf: _Gltf, part: str | None
-) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
     number = _chosen(gltf, part)
     mesh = gltf.document["meshes"][number]
     matrix = _transform(gltf, number)
@@ -261,7 +268,7 @@ def _chosen(gltf: _Gltf, part: str | None) -> int:
     return able[0]
 
 
-def _transform(gltf: _Gltf, mesh: int) -> Floats:
+def _transform(gltf: _Gltf, mesh: int) -> Float64Array:
     """Return the 4 x 4 matrix from the mesh to the scene; the identity for a mesh no node shows."""
     nodes = gltf.document.get("nodes", [])
     shown = [number for number, node in enumerate(nodes) if node.get("mesh") == mesh]
@@ -279,7 +286,7 @@ def _transform(gltf: _Gltf, mesh: int) -> Floats:
     raise gltf.wrong("its nodes go in circles")
 
 
-def _local(node: dict[str, Any]) -> Floats:
+def _local(node: dict[str, Any]) -> Float64Array:
     if "matrix" in node:
         return np.asarray(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
     x, y, z, w = np.asarray(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)

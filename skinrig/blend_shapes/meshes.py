@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skinrig.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf
 from skinrig.blend_shapes import obj as blend_shape_obj
 from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 __all__ = ["BlendShapeError", "BlendShapeFileError", "BlendShapeMesh", "load"]
 
@@ -43,10 +40,10 @@ class BlendShapeMesh:
         Movement by a weight of 1, mm.
     """
 
-    vertices_mm: Float32
-    uv: Float32
-    faces: NDArray[np.int32]
-    shapes: Mapping[str, Float32] = field(repr=False)
+    vertices_mm: Float32Array
+    uv: Float32Array
+    faces: Int32Array
+    shapes: Mapping[str, Float32Array] = field(repr=False)
 
     def __post_init__(self) -> None:
         """Check shapes, indices and sizes."""
@@ -79,7 +76,7 @@ class BlendShapeMesh:
                 "say with unit_mm how many millimetres the file's unit has"
             )
 
-    def deformed(self, weights: Mapping[str, float]) -> Floats:
+    def deformed(self, weights: Mapping[str, float]) -> Float64Array:
         """Return the vertices under weights of shapes, mm, shape (V, 3).
 
         Parameters
@@ -168,7 +165,7 @@ def load(
     )
 
 
-def _read_npz(path: Path) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+def _read_npz(path: Path) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             missing = [key for key in NPZ_KEYS if key not in archive]
@@ -181,8 +178,9 @@ def _read_npz(path: Path) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, 
         raise BlendShapeFileError(f"{path}: not a readable .npz: {error}") from error
     names = arrays["shape_names"]
     if names.ndim != 1 or names.dtype.kind != "U":
-        raise BlendShapeFileError(f"{path}: shape_names: got {names.dtype} {names.shape}, "
-                                  "expected one row of text")  # fmt: skip
+        raise BlendShapeFileError(
+            f"{path}: shape_names: got {names.dtype} {names.shape}, expected one row of text"
+        )
     if len(set(names.tolist())) != names.size:
         raise BlendShapeFileError(f"{path}: shape_names: got a name twice")
     for key in ("vertices_mm", "uv", "shape_deltas_mm"):

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skinrig.arrays import Float64Array, Int64Array
 from skinrig.blend_shapes.errors import BlendShapeFileError
 
-Floats = NDArray[np.float64]
 NEUTRAL = "neutral"
 """Stem of the neutral file of a folder, in any case."""
 
@@ -24,15 +23,15 @@ NEUTRAL = "neutral"
 class ObjMesh:
     """What an OBJ file holds, as it is indexed there."""
 
-    positions: Floats
-    texture: Floats
-    corners: NDArray[np.int64]
+    positions: Float64Array
+    texture: Float64Array
+    corners: Int64Array
     """Triangles, (F, 3, 2): position and texture index of each corner."""
 
 
 def read(
     path: Path, shapes: Mapping[str, Path] | None
-) -> tuple[Floats, Floats, NDArray[np.int64], dict[str, Floats]]:
+) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
     """Read a neutral OBJ and its shapes.
 
     Parameters

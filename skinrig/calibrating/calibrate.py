@@ -9,7 +9,6 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration import polarization, sensor, store
@@ -18,11 +17,10 @@ from capture.calibration.color import matrix as color
 from capture.calibration.fiber.phantom import read_certificate
 from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.session import FrameRecord, Session
+from skinrig.arrays import Float32Array
 from skinrig.calibrating import dome, gradient, probe, white_tile
 
-KINDS = (
-    "sensor", "color", "polarization", "white", *dome.KINDS, probe.KIND
-)  # fmt: skip
+KINDS = ("sensor", "color", "polarization", "white", *dome.KINDS, probe.KIND)
 
 
 class CalibratingError(ValueError):
@@ -156,7 +154,7 @@ class _Frames:
                 " (`skinrig capture flash --target ...`)"
             ) from None
 
-    def dark_level(self) -> NDArray[np.float32] | float:
+    def dark_level(self) -> Float32Array | float:
         """Return what a frame without light shows above its black level, (h, w, 3)."""
         darks = [raw.linear_rgb(frame, demosaic="centered").rgb for _, frame in self.of("dark")]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0

@@ -8,7 +8,6 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration import geometry, store
@@ -19,10 +18,10 @@ from capture.calibration.lights.white_plate import PlateSamples, PlateWindow, Wh
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
+from skinrig.arrays import Float64Array
 
 KINDS = ("geometry", "lights")
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
-Vector = NDArray[np.float64]
 
 
 class DomeCalibratingError(ValueError):
@@ -139,10 +138,13 @@ def _geometry(
         center, error = camera.center_mm, np.sqrt(np.diag(found.center_covariance_mm2[name]))
         place = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
         focal, focal_error = camera.matrix[0, 0], camera.matrix_stderr[0, 0]
-        summary.append((
-            f"{name} ({camera.serial})",
-            f"{found.rms_px[name]:.3f} px; centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px",
-        ))  # fmt: skip
+        summary.append(
+            (
+                f"{name} ({camera.serial})",
+                f"{found.rms_px[name]:.3f} px; centre {place} mm; "
+                f"f {focal:.1f} ± {focal_error:.1f} px",
+            )
+        )
     calibration = geometry.to_calibration(
         found.cameras,
         rig=rig.name,
@@ -209,12 +211,18 @@ def _lights(
         lit = table.intensity[table.valid]
         relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
         summary += [
-            ("lights measured", f"{int((table.intensity > 0).all(axis=1).sum())} of"
-             f" {len(rig.lights)}, in {fit.frames} frames"),
-            ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and"
-             f" {100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance)"),
+            (
+                "lights measured",
+                f"{int((table.intensity > 0).all(axis=1).sum())} of"
+                f" {len(rig.lights)}, in {fit.frames} frames",
+            ),
+            (
+                "standard error of an intensity",
+                f"{100 * np.median(relative):.2f} % (and"
+                f" {100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance)",
+            ),
             ("residual of the plate's parts", f"{100 * fit.residual:.2f} %"),
-        ]  # fmt: skip
+        ]
         for serial, response in table.cameras.items():
             gain = ", ".join(f"{g:.4f}" for g in response.gain)
             corner = 1 + float(response.vignetting.sum())
@@ -242,8 +250,8 @@ def _mirror(
     what: DomeTargets,
 ) -> mirror_lights.LightPlaces:
     """Return the lights' places from the frames of mirror spheres."""
-    outlines: dict[int, dict[str, Vector]] = {}
-    colors: dict[str, Vector] = {}
+    outlines: dict[int, dict[str, Float64Array]] = {}
+    colors: dict[str, Float64Array] = {}
     for number, session, record in _frames(sessions, "mirror"):
         if record.index.get("light") != "outline":
             continue
@@ -294,9 +302,7 @@ def _lit(record: FrameRecord) -> tuple[str, ...]:
 
 
 def _white(
-    sessions: Sequence[Session],
-    cameras: Mapping[str, geometry.CameraPose],
-    what: DomeTargets,
+    sessions: Sequence[Session], cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
 ) -> list[PlateSamples]:
     """Return the parts of the white plate in all frames lit by one light."""
     markers: dict[tuple[str, int], Sighting] = {}
@@ -330,7 +336,13 @@ def _white(
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
         samples.append(
-            window.sample(shot.rgb, shot.variance, shot.valid, view=record.camera,
-                          light=str(record.settings["light"]), on_s=on_s)
-        )  # fmt: skip
+            window.sample(
+                shot.rgb,
+                shot.variance,
+                shot.valid,
+                view=record.camera,
+                light=str(record.settings["light"]),
+                on_s=on_s,
+            )
+        )
     return samples

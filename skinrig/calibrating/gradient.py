@@ -9,7 +9,6 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration import sensor, store
 from capture.calibration.fiber.spot_photometry import Shot, shot
@@ -18,6 +17,7 @@ from capture.calibration.record import Quantity
 from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.raw import RawFrame
 from capture.session import FrameRecord, Session
+from skinrig.arrays import Float32Array, Float64Array, UInt16Array
 
 KINDS = ("sensor", "lights", "polarization")
 READING_DEG = {"parallel": 0.0, "crossed": 90.0}
@@ -139,16 +139,16 @@ def _survey(
     return survey_sphere(shots, rig, view=rig.views[0].name, target=target), notes
 
 
-def _shots(sessions: Sequence[Session], flat: NDArray[np.float64] | float) -> Iterator[Shot]:
+def _shots(sessions: Sequence[Session], flat: Float64Array | float) -> Iterator[Shot]:
     """Yield the exposures of the lit ball, the dark of their own exposure time taken off."""
-    darks: dict[float, list[NDArray[np.float32]]] = defaultdict(list)
+    darks: dict[float, list[Float32Array]] = defaultdict(list)
     lit: list[tuple[FrameRecord, Session]] = []
     for record, session in _frames(sessions, "ball"):
         if record.settings.get("pattern") == "dark":
             darks[float(record.settings["exposure_s"])].append(_above_black(session.read(record)))
         elif record.settings.get("pattern") == "full" and float(record.settings["level"]) > 0:
             lit.append((record, session))
-    means: dict[float, NDArray[np.float32]] = {
+    means: dict[float, Float32Array] = {
         time: np.mean(stack, axis=0, dtype=np.float32) for time, stack in darks.items()
     }
     for record, session in lit:
@@ -167,7 +167,7 @@ def _shots(sessions: Sequence[Session], flat: NDArray[np.float64] | float) -> It
         )
 
 
-def _above_black(frame: RawFrame) -> NDArray[np.float32]:
+def _above_black(frame: RawFrame) -> Float32Array:
     black = np.float32(frame.black[0])
     return (frame.cfa.astype(np.float32) - black) / (np.float32(frame.white) - black)
 
@@ -179,7 +179,7 @@ def _reading_deg(record: FrameRecord) -> float:
 
 def _flat_field(
     folder: Path, session: Session, created: date
-) -> tuple[NDArray[np.float64] | float, tuple[str, ...]]:
+) -> tuple[Float64Array | float, tuple[str, ...]]:
     """Return the camera's flat field, from the folder's sensor calibration where there is one."""
     view = session.rig.views[0]
     try:
@@ -197,7 +197,7 @@ def _flat_field(
 
 
 def _sensor(sessions: Sequence[Session], created: date) -> GradientCalibration:
-    by_light: dict[float, list[NDArray[np.uint16]]] = defaultdict(list)
+    by_light: dict[float, list[UInt16Array]] = defaultdict(list)
     frames = _frames(sessions, "flat")
     first = frames[0][1].read(frames[0][0])
     for record, session in frames:
@@ -257,14 +257,13 @@ def _lights_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
         ("ball's radius", f"{ball.radius_mm:.3f} ± {error[3]:.3f} mm"),
         ("lights seen", f"{int(table.seen.sum())} of {len(table.names)}"),
         ("lights off their places", f"{survey.light_scatter_mm:.2f} mm"),
+        ("standard error of a direction", f"{np.median(angle):.3f}°, worst {angle.max():.3f}°"),
         (
-            "standard error of a direction",
-            f"{np.median(angle):.3f}°, worst {angle.max():.3f}°",
+            "intensities measured",
+            f"{int(shining.sum())}, scatter {100 * np.std(table.intensities[shining]):.1f} %",
         ),
-        ("intensities measured", f"{int(shining.sum())}, scatter"
-         f" {100 * np.std(table.intensities[shining]):.1f} %"),
         ("standard error of an intensity", f"{np.median(share):.2f} %, worst {share.max():.1f} %"),
-    )  # fmt: skip
+    )
 
 
 def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
@@ -273,14 +272,25 @@ def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     leaked, glass = films.leakage, films.glass_leakage[films.valid]
     return (
         ("analyser's misalignment", f"{zero:+.3f}° ± {error:.3f}°"),
-        ("extinction of the lights' films", f"{1 / films.light_leak:.0f} : 1 (leak"
-         f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})"),
-        ("extinction of the analyser", f"{1 / films.analyser_leak:.0f} : 1 (leak"
-         f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})"),
+        (
+            "extinction of the lights' films",
+            f"{1 / films.light_leak:.0f} : 1 (leak"
+            f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})",
+        ),
+        (
+            "extinction of the analyser",
+            f"{1 / films.analyser_leak:.0f} : 1 (leak"
+            f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})",
+        ),
         ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f}°"),
-        ("glass leaks crossed", f"median {100 * np.median(glass):.2f} %, most"
-         f" {100 * glass.max():.1f} % of parallel"),
-        (f"skin (eta {films.eta:g}) will leak", f"median {100 * np.median(leaked):.3f} %, 9 of 10"
-         f" lights below {100 * np.quantile(leaked, 0.9):.2f} %"),
+        (
+            "glass leaks crossed",
+            f"median {100 * np.median(glass):.2f} %, most {100 * glass.max():.1f} % of parallel",
+        ),
+        (
+            f"skin (eta {films.eta:g}) will leak",
+            f"median {100 * np.median(leaked):.3f} %, 9 of 10"
+            f" lights below {100 * np.quantile(leaked, 0.9):.2f} %",
+        ),
         ("readings of the analyser", ", ".join(f"{r:g}" for r in survey.readings_deg)),
-    )  # fmt: skip
+    )

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.fiber.phantom import (
     CertificateError,
@@ -17,6 +16,7 @@ from capture.calibration.fiber.phantom import (
 )
 from capture.rig import Rig
 from model import photon_table, spectra
+from skinrig.arrays import Float64Array
 
 
 def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedReflectance:
@@ -67,9 +67,13 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
     try:
         held = photon_table.domain(radius, sigma_a[:, None], sigma_s[:, None], **how)
         slopes = photon_table.derivatives(
-            radius, sigma_a[:, None], sigma_s[:, None], core_mm=probe.fibres[0].core_mm,
-            source_core_mm=probe.source_core_mm, **how,
-        )  # fmt: skip
+            radius,
+            sigma_a[:, None],
+            sigma_s[:, None],
+            core_mm=probe.fibres[0].core_mm,
+            source_core_mm=probe.source_core_mm,
+            **how,
+        )
         own = photon_table.relative_error(radius, sigma_a[:, None], sigma_s[:, None], **how)
     except photon_table.TableDomainError as exc:
         raise CertificateError(f"phantom: {exc}") from exc
@@ -80,7 +84,7 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
             f" {sigma_s.min():g} to {sigma_s.max():g} per mm); use one like skin"
         )
 
-    def band(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def band(values: Float64Array) -> Float64Array:
         return np.asarray(values.T @ weights)
 
     value = slopes.reflectance_per_mm2

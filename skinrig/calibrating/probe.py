@@ -293,13 +293,18 @@ def _summary(
     spots, mixed = fibres.spots, fibres.crosstalk
     count = len(fibres.names)
     rows = [
-        ("spots found", f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
-         f" {spots.shift_px[1]:+.2f} px off their places, row turned"
-         f" {np.degrees(spots.rotation_rad):+.2f}°"),
+        (
+            "spots found",
+            f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
+            f" {spots.shift_px[1]:+.2f} px off their places, row turned"
+            f" {np.degrees(spots.rotation_rad):+.2f}°",
+        ),
         ("standard error of a place", f"worst {spots.center_stderr_px[spots.found].max():.3f} px"),
-        ("radius of spots, of apertures", f"{spots.radius_px[spots.found].mean():.2f},"
-         f" {spots.aperture_px:.2f} px"),
-    ]  # fmt: skip
+        (
+            "radius of spots, of apertures",
+            f"{spots.radius_px[spots.found].mean():.2f}, {spots.aperture_px:.2f} px",
+        ),
+    ]
     for c, color in enumerate(("red", "green", "blue")[: fibres.gain.shape[1]]):
         good = fibres.valid[:, c]
         if not good.any():
@@ -312,32 +317,47 @@ def _summary(
         shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
         worst = int(np.flatnonzero(good)[np.argmax(error)])
         rows.append(
-            (f"gain {color}", f"{gain.min() / np.median(gain):.2f} to"
-             f" {gain.max() / np.median(gain):.2f} of the usual, {int(good.sum())} fibres; standard"
-             f" error median {100 * np.median(error):.2f} %, worst {100 * error.max():.2f} %"
-             f" ({fibres.names[worst]}); in common up to {100 * shape:.1f} %")
-        )  # fmt: skip
+            (
+                f"gain {color}",
+                f"{gain.min() / np.median(gain):.2f} to"
+                f" {gain.max() / np.median(gain):.2f} of the usual, {int(good.sum())} fibres;"
+                f" standard error median {100 * np.median(error):.2f} %,"
+                f" worst {100 * error.max():.2f} %"
+                f" ({fibres.names[worst]}); in common up to {100 * shape:.1f} %",
+            )
+        )
     if mixed.measured:
         first, second = (np.diagonal(mixed.matrix, k) for k in (1, 2))
         error = np.diagonal(mixed.stderr, 1)
         rows.append(
-            ("cross-talk", f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
-             f" {first.max():.1e}, standard error {np.median(error):.0e}), next"
-             f" {np.median(second):.1e}")
-        )  # fmt: skip
+            (
+                "cross-talk",
+                f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
+                f" {first.max():.1e}, standard error {np.median(error):.0e}), next"
+                f" {np.median(second):.1e}",
+            )
+        )
         strays = np.abs(mixed.offset).max()
         strays_error = np.hypot(mixed.offset_stderr, mixed.offset_common).max()
-        rows.append(("stray light", f"at most {strays:.1e} ± {strays_error:.0e} full"
-                     " scales per second"))  # fmt: skip
-        rows.append(("covers let through", f"{mixed.cover_leak:.1e} ±"
-                     f" {mixed.cover_leak_stderr:.0e}"))  # fmt: skip
+        rows.append(
+            ("stray light", f"at most {strays:.1e} ± {strays_error:.0e} full scales per second")
+        )
+        rows.append(
+            ("covers let through", f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}")
+        )
     darks, phantom, mask = series.counts
     rows += [
-        ("dark current", f"{series.darks.mean_rate_dn_per_s:.3g} ±"
-         f" {series.darks.mean_rate_stderr:.1g} DN/s, {int(series.darks.hot.sum())} hot pixels"),
+        (
+            "dark current",
+            f"{series.darks.mean_rate_dn_per_s:.3g} ±"
+            f" {series.darks.mean_rate_stderr:.1g} DN/s, {int(series.darks.hot.sum())} hot pixels",
+        ),
         ("dead fibres", ", ".join(np.array(fibres.names)[fibres.dead]) or "none"),
         ("frames", f"{darks} dark, {phantom} phantom, {mask} mask"),
-        ("phantom", f"{paper.name or 'not named'}: uncertain by {100 * paper.uncertainty.sigma_a:g}"
-         f" % of sigma_a, {100 * paper.uncertainty.sigma_s_prime:g} % of sigma_s'"),
-    ]  # fmt: skip
+        (
+            "phantom",
+            f"{paper.name or 'not named'}: uncertain by {100 * paper.uncertainty.sigma_a:g}"
+            f" % of sigma_a, {100 * paper.uncertainty.sigma_s_prime:g} % of sigma_s'",
+        ),
+    ]
     return tuple(rows)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.sensor.transfer_curve import block_sums
+from skinrig.arrays import BoolArray, FloatArray
 
 __all__ = ["LEAST_EVEN", "NoTileError", "evenness", "examine"]
 
@@ -34,7 +34,7 @@ class NoTileError(ValueError):
     """A frame that is to show a white tile and shows something else."""
 
 
-def evenness(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> float:
+def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     """Return the share of a picture that is as even and as neutral as a lit white tile.
 
     Parameters
@@ -86,7 +86,7 @@ def evenness(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> float:
     return float(np.count_nonzero(even & whole) / np.count_nonzero(whole))
 
 
-def examine(rgb: NDArray[np.floating], valid: NDArray[np.bool_], what: str) -> tuple[str, ...]:
+def examine(rgb: FloatArray, valid: BoolArray, what: str) -> tuple[str, ...]:
     """Refuse a picture of something else than a white tile, and tell of one it does not fill.
 
     Parameters

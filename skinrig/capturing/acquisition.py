@@ -16,12 +16,7 @@ from typing import Any, Literal, cast, get_args
 from capture.devices.dome import Eyes
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
-from capture.plan.gradient import (
-    GradientTarget,
-    gradient_calibration_plan,
-    gradient_plan,
-    state_of,
-)
+from capture.plan.gradient import GradientTarget, gradient_calibration_plan, gradient_plan, state_of
 from capture.plan.probe import SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
@@ -157,9 +152,10 @@ def sequence_of(
             )
         return None
     for option, text in (
-        ("--prompt-period", prompt_period), ("--shot-period", shot_period),
+        ("--prompt-period", prompt_period),
+        ("--shot-period", shot_period),
         ("--duration", duration),
-    ):  # fmt: skip
+    ):
         if text is not None:
             _seconds(text, option)
     order = SequenceOrder(
@@ -267,10 +263,7 @@ def _dome_plan(rig: Rig, target: str | None) -> Plan:
 
 
 def _gradient_plan(
-    rig: Rig,
-    target: str | None,
-    angles: Sequence[float] | None,
-    steps: tuple[int, int] | None,
+    rig: Rig, target: str | None, angles: Sequence[float] | None, steps: tuple[int, int] | None
 ) -> Plan:
     if target is None:
         return gradient_plan(rig, angles=angles, steps=steps)
@@ -379,9 +372,16 @@ def capture_session(
         raise UnusableError(f"--force-limit: got {force_limit_n:g}, expected more than 0 newton")
     rig = load_rig(rig_name)
     chosen = choose_plan(
-        rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats,
-        sequence=sequence, states=states,
-    )  # fmt: skip
+        rig,
+        plan,
+        target,
+        angles=angles,
+        steps=steps,
+        sites=sites,
+        repeats=repeats,
+        sequence=sequence,
+        states=states,
+    )
     seconds = chosen.estimated_s(rig)
     needed = needed_boxes(rig, chosen)
     if not dry_run:
@@ -409,18 +409,32 @@ def capture_session(
     if out is None or dry_run:
         console.rows(
             ("step", "kind", "settings"),
-            [(s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
-             for s in chosen.steps],
-        )  # fmt: skip
+            [
+                (s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
+                for s in chosen.steps
+            ],
+        )
         return {
-            "steps": len(chosen.steps), "estimated_s": seconds, "captured": 0, "light": light,
+            "steps": len(chosen.steps),
+            "estimated_s": seconds,
+            "captured": 0,
+            "light": light,
             "plan": chosen.to_json(),
-        }  # fmt: skip
+        }
     box_urls = {name: box_urls[name] for name in needed}
     return _run(
-        rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes, force_limit_n,
+        rig,
+        chosen,
+        out,
+        box_urls,
+        camera_urls,
+        subject,
+        resume,
+        console,
+        eyes,
+        force_limit_n,
         all_brackets,
-    )  # fmt: skip
+    )
 
 
 def _run(
@@ -447,9 +461,12 @@ def _run(
     from capture.devices.probe import ProbeBox
 
     drivers: Mapping[str, type[Box]] = {
-        "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox,
-        "caliper": CaliperBox, "probe": ProbeBox,
-    }  # fmt: skip
+        "flash": FlashBox,
+        "dome": DomeBox,
+        "gradient_sphere": GradientSphereBox,
+        "caliper": CaliperBox,
+        "probe": ProbeBox,
+    }
 
     def open_box(kind: str) -> Box:
         return drivers[kind](Port(box_urls[kind]))
@@ -475,20 +492,33 @@ def _run(
         else:
             fresh = not out.exists()
             session = Session.create(
-                out, plan=plan, rig=rig,
-                devices={**box_urls,
-                         **{name: camera.info.serial for name, camera in opened.items()}},
-                subject=subject, source=_source(next(iter(boxes.values())).identify()),
-            )  # fmt: skip
+                out,
+                plan=plan,
+                rig=rig,
+                devices={
+                    **box_urls,
+                    **{name: camera.info.serial for name, camera in opened.items()},
+                },
+                subject=subject,
+                source=_source(next(iter(boxes.values())).identify()),
+            )
             stack.enter_context(_unless_used(session, fresh, console))
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
-                plan, rig, boxes=boxes, cameras=opened, session=session,
-                progress=console.progress, prompt=partial(ask, console.progress),
-                interrupted=stopped, eyes=eyes, force_limit_n=force_limit_n,
-                all_brackets=all_brackets, signal=partial(sound, console.progress),
-            )  # fmt: skip
+                plan,
+                rig,
+                boxes=boxes,
+                cameras=opened,
+                session=session,
+                progress=console.progress,
+                prompt=partial(ask, console.progress),
+                interrupted=stopped,
+                eyes=eyes,
+                force_limit_n=force_limit_n,
+                all_brackets=all_brackets,
+                signal=partial(sound, console.progress),
+            )
         session.close()
         left_out = dict(session.left_out())
     if done.dead_lights:
@@ -498,10 +528,14 @@ def _run(
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {named(out)}")
     return {
-        "session": out, "captured": done.frames, "retakes": done.retakes,
-        "stale_frames": done.stale, "steps": len(plan.steps), "dead_lights": done.dead_lights,
+        "session": out,
+        "captured": done.frames,
+        "retakes": done.retakes,
+        "stale_frames": done.stale,
+        "steps": len(plan.steps),
+        "dead_lights": done.dead_lights,
         "left_out": left_out,
-    }  # fmt: skip
+    }
 
 
 def ask(progress: Callable[[str], None], what: str) -> None:

@@ -66,26 +66,41 @@ def analyse_brdf(
     console = Console(json)
     if appearances:
         found = analysing_brdf.analyse_measured(
-            out, appearances, labels=labels, basis=basis,
-            points_each=points or analysing_brdf.POINTS_B, method=how, seed=seed,
-        )  # fmt: skip
+            out,
+            appearances,
+            labels=labels,
+            basis=basis,
+            points_each=points or analysing_brdf.POINTS_B,
+            method=how,
+            seed=seed,
+        )
     elif labels is not None or basis is not None:
         raise UsageError("--labels, --basis: are of measured faces; name their folders")
     else:
         some = points or analysing_brdf.POINTS_A
         found = analysing_brdf.analyse_simulated(
-            out, points=some, points_each=max(1, round(0.4 * some)), method=how, seed=seed,
+            out,
+            points=some,
+            points_each=max(1, round(0.4 * some)),
+            method=how,
+            seed=seed,
             progress=console.progress,
-        )  # fmt: skip
+        )
     documents = [one.document() for one in found]
     console.rows(
         ("points of", "needs", "by 2 %", "by 10 %", "to noise", "error", "others", "noise"),
         [
-            (d["name"], str(d["plateau"]), str(d["plateau_by_share"]["0.02"]),
-             str(d["plateau_by_share"]["0.1"]), str(d["rank_at_noise"] or "-"), *_at_plateau(d))
+            (
+                d["name"],
+                str(d["plateau"]),
+                str(d["plateau_by_share"]["0.02"]),
+                str(d["plateau_by_share"]["0.1"]),
+                str(d["rank_at_noise"] or "-"),
+                *_at_plateau(d),
+            )
             for d in documents
         ],
-    )  # fmt: skip
+    )
     for document in documents:
         for rank, why in document["left_out"]:
             console.say(f"left out: {document['name']}, {rank} lobes and more: {why}")

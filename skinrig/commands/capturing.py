@@ -32,8 +32,7 @@ from skinrig.console import Console, counted
 
 def capture(
     rig: Annotated[
-        str,
-        typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=completion.rigs),
+        str, typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=completion.rigs)
     ],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
     port: Annotated[
@@ -94,15 +93,27 @@ def capture(
 
     console = Console(json)
     done = capture_session(
-        rig, out, ports=port or [], cameras=camera or [], plan=plan, target=target,
-        subject=subject_of(subject, consent, consent_expires), dry_run=dry_run,
-        plan_out=plan_out, resume=resume, console=console, eyes=eyes_of(eyes),
-        force_limit_n=force_limit, angles=numbers_of(angles, "--angles"),
-        steps=range_of(steps, "--steps"), sites=names_of(sites), repeats=repeats,
+        rig,
+        out,
+        ports=port or [],
+        cameras=camera or [],
+        plan=plan,
+        target=target,
+        subject=subject_of(subject, consent, consent_expires),
+        dry_run=dry_run,
+        plan_out=plan_out,
+        resume=resume,
+        console=console,
+        eyes=eyes_of(eyes),
+        force_limit_n=force_limit,
+        angles=numbers_of(angles, "--angles"),
+        steps=range_of(steps, "--steps"),
+        sites=names_of(sites),
+        repeats=repeats,
         all_brackets=all_brackets,
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         states=tuple(state or ()),
-    )  # fmt: skip
+    )
     console.document("skinrig.capture/1", done)
 
 
@@ -140,9 +151,17 @@ def serve(
     from skinrig.simulating.serving import serve_rig
 
     serve_rig(
-        rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed,
-        site=site, resume=resume, as_json=json,
-    )  # fmt: skip
+        rig,
+        pty=pty,
+        tcp=tcp,
+        allow_remote=anywhere,
+        subject=subject,
+        size=size,
+        seed=seed,
+        site=site,
+        resume=resume,
+        as_json=json,
+    )
 
 
 def verify(
@@ -166,8 +185,13 @@ def verify(
     )
     console.document(
         "skinrig.verify/1",
-        {"ok": found.ok, "problems": found.problems, "warnings": found.warnings,
-         "frames": found.frames, "bytes": found.bytes},
-    )  # fmt: skip
+        {
+            "ok": found.ok,
+            "problems": found.problems,
+            "warnings": found.warnings,
+            "frames": found.frames,
+            "bytes": found.bytes,
+        },
+    )
     if not found.ok:
         raise typer.Exit(errors.BAD_INPUT)

@@ -23,8 +23,7 @@ Mesh = Annotated[
 Size = Annotated[int, typer.Option(help="Pixels a side of the displacement map.")]
 At = Annotated[str | None, typer.Option("--site", help="Whose microrelief; default: the first.")]
 Synthesize = Annotated[
-    str,
-    typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space)."),
+    str, typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space).")
 ]
 Extrapolate = Annotated[
     str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
@@ -61,9 +60,14 @@ def fit_facial_color(
 
     console = Console(json)
     found = fit(
-        sessions, out=out, calibration=calibration, landmarks=landmarks, radius_px=radius,
-        stored_size=stored_size, progress=console.progress,
-    )  # fmt: skip
+        sessions,
+        out=out,
+        calibration=calibration,
+        landmarks=landmarks,
+        radius_px=radius,
+        stored_size=stored_size,
+        progress=console.progress,
+    )
     rows = summary(found)
     console.rows(
         ("state", "change of blood, points", "change, %", "median scale", "place error, px"), rows
@@ -76,10 +80,15 @@ def fit_facial_color(
     console.say(f"next: skinrig apply expression {named(out)} --weights {last}=1 --out {last}")
     console.document(
         "skinrig.fit/1",
-        {"model": "facial_color", "out": out, "states": list(found.hemoglobin),
-         "radius_px": found.rig.radius_px, "left_out": [list(row) for row in found.left_out],
-         "rows": [list(row) for row in rows]},
-    )  # fmt: skip
+        {
+            "model": "facial_color",
+            "out": out,
+            "states": list(found.hemoglobin),
+            "radius_px": found.rig.radius_px,
+            "left_out": [list(row) for row in found.left_out],
+            "rows": [list(row) for row in rows],
+        },
+    )
 
 
 @fit_app.command("wrinkles", cls=Command)
@@ -109,9 +118,13 @@ def fit_wrinkles(
     console.say(f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of the differences")
     console.document(
         "skinrig.fit/1",
-        {"model": "wrinkles", "out": out, "explained": found.fit.explained,
-         "rows": [list(row) for row in summary(found)]},
-    )  # fmt: skip
+        {
+            "model": "wrinkles",
+            "out": out,
+            "explained": found.fit.explained,
+            "rows": [list(row) for row in summary(found)],
+        },
+    )
 
 
 @fit_app.command("microstructure", cls=Command)
@@ -140,9 +153,12 @@ def fit_microstructure(
     )
     console.document(
         "skinrig.fit/1",
-        {"model": "microstructure", "out": out,
-         "sites": {site: one.document() for site, one in found.items()}},
-    )  # fmt: skip
+        {
+            "model": "microstructure",
+            "out": out,
+            "sites": {site: one.document() for site, one in found.items()},
+        },
+    )
 
 
 @apply_app.command("expression", cls=Command)
@@ -191,18 +207,28 @@ def apply_expression(
     given = applying.parse_weights(weights)
     wanted = PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
     expression = applying.Expression(
-        given, normalize=normalize, clamp=one_of("--clamp", clamp, ("unit", "signed")),
-        emotional=emotional, gain=gain, onto=_other_face(onto, landmarks or []),
-    )  # fmt: skip
+        given,
+        normalize=normalize,
+        clamp=one_of("--clamp", clamp, ("unit", "signed")),
+        emotional=emotional,
+        gain=gain,
+        onto=_other_face(onto, landmarks or []),
+    )
     relief = None
     one_of("--synthesize", synthesize, SOURCES)
     one_of("--extrapolate", extrapolate, EXTRAPOLATIONS)
     if mesh is not None:
         relief = Relief.of(
-            mesh, applying.normalized(expression).weights, size_px=size, site=site,
-            source=synthesize, extrapolate=extrapolate, seed=seed, out=out,
+            mesh,
+            applying.normalized(expression).weights,
+            size_px=size,
+            site=site,
+            source=synthesize,
+            extrapolate=extrapolate,
+            seed=seed,
+            out=out,
             progress=console.progress,
-        )  # fmt: skip
+        )
     done = applying.apply_expression(
         appearance, expression, out=out, parts=wanted, relief=relief, progress=console.progress
     )
@@ -233,13 +259,24 @@ def apply_microstructure(
     console = Console(json)
     given = applying.parse_weights(weights)
     relief = Relief.of(
-        mesh, given, size_px=size, site=site, source=synthesize, extrapolate=extrapolate,
-        seed=seed, out=out, progress=console.progress,
-    )  # fmt: skip
-    done = applying.apply_expression(
-        appearance, applying.Expression(given), out=out, parts=(MICROSTRUCTURE,), relief=relief,
+        mesh,
+        given,
+        size_px=size,
+        site=site,
+        source=synthesize,
+        extrapolate=extrapolate,
+        seed=seed,
+        out=out,
         progress=console.progress,
-    )  # fmt: skip
+    )
+    done = applying.apply_expression(
+        appearance,
+        applying.Expression(given),
+        out=out,
+        parts=(MICROSTRUCTURE,),
+        relief=relief,
+        progress=console.progress,
+    )
     _tell(console, out, done)
 
 
@@ -281,6 +318,10 @@ def _tell(console: Console, out: Path, done: Any) -> None:
     console.say(f"{out}: {', '.join(done.maps)}")
     console.document(
         "skinrig.apply/1",
-        {"out": out, "maps": list(done.maps), "figures": done.figures,
-         "left_out": [list(row) for row in done.left_out]},
-    )  # fmt: skip
+        {
+            "out": out,
+            "maps": list(done.maps),
+            "figures": done.figures,
+            "left_out": [list(row) for row in done.left_out],
+        },
+    )

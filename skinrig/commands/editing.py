@@ -62,16 +62,20 @@ def edit(
 
     console = Console(json)
     order = editing.Order(
-        traits=parse_amounts("--trait", trait), region=region,
+        traits=parse_amounts("--trait", trait),
+        region=region,
         parts=None if parts is None else tuple(p.strip() for p in parts.split(",")),
-        mask=mask, spots=parse_spots(spots), landmarks=landmarks, basis=basis,
-        iterations=iterations, seed=seed,
-    )  # fmt: skip
+        mask=mask,
+        spots=parse_spots(spots),
+        landmarks=landmarks,
+        basis=basis,
+        iterations=iterations,
+        seed=seed,
+    )
     library, digest = regions.load(space) if order.traits else (None, "")
     done = editing.edit(
-        appearance, order, out=out, library=library, library_hash=digest,
-        progress=console.progress,
-    )  # fmt: skip
+        appearance, order, out=out, library=library, library_hash=digest, progress=console.progress
+    )
     rows = [
         (part, key, value)
         for part in editing.PARTS
@@ -95,8 +99,7 @@ def fit_traits(
         list[Path], typer.Argument(help="Fitted maps of the dome, a face each.")
     ],
     labels: Annotated[
-        Path,
-        typer.Option(help="Table name,TRAIT,...: 0 or 1 whether a face has it, or a value."),
+        Path, typer.Option(help="Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.")
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write, such as traits.npz.")],
     landmarks: Annotated[
@@ -128,10 +131,17 @@ def fit_traits(
     one_of("--vectors", vectors, ("quantiles", "histograms"))
     one_of("--contrast", contrast, ("means", "regression"))
     found = fit(
-        appearances, labels, out=out, landmarks=landmarks, vectors=vectors,  # type: ignore[arg-type]
-        contrast=contrast, size=size, basis=basis, seed=seed,  # type: ignore[arg-type]
+        appearances,
+        labels,
+        out=out,
+        landmarks=landmarks,
+        vectors=vectors,  # type: ignore[arg-type]
+        contrast=contrast,  # type: ignore[arg-type]
+        size=size,
+        basis=basis,
+        seed=seed,
         progress=console.progress,
-    )  # fmt: skip
+    )
     head = ("part", "trait", "with", "without", "p value", "cosine to the true one")
     console.rows(head, found.rows)
     for text in found.warnings:
@@ -148,11 +158,25 @@ def fit_traits(
     )
     console.document(
         "skinrig.fit/1",
-        {"model": "traits", "out": out, "faces": found.faces, "traits": names,
-         "rows": [dict(zip(("part", "trait", "with", "without", "p_value", "expected_cosine"), row,
-                           strict=True)) for row in found.rows],
-         "warnings": found.warnings, "left_out": [list(row) for row in found.left_out]},
-    )  # fmt: skip
+        {
+            "model": "traits",
+            "out": out,
+            "faces": found.faces,
+            "traits": names,
+            "rows": [
+                dict(
+                    zip(
+                        ("part", "trait", "with", "without", "p_value", "expected_cosine"),
+                        row,
+                        strict=True,
+                    )
+                )
+                for row in found.rows
+            ],
+            "warnings": found.warnings,
+            "left_out": [list(row) for row in found.left_out],
+        },
+    )
 
 
 def analyse_albedo(
@@ -184,9 +208,13 @@ def analyse_albedo(
     console = Console(json)
     if appearances:
         found = analysing_albedo.analyse_measured(
-            out, appearances, labels=labels, landmarks=landmarks, size=size,
+            out,
+            appearances,
+            labels=labels,
+            landmarks=landmarks,
+            size=size,
             progress=console.progress,
-        )  # fmt: skip
+        )
     elif labels is not None or landmarks is not None:
         raise UsageError("--labels, --landmarks: are of measured faces; name their folders")
     else:

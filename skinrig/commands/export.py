@@ -36,8 +36,7 @@ def export(
     ],
     out: Out,
     use: Annotated[
-        str | None,
-        typer.Option(help="What the copy is for; the subjects' consent must cover it."),
+        str | None, typer.Option(help="What the copy is for; the subjects' consent must cover it.")
     ] = None,
     unit: Annotated[
         str | None, typer.Option(help="Scene unit: m (default), cm or mm (mtlx, usd).")
@@ -104,8 +103,9 @@ def export(
     of_maps = (*appearances.FORMATS, *brdfs.SUFFIX)
     of_sessions = tuple(name for name in known if name not in of_maps)
     for file, kind, fitting in (
-        ("session.json", "a session", of_sessions), ("appearance.json", "maps", of_maps),
-    ):  # fmt: skip
+        ("session.json", "a session", of_sessions),
+        ("appearance.json", "maps", of_maps),
+    ):
         if (source / file).is_file() and to not in fitting:
             raise UnusableError(
                 f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
@@ -148,6 +148,12 @@ def export(
     console.say(f"next: {after}")
     console.document(
         "skinrig.export/1",
-        {"path": done.path, "files": done.files, "manifest": done.manifest, "to": to, "next": after,
-         "left_out": [list(row) for row in done.left_out]},
-    )  # fmt: skip
+        {
+            "path": done.path,
+            "files": done.files,
+            "manifest": done.manifest,
+            "to": to,
+            "next": after,
+            "left_out": [list(row) for row in done.left_out],
+        },
+    )

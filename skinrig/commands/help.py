@@ -10,12 +10,14 @@ from typer.core import TyperCommand, TyperGroup
 
 SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Begin", ("demo", "doctor")),
-    ("Capture, on a rig or its simulation",
-     ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify")),
+    (
+        "Capture, on a rig or its simulation",
+        ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify"),
+    ),
     ("From captures to models", ("reconstruct", "fit", "apply", "edit", "analyse")),
     ("Look, and hand on", ("report", "view", "render", "export")),
     ("Measure", ("bench",)),
-)  # fmt: skip
+)
 OTHER: Final = "More"
 
 

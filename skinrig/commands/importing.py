@@ -95,9 +95,15 @@ def import_mesh(
     console.say(f"next: skinrig {after if done.reopened else f'verify {named(done.path)}'}")
     console.document(
         "skinrig.import/1",
-        {"path": done.path, "vertices": done.vertices, "faces": done.faces,
-         "has_uv": done.has_uv, "extent_mm": done.extent_mm, "reopened": done.reopened},
-    )  # fmt: skip
+        {
+            "path": done.path,
+            "vertices": done.vertices,
+            "faces": done.faces,
+            "has_uv": done.has_uv,
+            "extent_mm": done.extent_mm,
+            "reopened": done.reopened,
+        },
+    )
 
 
 @import_app.command("lp", cls=Command)
@@ -125,9 +131,13 @@ def import_lp(
 
     console = Console(json)
     done = import_light_list(
-        directory, out=out, lights=lights, mask=mask,
-        encoding=encoding, mm_per_px=mm_per_px,  # type: ignore[arg-type]
-    )  # fmt: skip
+        directory,
+        out=out,
+        lights=lights,
+        mask=mask,
+        encoding=encoding,  # type: ignore[arg-type]
+        mm_per_px=mm_per_px,
+    )
     for text in done.assumed:
         console.say(f"assumed: {text}")
     console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")

@@ -10,9 +10,7 @@ import typer
 
 from skinrig import errors
 from skinrig.commands import completion
-from skinrig.commands.options import (
-    Json,
-)
+from skinrig.commands.options import Json
 from skinrig.console import Console
 from skinrig.waiting_threads import wait_asleep
 

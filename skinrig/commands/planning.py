@@ -46,8 +46,7 @@ def plan(
         Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", callback=file_to_write, help="File for the plan, JSON."),
+        Path | None, typer.Option("--out", callback=file_to_write, help="File for the plan, JSON.")
     ] = None,
     confirm: Annotated[
         Path | None,
@@ -72,9 +71,15 @@ def plan(
         raise errors.UnusableError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
     unused = unseen(subject, rig, console.progress)
     choice = choose(
-        rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
-        valid_share=valid_share, forecast=forecast,
-    )  # fmt: skip
+        rig,
+        want,
+        subject=subject,
+        seed=seed,
+        width_px=width,
+        most_lights=most_lights,
+        valid_share=valid_share,
+        forecast=forecast,
+    )
     for line in lines(choice):
         console.say(line)
     document = choice.to_document()

@@ -9,10 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import (
-    Json,
-    Out,
-)
+from skinrig.commands.options import Json, Out
 from skinrig.console import Console, counted
 from skinrig.errors import UnusableError
 from skinrig.next_steps import named
@@ -58,9 +55,13 @@ def calibrate(
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
     console.document(
         "skinrig.calibrate/1",
-        {"path": done.path, "values": dict(done.summary), "findings": done.findings,
-         "drift": [str(d) for d in done.drift]},
-    )  # fmt: skip
+        {
+            "path": done.path,
+            "values": dict(done.summary),
+            "findings": done.findings,
+            "drift": [str(d) for d in done.drift],
+        },
+    )
 
 
 def check_rank(rank: int | None, basis: Path | None) -> None:
@@ -145,10 +146,19 @@ def reconstruct(
         if len(sessions) > 1:
             console.say(f"{session}:")
         done = pipeline.reconstruct(
-            session, want=wants, out=folder, calibration=calibration, state=state, scan=scan,
-            basis=basis, landmarks=landmarks, progress=console.progress,
-            truth=truth.name if truth else "", hold_out=hold_out, rank=rank,
-        )  # fmt: skip
+            session,
+            want=wants,
+            out=folder,
+            calibration=calibration,
+            state=state,
+            scan=scan,
+            basis=basis,
+            landmarks=landmarks,
+            progress=console.progress,
+            truth=truth.name if truth else "",
+            hold_out=hold_out,
+            rank=rank,
+        )
         for text in done.assumed:
             console.say(f"assumed: {text}")
         console.say(f"run: {', '.join(done.ran) or 'nothing'}")
@@ -156,13 +166,18 @@ def reconstruct(
         for what, why in done.left_out:
             console.say(f"left out: {what} ({why})")
         made.append(
-            {"path": folder, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
-             "assumed": done.assumed, "work": [dict(w) for w in done.work]}
-        )  # fmt: skip
+            {
+                "path": folder,
+                "ran": done.ran,
+                "reused": done.reused,
+                "left_out": done.left_out,
+                "assumed": done.assumed,
+                "work": [dict(w) for w in done.work],
+            }
+        )
     console.say(f"next: skinrig report {named(out)}")
     console.document(
-        "skinrig.reconstruct/1",
-        made[0] if len(made) == 1 else {"path": out, "appearances": made},
+        "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )
 
 

@@ -21,12 +21,13 @@ def fit_reflectance(
     landmarks: Annotated[
         Path | None,
         typer.Option(
-            "--landmarks", "--sites",
+            "--landmarks",
+            "--sites",
             help="Table name,x,y of the probe's sites in texels of the dome's maps.",
         ),
     ] = None,
     json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Put lobes, albedo, normals and translucency of a subject together as one model.
 
     Example: skinrig fit reflectance appearance-dome appearance-probe --out model
@@ -49,7 +50,11 @@ def fit_reflectance(
     console.say(f"next: skinrig render {named(out)} --light 1,1,2 --out picture")
     console.document(
         "skinrig.fit/1",
-        {"model": "reflectance", "out": out, "assumed": list(found.assumed),
-         "left_out": [list(row) for row in found.left_out],
-         "rows": [list(row) for row in rows]},
-    )  # fmt: skip
+        {
+            "model": "reflectance",
+            "out": out,
+            "assumed": list(found.assumed),
+            "left_out": [list(row) for row in found.left_out],
+            "rows": [list(row) for row in rows],
+        },
+    )

@@ -25,8 +25,7 @@ Lights = Annotated[
 
 def render(
     appearance: Annotated[
-        list[Path],
-        typer.Argument(help="Fitted maps of the dome, with lobes; several for --bases."),
+        list[Path], typer.Argument(help="Fitted maps of the dome, with lobes; several for --bases.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write.")],
     view: Views = "0,0,700",
@@ -140,10 +139,17 @@ def render(
         from skinrig.rendering.photographs import evaluation
 
         found = evaluation.evaluate_folders(
-            appearance[0], against, out, calibration=calibration, translucency=translucency,
+            appearance[0],
+            against,
+            out,
+            calibration=calibration,
+            translucency=translucency,
             subsurface=subsurface,  # type: ignore[arg-type]
-            count=photographs, ablation=ablation, seed=seed, progress=console.progress,
-        )  # fmt: skip
+            count=photographs,
+            ablation=ablation,
+            seed=seed,
+            progress=console.progress,
+        )
         evaluation.tell(console, found)
         if not found["passed"]:
             raise typer.Exit(errors.LIMIT_MISSED)
@@ -156,9 +162,13 @@ def render(
     stage = Stage.of(rig, calibration)
     camera = stage.camera(view, size_px=size, target_mm=target, fov_deg=fov)
     lights = lights_of(
-        stage, light or (), radius_mm=light_radius, environment=environment,
-        environment_count=environment_lights, seed=seed,
-    )  # fmt: skip
+        stage,
+        light or (),
+        radius_mm=light_radius,
+        environment=environment,
+        environment_count=environment_lights,
+        seed=seed,
+    )
     subjects = [
         figures.Subject.of(path, mesh=mesh, translucency=translucency) for path in appearance
     ]
@@ -202,11 +212,15 @@ def _tell(console: Console, done: dict[str, Any]) -> None:
         console.rows(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
             [
-                (row["skin"], row["name"].replace("_", " ") if row["sigma_tr_per_mm"] is None
-                 else ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"]),
-                 *row["rise_mm"])
+                (
+                    row["skin"],
+                    row["name"].replace("_", " ")
+                    if row["sigma_tr_per_mm"] is None
+                    else ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"]),
+                    *row["rise_mm"],
+                )
                 for row in done["boundaries"]
             ],
-        )  # fmt: skip
+        )
     console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
     console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

@@ -63,7 +63,10 @@ def report(
     console.document(
         "skinrig.report/1",
         {
-            "path": out, "bytes": size, "checks": len(done.checks), "missed": missed,
+            "path": out,
+            "bytes": size,
+            "checks": len(done.checks),
+            "missed": missed,
             "compared": done.compared,
         },
-    )  # fmt: skip
+    )

@@ -34,8 +34,7 @@ def simulate(
     rig: Rig,
     out: Out,
     size: Annotated[
-        str,
-        typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes),
+        str, typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes)
     ] = "small",
     width: Annotated[
         int | None, typer.Option(help="Pixels across, instead of the size; even but for gradient.")
@@ -182,20 +181,40 @@ def simulate(
     # a resumed session keeps what it was begun with, unless something else is said
     said = not resume or consent or consent_expires is not None
     done = simulate_session(
-        rig, out, size=size, width_px=width, seed=seed, subject=subject, mesh=mesh, target=target,
-        states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
-        site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
-        sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
-        movement=movement, wrapped=wrapped, progress=console.progress,
+        rig,
+        out,
+        size=size,
+        width_px=width,
+        seed=seed,
+        subject=subject,
+        mesh=mesh,
+        target=target,
+        states=tuple(state or ("neutral",)),
+        resume=resume,
+        lights=lights,
+        views=views,
+        move=move,
+        site=site,
+        angles=numbers_of(angles, "--angles"),
+        steps=range_of(steps, "--steps"),
+        sites=names_of(sites),
+        repeats=repeats,
+        all_brackets=all_brackets,
+        movement=movement,
+        wrapped=wrapped,
+        progress=console.progress,
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires)
         if said
         else None,
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
-        relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
+        relaxation_s=relaxation,
+        subsurface=subsurface,
+        interreflections=interreflections,
         conditions=amounts_of(condition, "--condition"),
-        plan=None if plan is None else read_plan(plan), leave_out=names_of(leave_out) or (),
+        plan=None if plan is None else read_plan(plan),
+        leave_out=names_of(leave_out) or (),
         nearer_mm=nearer,
-    )  # fmt: skip
+    )
     console.say(
         f"{done.session}: {counted(done.frames, 'frame')}"
         + (f", truth in {done.truth}" if done.truth else "")

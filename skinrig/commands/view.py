@@ -48,7 +48,7 @@ def view(
         int | None,
         typer.Option(
             help="Serve the page and its large displacement on this port of this machine alone, 0: "
-            "any free one, in place of writing it.",
+            "any free one, in place of writing it."
         ),
     ] = None,
     displacement: Annotated[

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skinrig.arrays import FloatArray
 from skinrig.drawing import svg
 
 COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
@@ -56,7 +56,7 @@ def plain_numbers(*log_axes: Any) -> None:
         axis.set_tick_params(which="minor", labelsize=7)
 
 
-def span_of(values: NDArray[np.floating]) -> str:
+def span_of(values: FloatArray) -> str:
     """Return the ends of what is finite, as words."""
     finite = values[np.isfinite(values)]
     return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
@@ -65,7 +65,7 @@ def span_of(values: NDArray[np.floating]) -> str:
 def bars(
     title: str,
     labels: Sequence[str],
-    series: Mapping[str, NDArray[np.floating] | Sequence[float]],
+    series: Mapping[str, FloatArray | Sequence[float]],
     *,
     unit: str,
     limits: Mapping[str, float] | None = None,
@@ -140,9 +140,16 @@ def curves(
         bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
         down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis has no room for zero
         axes.errorbar(
-            x, y, yerr=np.stack([down, bars]), fmt=style or "o", color=color, ms=4, lw=1.2,
-            elinewidth=1, label=curve.name,
-        )  # fmt: skip
+            x,
+            y,
+            yerr=np.stack([down, bars]),
+            fmt=style or "o",
+            color=color,
+            ms=4,
+            lw=1.2,
+            elinewidth=1,
+            label=curve.name,
+        )
     if log_y:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)
@@ -158,12 +165,7 @@ def curves(
     return finished(figure, f"{title}: {y_name} against {x_name}; {told}")
 
 
-def sensitivity(
-    title: str,
-    c_m: NDArray[np.floating],
-    c_hd: NDArray[np.floating],
-    percent: NDArray[np.floating],
-) -> str:
+def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
     """Draw the least relative standard error over melanin and hemoglobin, in percent.
 
     Parameters

@@ -9,6 +9,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
+
 SCALES = {"viridis": "viridis", "magma": "magma", "RdBu_r": "diverging", "gray": "grays"}
 """matplotlib's color maps that maps are shown by, and what a style sheet calls them."""
 GRAY = 128
@@ -61,7 +63,7 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     return _file(width, height, depth, color_type, packed)
 
 
-def encode_indexed(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
+def encode_indexed(index: UInt8Array, palette: UInt8Array) -> bytes:
     r"""Encode an image of a color scale as PNG with a palette.
 
     Parameters
@@ -123,7 +125,7 @@ def _file(
     )
 
 
-def _quick(rows: NDArray[np.uint8], step: int) -> bytes:
+def _quick(rows: UInt8Array, step: int) -> bytes:
     """Compress rows of bytes by the differences to the left."""
     filtered = np.empty((rows.shape[0], rows.shape[1] + 1), np.uint8)
     filtered[:, 0] = 1
@@ -132,7 +134,7 @@ def _quick(rows: NDArray[np.uint8], step: int) -> bytes:
     return zlib.compress(filtered.tobytes(), 4)
 
 
-def _smallest(rows: NDArray[np.uint8], step: int) -> bytes:
+def _smallest(rows: UInt8Array, step: int) -> bytes:
     """Compress rows of bytes, shape (H, B), by one filter for all, whichever leaves least.
 
     Smooth pictures gain from the differences that filters store, flat and noisy ones lose.
@@ -157,9 +159,7 @@ def _smallest(rows: NDArray[np.uint8], step: int) -> bytes:
     return zlib.compress(best, 9)
 
 
-def _paeth(
-    left: NDArray[np.uint8], above: NDArray[np.uint8], corner: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
+def _paeth(left: UInt8Array, above: UInt8Array, corner: UInt8Array) -> UInt8Array:
     """Return whichever neighbor is nearest to left + above - corner (PNG specification 9.4)."""
     a, b, c = (one.astype(np.int16) for one in (left, above, corner))
     to_a, to_b, to_c = np.abs(b - c), np.abs(a - c), np.abs(a + b - 2 * c)
@@ -177,7 +177,7 @@ def address(file: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
 
 
-def srgb8(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+def srgb8(linear: FloatArray) -> UInt8Array:
     """Apply the sRGB curve (IEC 61966-2-1) and round to 8 bits.
 
     Parameters
@@ -199,13 +199,13 @@ def srgb8(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def colorize(
-    values: NDArray[np.floating],
+    values: FloatArray,
     low: float,
     high: float,
     *,
     scale: str = "viridis",
-    valid: NDArray[np.bool_] | None = None,
-) -> NDArray[np.uint8]:
+    valid: BoolArray | None = None,
+) -> UInt8Array:
     """Map values to a perceptually uniform color scale.
 
     Parameters
@@ -231,7 +231,7 @@ def colorize(
     return image
 
 
-def palette(scale: str, colors: int) -> NDArray[np.uint8]:
+def palette(scale: str, colors: int) -> UInt8Array:
     """Return colors spread evenly over a matplotlib color map, (colors, 3), uint8."""
     from matplotlib import colormaps
 
@@ -239,12 +239,12 @@ def palette(scale: str, colors: int) -> NDArray[np.uint8]:
 
 
 def encode_scalar(
-    values: NDArray[np.floating],
+    values: FloatArray,
     low: float,
     high: float,
     *,
     scale: str = "viridis",
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     levels: int = 128,
 ) -> bytes:
     """Encode a map by a color scale of few colors as PNG with a palette.
@@ -270,8 +270,8 @@ def encode_scalar(
 
 
 def _position(
-    values: NDArray[np.floating], low: float, high: float, valid: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    values: FloatArray, low: float, high: float, valid: BoolArray | None
+) -> tuple[Float64Array, BoolArray]:
     """Return where values lie on a scale, in [0, 1], and which are shown."""
     values = np.asarray(values, np.float64)
     span = high - low if high > low else 1.0

@@ -7,16 +7,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skinrig.arrays import Float64Array, FloatArray
 
 _PLACES = tuple(
     (dx, dy, across, up)
     for far in (5, 12, 20)
     for dx, dy, across, up in (
-        (5, far, "left", "bottom"), (-5, far, "right", "bottom"), (5, -far, "left", "top"),
-        (-5, -far, "right", "top"), (0, far, "center", "bottom"), (0, -far, "center", "top"),
+        (5, far, "left", "bottom"),
+        (-5, far, "right", "bottom"),
+        (5, -far, "left", "top"),
+        (-5, -far, "right", "top"),
+        (0, far, "center", "bottom"),
+        (0, -far, "center", "top"),
     )
-)  # fmt: skip
+)
 """Where a name is tried: offsets from its point, points, and which of its corners lies there."""
 
 
@@ -26,7 +31,7 @@ def name_points(
     labels: Sequence[tuple[str, float, float]],
     *,
     points: Sequence[tuple[float, float]],
-    lines: Sequence[NDArray[np.floating]] = (),
+    lines: Sequence[FloatArray] = (),
     legend: Any = None,
 ) -> None:
     """Write names beside points, each where nothing else stands; where there is no room, not.
@@ -95,7 +100,7 @@ def _moved(words: Any, place: tuple[int, int, str, str]) -> Any:
     return words.get_window_extent()
 
 
-def _along(line: NDArray[np.floating]) -> NDArray[np.float64]:
+def _along(line: FloatArray) -> Float64Array:
     """Return points along a line of (N, 2) pixels, closer than a name is high."""
     parts = np.linspace(0.0, 1.0, 200)[:, None]
     pairs = itertools.pairwise(line)

@@ -13,17 +13,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import texture_statistics
 from reconstruction.correspondence.common_parameterization import Chart
 from reconstruction.surface import texture_fill
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits import albedo_vectors
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 NOISE: Final = 0.05
 """Standard deviation of the noise added before matching, in each channel's own."""
@@ -50,12 +47,14 @@ class AlbedoEdit:
         and after.
     """
 
-    factor: Image
+    factor: Float32Array
     clipped: float
     before: float
     after: float
 
-    def apply(self, r_d: ArrayLike, mask: ArrayLike | None = None) -> tuple[Image, Bools]:
+    def apply(
+        self, r_d: ArrayLike, mask: ArrayLike | None = None
+    ) -> tuple[Float32Array, BoolArray]:
         """Return R_d edited, and which texels had to be held at a perfect white's.
 
         Parameters
@@ -87,8 +86,8 @@ def edit_albedo(
     space: AlbedoTraits,
     amounts: Mapping[str, float],
     *,
-    region: Bools,
-    share: Floats,
+    region: BoolArray,
+    share: Float64Array,
     iterations: int = 5,
     noise: float = NOISE,
     rng: np.random.Generator,
@@ -148,7 +147,9 @@ def edit_albedo(
     )
 
 
-def _log_ratio(new: Floats, old: Floats, kind: VectorKind, used: Bools) -> Floats:
+def _log_ratio(
+    new: Float64Array, old: Float64Array, kind: VectorKind, used: BoolArray
+) -> Float64Array:
     """Return the logarithm of the factor from one encoded map to another."""
     if kind == "quantiles":
         return new - old
@@ -157,8 +158,12 @@ def _log_ratio(new: Floats, old: Floats, kind: VectorKind, used: Bools) -> Float
 
 
 def _noisy(
-    image: Image, used: Bools, space: AlbedoTraits, noise: float, rng: np.random.Generator
-) -> Floats:
+    image: Float32Array,
+    used: BoolArray,
+    space: AlbedoTraits,
+    noise: float,
+    rng: np.random.Generator,
+) -> Float64Array:
     """Return a map with noise in its decorrelated channels."""
     channels = space.texture.to_channels(np.asarray(image, np.float64))
     for channel in channels:

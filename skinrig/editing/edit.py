@@ -20,6 +20,7 @@ from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
+from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
@@ -30,9 +31,6 @@ from skinrig.editing.surface_mixtures import SurfaceMixtures
 from skinrig.errors import UsageError
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
-
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 PARTS: Final = ("albedo", "surface")
 MOST_AMOUNT: Final = 10.0
@@ -241,11 +239,16 @@ def edited(
     used = () if library is None or not asked else (library,)
     agreed = consent.carried(source, *used)
     appearance = dataclasses.replace(
-        source, maps=work.maps, files=work.files, left_out=tuple(work.left_out),
+        source,
+        maps=work.maps,
+        files=work.files,
+        left_out=tuple(work.left_out),
         parameters={
-            **source.parameters, "edit": record, **({consent.KEY: agreed} if agreed else {}),
+            **source.parameters,
+            "edit": record,
+            **({consent.KEY: agreed} if agreed else {}),
         },
-    )  # fmt: skip
+    )
     return Edited(appearance, changed, record, tuple(work.warnings))
 
 
@@ -323,20 +326,25 @@ def _edit_albedo(
     parts: LibraryParts,
     amounts: Mapping[str, float],
     order: Order,
-    mask: Image | None,
+    mask: Float32Array | None,
 ) -> None:
     space = parts.albedo[order.region]
     chart = work.face.chart(parts.frame)
     source = work.maps["r_d"]
     _say_unmarked(work, order)
 
-    def one(values: Image, given: Mapping[str, float], stream: int) -> AlbedoEdit:
+    def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
         return editing_albedo.edit_albedo(
-            values, face_textures.valid_of(source), chart, space, given,
+            values,
+            face_textures.valid_of(source),
+            chart,
+            space,
+            given,
             region=common_regions.region(order.region, parts.frame),
             share=masks.feathered(order.region, parts.frame),
-            iterations=order.iterations, rng=np.random.default_rng([order.seed, stream]),
-        )  # fmt: skip
+            iterations=order.iterations,
+            rng=np.random.default_rng([order.seed, stream]),
+        )
 
     found = one(source.values, amounts, 0)
     values, held = found.apply(source.values, mask)
@@ -367,7 +375,7 @@ def _edit_surface(
     parts: LibraryParts,
     amounts: Mapping[str, float],
     order: Order,
-    mask: Image | None,
+    mask: Float32Array | None,
 ) -> None:
     if parts.surface is None:
         return
@@ -405,7 +413,7 @@ def _edit_spots(
     work: _Work,
     spots: Sequence[SpotOrder],
     order: Order,
-    mask: Image | None,
+    mask: Float32Array | None,
     tell: Callable[[str], None],
 ) -> None:
     face = work.face
@@ -450,7 +458,7 @@ def _say_unmarked(work: _Work, order: Order) -> None:
             work.warnings.append(text)
 
 
-def _relative(a: Image, b: Image, good: Bools) -> float:
+def _relative(a: Float32Array, b: Float32Array, good: BoolArray) -> float:
     if not good.any():
         return 0.0
     x, y = a[good].astype(np.float64), b[good].astype(np.float64)

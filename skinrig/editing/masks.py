@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import store
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
-
-Image = NDArray[np.float32]
+from skinrig.arrays import Float32Array, Float64Array
 
 FEATHER_MM = 6.0
 """Distance over which an edit of a region fades."""
@@ -22,7 +20,7 @@ class MaskError(ValueError):
     """A picture that is no mask of a texture."""
 
 
-def read(path: Path, shape: tuple[int, int]) -> Image:
+def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     """Read a mask for a texture.
 
     Parameters
@@ -69,7 +67,7 @@ def read(path: Path, shape: tuple[int, int]) -> Image:
     return gray
 
 
-def feathered(name: str, frame: CommonFrame) -> NDArray[np.float64]:
+def feathered(name: str, frame: CommonFrame) -> Float64Array:
     """Return a region of the common map whose rim fades over `FEATHER_MM`, (N, N), 0 to 1."""
     inside = common_regions.region(name, frame).astype(np.float64)
     if name == "face":
@@ -79,7 +77,7 @@ def feathered(name: str, frame: CommonFrame) -> NDArray[np.float64]:
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
-def on_texture(name: str, frame: CommonFrame, chart: Chart) -> Image:
+def on_texture(name: str, frame: CommonFrame, chart: Chart) -> Float32Array:
     """Return a region's share at the texels of a face, (H, W); off the face it is 0."""
     if name == "face":
         return np.ones(chart.on_surface.shape, np.float32)
@@ -87,7 +85,7 @@ def on_texture(name: str, frame: CommonFrame, chart: Chart) -> Image:
     return np.where(inside, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
 
 
-def _png(path: Path) -> Image:
+def _png(path: Path) -> Float32Array:
     import cv2
 
     try:

@@ -14,16 +14,13 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from model import color_table
 from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 CAMERA, ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
 """Of the dome's camera RGB."""
@@ -93,10 +90,10 @@ class Spots:
         (3,): what the middle of a spot leaves of each channel.
     """
 
-    gain: Image
-    center_mm: Floats
-    diameter_mm: Floats
-    transmitted: Floats
+    gain: Float32Array
+    center_mm: Float64Array
+    diameter_mm: Float64Array
+    transmitted: Float64Array
 
 
 def draw(
@@ -163,7 +160,7 @@ def draw(
     return Spots(gain, centers, diameter, transmitted)
 
 
-def texel_area_mm2(position_mm: Floats, surface: Bools) -> Floats:
+def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Array:
     """Return the area that each texel shows, (H, W), mm^2; 0 off the surface.
 
     Rims of islands, where a neighbor is missing, take the median.
@@ -196,7 +193,9 @@ def _table() -> ColorTable:
     return color_table.build(CAMERA, ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
-def _transmitted(colors: Floats, added: float, amount: float, table: ColorTable) -> Floats:
+def _transmitted(
+    colors: Float64Array, added: float, amount: float, table: ColorTable
+) -> Float64Array:
     """Return what `added` melanin leaves of each channel of the median color, (3,)."""
     usable = colors[(colors > 0).all(axis=1)]
     if not len(usable):
@@ -213,8 +212,12 @@ def _transmitted(colors: Floats, added: float, amount: float, table: ColorTable)
 
 
 def _scatter(
-    points: Floats, weight: Floats, number: int, density: float, rng: np.random.Generator
-) -> Floats:
+    points: Float64Array,
+    weight: Float64Array,
+    number: int,
+    density: float,
+    rng: np.random.Generator,
+) -> Float64Array:
     """Return points no two of which are closer than a part of their mean distance (Poisson disc).
 
     Points are drawn by area; one that is too near to an earlier one is passed over.
@@ -222,10 +225,11 @@ def _scatter(
     if number == 0:
         return np.empty((0, 3))
     least = _PACKING * 10.0 / np.sqrt(density)
-    drawn = rng.choice(len(points), size=min(12 * number + 64, 20 * MOST_SPOTS),
-                       p=weight / weight.sum())  # fmt: skip
-    cells: dict[tuple[int, int, int], list[Floats]] = {}
-    kept: list[Floats] = []
+    drawn = rng.choice(
+        len(points), size=min(12 * number + 64, 20 * MOST_SPOTS), p=weight / weight.sum()
+    )
+    cells: dict[tuple[int, int, int], list[Float64Array]] = {}
+    kept: list[Float64Array] = []
     for k in drawn:
         at = points[k]
         x, y, z = (int(c) for c in np.floor(at / least))
@@ -246,14 +250,14 @@ def _scatter(
 
 
 def _profile(
-    place: Floats,
-    where: Bools,
-    centers: Floats,
-    diameter: Floats,
-    area: Floats,
+    place: Float64Array,
+    where: BoolArray,
+    centers: Float64Array,
+    diameter: Float64Array,
+    area: Float64Array,
     edge: float,
     rng: np.random.Generator,
-) -> Floats:
+) -> Float64Array:
     """Return how deep each texel lies in a spot, (H, W), 0 to 1.
 
     A spot smaller than a texel darkens it by its share of the area.

@@ -16,10 +16,7 @@ from scipy import ndimage
 
 from reconstruction.correspondence.common_parameterization import Chart
 from reconstruction.surface import texture_fill
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, Float32Array
 
 SIGMAS: Final = 5.0
 """Times the usual depth of the skin's grain from which on a spot is one."""
@@ -43,8 +40,8 @@ class Removal:
         How many were found.
     """
 
-    fill: Image
-    share: Image
+    fill: Float32Array
+    share: Float32Array
     spots: int
 
 
@@ -83,7 +80,7 @@ def find(
 
 def dark_spots(
     image: ArrayLike, known: ArrayLike, *, pixel_mm: float, range_mm: tuple[float, float]
-) -> tuple[Bools, int]:
+) -> tuple[BoolArray, int]:
     """Return the pixels of small dark spots, (N, N), with their rims, and how many spots there are.
 
     Parameters
@@ -137,7 +134,7 @@ def _longest(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> float:
     return float(2.0 * np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 0.0)))
 
 
-def _disc(radius: float) -> Bools:
+def _disc(radius: float) -> BoolArray:
     reach = max(1, int(np.ceil(radius)))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     return np.asarray(x * x + y * y <= radius * radius + 0.5, np.bool_)

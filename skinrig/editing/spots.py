@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.skin import SkinMap
@@ -16,11 +15,9 @@ from reconstruction.correspondence.common_parameterization import Chart, CommonF
 from reconstruction.surface import texture_fill
 from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
+from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import pigment_spots, spot_removal
 from skinrig.traits import albedo_vectors
-
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 class SpotOrderError(ValueError):
@@ -67,13 +64,19 @@ def spot_frame(face: Face) -> CommonFrame:
 
 
 def added(
-    face: Face, source: SkinMap, spot: SpotOrder, share: Image, rng: np.random.Generator
-) -> tuple[Image, dict[str, Any]]:
+    face: Face, source: SkinMap, spot: SpotOrder, share: Float32Array, rng: np.random.Generator
+) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots drawn in, and what was done, as JSON values."""
     drawn = pigment_spots.draw(
-        spot.kind, source.values, face.position, face.surface, share, amount=spot.amount,
-        density_per_cm2=spot.density_per_cm2, rng=rng,
-    )  # fmt: skip
+        spot.kind,
+        source.values,
+        face.position,
+        face.surface,
+        share,
+        amount=spot.amount,
+        density_per_cm2=spot.density_per_cm2,
+        rng=rng,
+    )
     gain = _bled(drawn.gain, face.surface, share)
     values = np.where(gain == 1.0, source.values, source.values * gain)
     return values, {
@@ -85,13 +88,16 @@ def added(
 
 
 def removed(
-    source: SkinMap, spot: SpotOrder, share: Image, chart: Chart, frame: CommonFrame
-) -> tuple[Image, dict[str, Any]]:
+    source: SkinMap, spot: SpotOrder, share: Float32Array, chart: Chart, frame: CommonFrame
+) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots filled from around, and what was done, as JSON values."""
     found = spot_removal.find(
-        source.values, face_textures.valid_of(source), chart, pixel_mm=frame.pixel_mm,
+        source.values,
+        face_textures.valid_of(source),
+        chart,
+        pixel_mm=frame.pixel_mm,
         range_mm=pigment_spots.KINDS[spot.kind].range_mm,
-    )  # fmt: skip
+    )
     part = (np.float32(-spot.amount) * share * found.share)[..., None]
     wanted = source.values * (1 - part) + found.fill * part
     ratio = np.where(part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.LEAST))
@@ -101,7 +107,7 @@ def removed(
     return values.astype(np.float32), {"found": found.spots}
 
 
-def _bled(gain: Image, surface: Bools, share: Image) -> Image:
+def _bled(gain: Float32Array, surface: BoolArray, share: Float32Array) -> Float32Array:
     """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
     rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (share > 0)
     if not rim.any():
@@ -110,7 +116,7 @@ def _bled(gain: Image, surface: Bools, share: Image) -> Image:
     return np.where(rim[..., None], np.exp(filled.values), gain).astype(np.float32)
 
 
-def with_values(source: SkinMap, values: Image) -> SkinMap:
+def with_values(source: SkinMap, values: Float32Array) -> SkinMap:
     """Return a map with other values, its standard error scaled as they are."""
     error = source.stderr
     if error is not None:

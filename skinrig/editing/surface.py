@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinMap
 from model.traits import TraitSpace, lobe_edits
+from skinrig.arrays import FloatArray
 from skinrig.editing.surface_mixtures import SurfaceMixtures
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +38,7 @@ def edit_surface(
     space: TraitSpace,
     amounts: Mapping[str, float],
     *,
-    share: NDArray[np.floating] | None = None,
+    share: FloatArray | None = None,
 ) -> SurfaceEdit:
     """Change the lobes of a face.
 

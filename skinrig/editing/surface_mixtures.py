@@ -14,9 +14,7 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, Float64Array
 
 UNUSUAL: Final = 6.0
 """Times the usual strength from which on a texel does not count: no sample held its lobes down."""
@@ -43,7 +41,7 @@ class SurfaceMixtures:
     """
 
     maps: tuple[SkinMap, ...]
-    mix: Floats
+    mix: Float64Array
     materials: tuple[str, ...]
     stored: dict[str, NDArray[Any]]
 
@@ -53,7 +51,7 @@ class SurfaceMixtures:
         return float(self.stored["light_radius_rad"])
 
     @property
-    def valid(self) -> Bools:
+    def valid(self) -> BoolArray:
         """Texels where all shares are known, (H, W)."""
         shape = self.maps[0].values.shape
         good = np.ones(shape, np.bool_)
@@ -61,11 +59,11 @@ class SurfaceMixtures:
             good &= True if one.valid is None else one.valid
         return good
 
-    def weights(self) -> Floats:
+    def weights(self) -> Float64Array:
         """Return the shares at least 0, (H, W, K)."""
         return np.maximum(np.stack([m.values for m in self.maps], axis=-1).astype(np.float64), 0.0)
 
-    def mean_shares(self, strength: Floats) -> Floats:
+    def mean_shares(self, strength: Float64Array) -> Float64Array:
         """Return the mean share of each lobe over texels of no unusual strength, (K,).
 
         Parameters
@@ -82,7 +80,7 @@ class SurfaceMixtures:
             return np.zeros(len(self.mix))
         return np.asarray(rows[total < UNUSUAL * float(np.median(some))].mean(axis=0))
 
-    def mean(self, strength: Floats) -> Floats:
+    def mean(self, strength: Float64Array) -> Float64Array:
         """Return the mean mixture of materials, (M,)."""
         return self.mean_shares(strength) @ self.mix
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
+from skinrig.arrays import Float64Array
 
-Floats = NDArray[np.float64]
 
-
-def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, Floats]:
+def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, Float64Array]:
     """Return relative bounds of the standard errors of melanin and hemoglobin, each (H, W).
 
     Fisher's information of a pixel's three channels about both cube roots and the log of its
@@ -63,13 +61,13 @@ def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, F
 
 def relative_bounds(
     table: color_table.ColorTable,
-    c_m: Floats,
-    c_hd: Floats,
-    relative_variance: Floats,
+    c_m: Float64Array,
+    c_hd: Float64Array,
+    relative_variance: Float64Array,
     *,
     shading_spread: float,
     model_scale: float = 1.0,
-) -> tuple[Floats, Floats]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the smallest relative standard errors of melanin and hemoglobin, each (n,).
 
     Parameters

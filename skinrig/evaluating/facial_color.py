@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import metrics
 from model.facial_color import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
-
-Map = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, FloatArray
 
 WAYS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
 """How a state's blood can be had: as measured, by the rig, by one factor of the neutral map, or
@@ -130,7 +127,7 @@ def compare(
             continue
         neutral = rig.neutral.astype(np.float64)
         level = float(np.mean(measured.values[seen]) / np.mean(neutral[seen]))
-        found: Mapping[str, tuple[Map, Map | None]] = {
+        found: Mapping[str, tuple[FloatArray, FloatArray | None]] = {
             WAYS[0]: (measured.values, measured.stderr),
             WAYS[1]: (blend.hemoglobin, blend.stderr),
             WAYS[2]: (level * neutral, None),
@@ -148,21 +145,23 @@ def compare(
         got = change.values.astype(np.float64)
         changes.append(
             ChangeError(
-                state, float(moved[both].mean()), float(got[both].mean()),
+                state,
+                float(moved[both].mean()),
+                float(got[both].mean()),
                 float(np.sqrt(np.mean((got - moved)[both] ** 2))),
                 metrics.coverage(got[both], change.stderr[both], moved[both]).share,
             )
-        )  # fmt: skip
+        )
     return states, changes
 
 
 def _row(
     state: str,
     way: str,
-    values: Map,
-    stderr: Map | None,
-    true: Map,
-    seen: Mask,
+    values: FloatArray,
+    stderr: FloatArray | None,
+    true: FloatArray,
+    seen: BoolArray,
     rng: np.random.Generator,
 ) -> StateError:
     found, real = values[seen].astype(np.float64), true[seen].astype(np.float64)
@@ -172,11 +171,17 @@ def _row(
     if stderr is not None:
         held = metrics.coverage(found, stderr[seen].astype(np.float64), real).share
     return StateError(
-        state, way, median, interval, float(np.sqrt(np.mean((found - real) ** 2))),
-        float(np.median(relative)), held, int(seen.sum()),
-    )  # fmt: skip
+        state,
+        way,
+        median,
+        interval,
+        float(np.sqrt(np.mean((found - real) ** 2))),
+        float(np.median(relative)),
+        held,
+        int(seen.sum()),
+    )
 
 
-def _valid(skin_map: SkinMap) -> Mask:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

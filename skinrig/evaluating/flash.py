@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.evaluating.bounds import cramer_rao
 
 BANDS: tuple[tuple[float, float], ...] = (
-    (0.0, 0.02), (0.02, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.51),
-)  # fmt: skip
+    (0.0, 0.02),
+    (0.02, 0.05),
+    (0.05, 0.1),
+    (0.1, 0.2),
+    (0.2, 0.51),
+)
 """Melanin bands, volume fraction: about very light, light, tan, brown and dark skin."""
 
 
@@ -134,15 +138,23 @@ def compare(
             skin = _skin(truth, true_map.values)
             rows += [
                 _row(
-                    name, against, band, estimate, true_map.values, melanin, skin, rng,
-                    noise=appearance.maps.get(name + NOISE_STDERR), bound=bounds.get(name),
+                    name,
+                    against,
+                    band,
+                    estimate,
+                    true_map.values,
+                    melanin,
+                    skin,
+                    rng,
+                    noise=appearance.maps.get(name + NOISE_STDERR),
+                    bound=bounds.get(name),
                 )
                 for band in (None, *BANDS)
-            ]  # fmt: skip
+            ]
     return [row for row in rows if row.pixels >= 20]
 
 
-def _skin(truth: SkinAppearance, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _skin(truth: SkinAppearance, values: Float32Array) -> BoolArray:
     skin = np.isfinite(values) & (values > 0)
     if "mask" in truth.maps:
         skin &= truth.maps["mask"].values > 0.5
@@ -154,13 +166,13 @@ def _row(
     against: str,
     band: tuple[float, float] | None,
     estimate: SkinMap,
-    true_values: NDArray[np.float32],
-    melanin: NDArray[np.float32],
-    skin: NDArray[np.bool_],
+    true_values: Float32Array,
+    melanin: Float32Array,
+    skin: BoolArray,
     rng: np.random.Generator,
     *,
     noise: SkinMap | None,
-    bound: NDArray[np.float64] | None,
+    bound: Float64Array | None,
 ) -> MapError:
     chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
     valid = chosen if estimate.valid is None else chosen & estimate.valid

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
@@ -20,6 +19,7 @@ from reconstruction.pipeline.gradient.stages import (
     KERNEL_FILE,
     STRAIN_FILE,
 )
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 NORMAL_LIMIT_DEG = 1.5
 HEIGHT_LIMIT = 0.05
@@ -30,8 +30,6 @@ DISTANCE_LIMIT = 0.5
 
 # of an error with the same deviation in two directions, the length that 68.27 % stay below
 RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,14 +137,20 @@ def compare(
         height_um, relief_um, height_coverage = _height(appearance, truth, state, pixel_um)
         rows.append(
             ReliefError(
-                state, int(skin.sum()), 1.0 - float(good.sum()) / max(int(skin.sum()), 1),
-                float(error.mean()) if error.size else math.nan, middle, interval,
+                state,
+                int(skin.sum()),
+                1.0 - float(good.sum()) / max(int(skin.sum()), 1),
+                float(error.mean()) if error.size else math.nan,
+                middle,
+                interval,
                 float(sharp.mean()) if sharp.size else math.nan,
                 float(np.median(stderr)) if stderr.size else math.nan,
-                float(covered.mean()) if covered.size else math.nan, height_um, relief_um,
+                float(covered.mean()) if covered.size else math.nan,
+                height_um,
+                relief_um,
                 height_coverage,
             )
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -167,9 +171,7 @@ def _height(
     return float(np.std(error)), float(np.std(relief[good])), covered
 
 
-def true_relief(
-    appearance: SkinAppearance, truth: SkinAppearance, state: str
-) -> NDArray[np.float32]:
+def true_relief(appearance: SkinAppearance, truth: SkinAppearance, state: str) -> Float32Array:
     """Return the true height of a state without what is wider than a millimetre, um.
 
     It has gone through the filter that the estimate went through, over the same pixels.
@@ -199,10 +201,13 @@ def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[S
         axis = np.array([math.cos(angle), math.sin(angle)])
         rows.append(
             StretchError(
-                name, _number(state["reading_ratio"]), float(np.linalg.norm(gradient @ axis)),
-                _number(state["stretch_s"]), _number(state["stretch_s_stderr"]),
+                name,
+                _number(state["reading_ratio"]),
+                float(np.linalg.norm(gradient @ axis)),
+                _number(state["stretch_s"]),
+                _number(state["stretch_s_stderr"]),
             )
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -212,11 +217,15 @@ def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float
     if fitted is None:
         return []
     return [
-        (str(fit["name"]), _number(fit["stretch_s"]), _number(fit["distance_before"]),
-         _number(fit["distance"]))
+        (
+            str(fit["name"]),
+            _number(fit["stretch_s"]),
+            _number(fit["distance_before"]),
+            _number(fit["distance"]),
+        )
         for fit in fitted["fits"]
         if fit["valid"]
-    ]  # fmt: skip
+    ]
 
 
 def variances(
@@ -244,10 +253,12 @@ def variances(
             continue
         found.setdefault(float(state["angle_deg"]), []).append(
             (
-                _number(state["stretch_s"]), _number(state["stretch_s_stderr"]),
-                _number(entry["variance_s"]), _number(entry["variance_s_stderr"]),
+                _number(state["stretch_s"]),
+                _number(state["stretch_s_stderr"]),
+                _number(entry["variance_s"]),
+                _number(entry["variance_s_stderr"]),
             )
-        )  # fmt: skip
+        )
     return {angle: sorted(rows) for angle, rows in sorted(found.items())}
 
 
@@ -255,12 +266,12 @@ def _number(value: object) -> float:
     return math.nan if value is None else float(str(value))
 
 
-def _valid(skin_map: SkinMap) -> Bools:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
-def _stderr(skin_map: SkinMap) -> NDArray[np.float64]:
+def _stderr(skin_map: SkinMap) -> Float64Array:
     if skin_map.stderr is None:
         return np.full(skin_map.values.shape[:2], np.nan)
     spread = skin_map.stderr.astype(np.float64)

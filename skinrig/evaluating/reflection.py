@@ -17,12 +17,11 @@ from model.skin import SkinAppearance
 from reconstruction import brdf_basis
 from reconstruction.pipeline.dome.stages import BASIS_FILE, weight_names
 from reconstruction.surface.estimates import transmitted
+from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
 from skinrig.evaluating.surface import NEAR_MM
 
 HELD_OUT_LIMIT = 0.05
-
-Double = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +113,8 @@ class SurfaceTest:
     """
 
     texels: NDArray[np.intp]
-    fitted: Double
-    true: Double
+    fitted: Float64Array
+    true: Float64Array
 
 
 def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTest | None:
@@ -144,7 +143,7 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
 
 def _held_by(
     appearance: SkinAppearance, truth: SkinAppearance
-) -> tuple[BrdfBasis, NDArray[np.intp], dict[str, Double]] | None:
+) -> tuple[BrdfBasis, NDArray[np.intp], dict[str, Float64Array]] | None:
     """Return basis, texels and the test at the points that the appearance holds; None: no test."""
     basis = basis_of(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
@@ -161,9 +160,9 @@ def _lobes(
     appearance: SkinAppearance,
     basis: BrdfBasis,
     texels: NDArray[np.intp],
-    light: Double,
-    view: Double,
-) -> tuple[Double, Double, Double]:
+    light: Float64Array,
+    view: Float64Array,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return f_r of the lobes, 1/sr, and cosines of light and view, each (S, K)."""
     normals = normal_at(appearance, texels)
     weights = np.stack(
@@ -181,9 +180,9 @@ def predict(
     appearance: SkinAppearance,
     basis: BrdfBasis,
     texels: NDArray[np.intp],
-    light: Double,
-    view: Double,
-) -> Double:
+    light: Float64Array,
+    view: Float64Array,
+) -> Float64Array:
     """Return f_r as an appearance has it, shape (S, K, 3), 1/sr; NaN below the horizon.
 
     Parameters
@@ -204,10 +203,10 @@ def predict(
     return np.where(above[..., None], inside + lobes[..., None], np.nan)
 
 
-def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Double:
+def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float64Array:
     """Return normals at flat texel indices, (S, 3): refined ones where there are some."""
 
-    def flat(name: str) -> Double:
+    def flat(name: str) -> Float64Array:
         return appearance.maps[name].values.reshape(-1, 3)[texels].astype(np.float64)
 
     if "normals_refined" not in appearance.maps:
@@ -219,7 +218,7 @@ def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Double
 
 def spheres(
     appearance: SkinAppearance, truth: SkinAppearance
-) -> list[tuple[str, Double, Double | None]]:
+) -> list[tuple[str, Float64Array, Float64Array | None]]:
     """Return the reflection of some sites on spheres: name, truth and estimate.
 
     The estimate is None at sites that it does not reach; without a test file nothing is returned.
@@ -230,7 +229,7 @@ def spheres(
     with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
         names, texels, images = stored["site"], stored["site_texel"], stored["sphere"]
     own = _texels_for(texels, appearance, truth)
-    out: list[tuple[str, Double, Double | None]] = []
+    out: list[tuple[str, Float64Array, Float64Array | None]] = []
     for name, texel, image in zip(names, own, images, strict=True):
         drawn = None
         if texel >= 0:
@@ -245,9 +244,9 @@ def _reflected(
     appearance: SkinAppearance,
     basis: BrdfBasis,
     at: NDArray[np.intp],
-    to_light: Double,
-    to_camera: Double,
-) -> Double:
+    to_light: Float64Array,
+    to_camera: Float64Array,
+) -> Float64Array:
     return predict(appearance, basis, at, to_light[None], to_camera[None])[0]
 
 

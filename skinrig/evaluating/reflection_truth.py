@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.skin import SkinAppearance
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 TEST_FILE: Final = "reflection_test.npz"
 LEAST_COSINE: Final = 0.3
 """Directions nearer to the horizon are not asked for: 73 degrees."""
 SPHERE_PX: Final = 96
-
-Double = NDArray[np.float64]
 
 
 class TrueReflection(Protocol):
@@ -24,7 +23,7 @@ class TrueReflection(Protocol):
 
     def brdf(
         self, uv: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Float32Array, Float32Array]:
         """Return f_r, shape (n, 3), and its surface part, shape (n,), 1/sr."""
 
 
@@ -64,7 +63,7 @@ def make_test(
     chosen = rng.permutation(np.flatnonzero(valid))[:points]
     all_normals = truth.maps["normals"].values.reshape(-1, 3).astype(np.float64)
 
-    def uv_of(texel: NDArray[np.integer]) -> Double:
+    def uv_of(texel: NDArray[np.integer]) -> Float64Array:
         rows, columns = np.divmod(texel, size)
         return np.stack([(columns + 0.5) / size, 1.0 - (rows + 0.5) / size], axis=-1)
 
@@ -79,7 +78,9 @@ def make_test(
         texel = int(np.argmin(np.where(valid.reshape(-1), apart, np.inf)))
         spot = uv_of(np.array([texel]))
 
-        def reflect(to_light: Double, to_camera: Double, spot: Double = spot) -> Double:
+        def reflect(
+            to_light: Float64Array, to_camera: Float64Array, spot: Float64Array = spot
+        ) -> Float64Array:
             return np.asarray(scene.brdf(spot.repeat(len(to_light), 0), to_light, to_camera)[0])
 
         spheres.append(sphere(reflect, all_normals[texel])[0])
@@ -100,11 +101,11 @@ def make_test(
 
 
 def sphere(
-    reflect: Callable[[Double, Double], Double],
-    normal: Double,
+    reflect: Callable[[Float64Array, Float64Array], Float64Array],
+    normal: Float64Array,
     *,
     light_dir: tuple[float, float, float] = (0.5, 0.5, 0.70710678),
-) -> tuple[Double, NDArray[np.bool_]]:
+) -> tuple[Float64Array, BoolArray]:
     """Draw the reflection of one spot on a sphere seen from +z, far away.
 
     Parameters
@@ -131,14 +132,14 @@ def sphere(
     to_camera = _turned(np.array([0.0, 0.0, 1.0]), outward, normal)
     image = np.zeros((SPHERE_PX, SPHERE_PX, 3))
     lit = shade > 0
-    image[np.flatnonzero(inside.reshape(-1))[lit] // SPHERE_PX,
-          np.flatnonzero(inside.reshape(-1))[lit] % SPHERE_PX] = (
-        np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
-    )  # fmt: skip
+    image[
+        np.flatnonzero(inside.reshape(-1))[lit] // SPHERE_PX,
+        np.flatnonzero(inside.reshape(-1))[lit] % SPHERE_PX,
+    ] = np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
     return image, inside
 
 
-def _turned(direction: Double, outward: Double, normal: Double) -> Double:
+def _turned(direction: Float64Array, outward: Float64Array, normal: Float64Array) -> Float64Array:
     """Return a direction seen from points of a sphere as seen from a spot: outward to normal.
 
     The turn is the shortest one, Rodrigues' formula for two unit vectors.
@@ -152,7 +153,7 @@ def _turned(direction: Double, outward: Double, normal: Double) -> Double:
     )
 
 
-def _around(normals: Double, count: int, rng: np.random.Generator) -> Double:
+def _around(normals: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
     """Draw directions around normals, even in solid angle down to `LEAST_COSINE`, (S, K, 3)."""
     shape = (len(normals), count)
     z = rng.uniform(LEAST_COSINE, 1.0, shape)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import metrics
+from skinrig.arrays import Float64Array
 
 BANDS: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
 EDGES_DEG: Final = (55.0, 41.0, 28.0, 10.0, -30.0)
@@ -23,7 +24,7 @@ SRGB_TO_XYZ: Final = (
 """IEC 61966-2-1, D65."""
 
 
-def typology_angle_deg(reflectance: ArrayLike) -> NDArray[np.float64]:
+def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
     """Return the individual typology angle of reflectances.
 
     Parameters
@@ -80,7 +81,7 @@ class MelaninBand:
     hemoglobin: float = 0.05
     """Volume fraction of that person's dermis."""
 
-    def reflectance(self) -> NDArray[np.float64]:
+    def reflectance(self) -> Float64Array:
         """Return the diffuse albedo of the typical person, (3,), linear sRGB under D65.
 
         By the layered model of `model.tissue_optics`.
@@ -106,7 +107,7 @@ MELANIN_BANDS: Final = {
 
 
 @cache
-def _reflectance(melanin: float, hemoglobin: float) -> NDArray[np.float64]:
+def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
     from model import spectra, tissue_optics
 
     spectrum = tissue_optics.two_layer_reflectance(

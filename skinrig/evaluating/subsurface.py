@@ -9,18 +9,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
+from skinrig.arrays import Float64Array
 
 MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08
 """Relative error of sigma_tr on homogeneous media, median and worst."""
 RECOMMENDED = METHODS[0]
 SIGNAL_TO_NOISE = 10.0
 """A fibre's reading tells something of the profile from here on."""
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +118,14 @@ def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[
             inside = np.abs(found - real) <= np.hypot(stderr, noise)
             rows.append(
                 ProfileError(
-                    name_of(entry), channel, float(np.median(error)), float(error.max()),
-                    int(good.sum()), float(inside[good].mean()),
+                    name_of(entry),
+                    channel,
+                    float(np.median(error)),
+                    float(error.max()),
+                    int(good.sum()),
+                    float(inside[good].mean()),
                 )
-            )  # fmt: skip
+            )
     return rows
 
 
@@ -140,11 +142,17 @@ def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitE
             low, high = numbers(fit["interval_per_mm"]).tolist()
             rows.append(
                 FitError(
-                    name_of(entry), fit["channel"], fit["method"], str(true["kind"]), sigma_tr,
-                    number(fit["sigma_tr_per_mm"]), number(fit["sigma_tr_stderr"]), (low, high),
+                    name_of(entry),
+                    fit["channel"],
+                    fit["method"],
+                    str(true["kind"]),
+                    sigma_tr,
+                    number(fit["sigma_tr_per_mm"]),
+                    number(fit["sigma_tr_stderr"]),
+                    (low, high),
                     bool(fit["valid"]),
                 )
-            )  # fmt: skip
+            )
     return rows
 
 
@@ -173,10 +181,14 @@ def by_method(rows: Sequence[FitError]) -> list[MethodError]:
         error = np.array([row.relative for row in chosen])
         found.append(
             MethodError(
-                method, len(chosen), float(np.median(np.abs(error))), float(np.abs(error).max()),
-                float(error.mean()), float(np.mean([row.covered for row in chosen])),
+                method,
+                len(chosen),
+                float(np.median(np.abs(error))),
+                float(np.abs(error).max()),
+                float(error.mean()),
+                float(np.mean([row.covered for row in chosen])),
             )
-        )  # fmt: skip
+        )
     return found
 
 
@@ -185,6 +197,6 @@ def number(value: object) -> float:
     return math.nan if value is None else float(str(value))
 
 
-def numbers(values: Sequence[object]) -> FloatArray:
+def numbers(values: Sequence[object]) -> Float64Array:
     """Return numbers of a document, float64; null becomes NaN."""
     return np.array([number(value) for value in values], np.float64)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
+from skinrig.arrays import BoolArray, Float64Array
 
 NEAR_MM = 3.0
 """Farther than this from the true surface a point has no truth."""
@@ -47,7 +48,7 @@ class Match:
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
     truth: NDArray[np.intp]
-    distance_mm: NDArray[np.float64]
+    distance_mm: Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def compare(
 
 def errors_at(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, pairs: Match
-) -> NDArray[np.float64]:
+) -> Float64Array:
     """Return a map's error at each matched texel, NaN where it is not valid.
 
     Angles in degrees for normals; else relative to the truth, in %, mean of the channels.
@@ -224,8 +225,8 @@ def _channels(
 def _row(
     name: str,
     unit: str,
-    error: NDArray[np.float64],
-    good: NDArray[np.bool_],
+    error: Float64Array,
+    good: BoolArray,
     held: metrics.Coverage,
     spread: float,
     bias: float,
@@ -247,11 +248,11 @@ def _row(
     )
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
-def _flat(skin_map: SkinMap) -> NDArray[np.float64]:
+def _flat(skin_map: SkinMap) -> Float64Array:
     values = skin_map.values
     return values.reshape(-1, *values.shape[2:]).astype(np.float64)

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import fresnel, merl, skin_reflectance
 from model.brdf import rgl
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.errors import UsageError
 
-FloatArray = NDArray[np.float64]
-Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
 
 DOCUMENT = "brdfs.json"
@@ -165,7 +164,7 @@ def _place(
         )
     surface = lobes.mixed(model.weights[near].astype(np.float64).mean(axis=0)[None])
 
-    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         found = np.repeat(surface.evaluate(light, view, _UP), 3, axis=-1)
         if place.diffuse:
             through = 1.0 - fresnel.reflectance(light[:, 2], model.eta)
@@ -185,7 +184,7 @@ def _place(
     return brdf, entry
 
 
-def _nearest_valid(valid: NDArray[np.bool_], place: Place) -> tuple[int, int]:
+def _nearest_valid(valid: BoolArray, place: Place) -> tuple[int, int]:
     height, width = valid.shape
     row = min(int((1.0 - place.v) * height), height - 1)
     column = min(int(place.u * width), width - 1)
@@ -206,10 +205,7 @@ def _write_rgl(path: Path, brdf: Brdf, description: str) -> None:
     rgl.write(path, rgl.of_brdf(brdf, description=description))
 
 
-_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {
-    "merl": _write_merl,
-    "rgl": _write_rgl,
-}
+_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {"merl": _write_merl, "rgl": _write_rgl}
 SUFFIX: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
 
 

@@ -15,11 +15,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
-
-Floats = NDArray[np.floating[Any]]
-Bools = NDArray[np.bool_]
 
 SRGB: Final = "linear sRGB"
 CAMERA: Final = "camera RGB, linear, white balanced"
@@ -64,13 +62,13 @@ class Image:
     """
 
     name: str
-    values: Floats
+    values: FloatArray
     unit: str
     space: str = DATA
     what: str = ""
     low: float | None = None
     high: float | None = None
-    valid: Bools | None = None
+    valid: BoolArray | None = None
     filler: tuple[float, ...] | None = None
 
     def on_empty_tile(self) -> Image:
@@ -83,9 +81,11 @@ class Image:
         values = np.empty((EMPTY_SIDE, EMPTY_SIDE, *self.values.shape[2:]), np.float32)
         values[...] = value if self.values.ndim == 3 else value[0]
         return replace(
-            self, values=values, valid=np.zeros(values.shape[:2], np.bool_),
+            self,
+            values=values,
+            valid=np.zeros(values.shape[:2], np.bool_),
             what=f"nothing was measured on this tile: one value; {self.what}",
-        )  # fmt: skip
+        )
 
 
 @dataclass(slots=True)
@@ -115,10 +115,11 @@ class ImageFolder:
         for tile, one in self._by_tile(image):
             names.append(self._place(folder, image.name, "exr", tile))
             write_exr(
-                self.root / names[-1], one.values,
+                self.root / names[-1],
+                one.values,
                 {"unit": one.unit, "colorSpace": one.space, "comments": one.what},
                 rec709=one.space == SRGB,
-            )  # fmt: skip
+            )
             self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
         return names[0]
 
@@ -223,7 +224,7 @@ def coded_range(image: Image) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def srgb_curve(linear: Floats) -> NDArray[np.float64]:
+def srgb_curve(linear: FloatArray) -> Float64Array:
     """Return sRGB's curve of values in [0, 1], IEC 61966-2-1.
 
     Examples
@@ -245,7 +246,7 @@ def png_range(name: str) -> tuple[float | None, float | None]:
 
 
 def write_exr(
-    path: Path, values: Floats, attributes: Mapping[str, str], *, rec709: bool = False
+    path: Path, values: FloatArray, attributes: Mapping[str, str], *, rec709: bool = False
 ) -> None:
     """Write (H, W) as channel Y or (H, W, 3) as R, G, B, float32, compressed without loss."""
     channel = "Y" if values.ndim == 2 else "RGB"
@@ -253,9 +254,12 @@ def write_exr(
 
 
 def write_channels(
-    path: Path, channels: Mapping[str, Floats], attributes: Mapping[str, str], *,
+    path: Path,
+    channels: Mapping[str, FloatArray],
+    attributes: Mapping[str, str],
+    *,
     rec709: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """Write named channels of one size as float32 EXR, compressed without loss.
 
     Parameters

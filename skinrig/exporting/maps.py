@@ -87,9 +87,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
 
 
 def _document(
-    appearance: SkinAppearance, delivery: Delivery, files: Mapping[str, Any],
+    appearance: SkinAppearance,
+    delivery: Delivery,
+    files: Mapping[str, Any],
     left_out: list[tuple[str, str]],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "orientation": ORIENTATION,
@@ -121,9 +123,15 @@ def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Ima
         space = CAMERA
         low, high = (0.0, 1.0) if low is None else (low, high)
     return Image(
-        name=name, values=values, unit=one.unit, space=space, what=what, low=low, high=high,
+        name=name,
+        values=values,
+        unit=one.unit,
+        space=space,
+        what=what,
+        low=low,
+        high=high,
         valid=one.valid,
-    )  # fmt: skip
+    )
 
 
 def _is_normals(name: str, one: SkinMap) -> bool:
@@ -134,14 +142,23 @@ def _errors(name: str, one: SkinMap, out: ImageFolder) -> None:
     if one.stderr is not None:
         unit = "rad" if _is_normals(name, one) else one.unit
         out.exr(
-            Image(name=f"{name}.stderr", values=one.stderr, unit=unit,
-                  what=f"standard error of {name}, 68 %", valid=one.valid)
-        )  # fmt: skip
+            Image(
+                name=f"{name}.stderr",
+                values=one.stderr,
+                unit=unit,
+                what=f"standard error of {name}, 68 %",
+                valid=one.valid,
+            )
+        )
     valid = np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
     out.exr(
-        Image(name=f"{name}.valid", values=valid.astype(np.float32), unit="1",
-              what=f"1 where {name} means something, else 0")
-    )  # fmt: skip
+        Image(
+            name=f"{name}.valid",
+            values=valid.astype(np.float32),
+            unit="1",
+            what=f"1 where {name} means something, else 0",
+        )
+    )
 
 
 def _packed(appearance: SkinAppearance) -> Image | None:
@@ -161,9 +178,16 @@ def _packed_png(packed: Image, out: ImageFolder) -> None:
     scale = np.array([2.0, 4.0, 1.0], np.float32)
     what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
     out.png(
-        Image(name=packed.name, values=packed.values * scale, unit="1", what=what, low=0.0,
-              high=1.0, valid=packed.valid)
-    )  # fmt: skip
+        Image(
+            name=packed.name,
+            values=packed.values * scale,
+            unit="1",
+            what=what,
+            low=0.0,
+            high=1.0,
+            valid=packed.valid,
+        )
+    )
 
 
 def _tangent_normals(
@@ -192,8 +216,13 @@ def _tangent_normals(
     turned = turned * np.array([1.0, y, 1.0], np.float32)
     green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     image = Image(
-        name="normal_tangent", values=turned, unit="1", low=-1.0, high=1.0, valid=valid,
+        name="normal_tangent",
+        values=turned,
+        unit="1",
+        low=-1.0,
+        high=1.0,
+        valid=valid,
         what=f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules), {green}",
-    )  # fmt: skip
+    )
     out.exr(image)
     return out.png(image), ""

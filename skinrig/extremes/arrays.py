@@ -96,14 +96,16 @@ def _no_numbers_in_media(real: Real) -> str:
             as_real([value], real), as_real([1.0], real), as_real([math.inf], real)
         )
 
-    return _each_refused([
-        ("radius_mm", lambda v: dipole.reflectance(real(v), real(0.1), real(1.0), 1.4)),
-        ("sigma_a_per_mm", lambda v: dipole.reflectance(real(1.0), real(v), real(1.0), 1.4)),
-        ("sigma_s_prime", lambda v: diffusion.reflectance(real(1.0), real(0.1), real(v), 1.4)),
-        ("sigma_a_per_mm", stack),
-        ("c_m", lambda v: tissue_optics.two_layer_reflectance(500.0, real(v), 0.05)),
-        ("wavelength", lambda v: tissue_optics.two_layer_reflectance(real(v), 0.02, 0.05)),
-    ])  # fmt: skip
+    return _each_refused(
+        [
+            ("radius_mm", lambda v: dipole.reflectance(real(v), real(0.1), real(1.0), 1.4)),
+            ("sigma_a_per_mm", lambda v: dipole.reflectance(real(1.0), real(v), real(1.0), 1.4)),
+            ("sigma_s_prime", lambda v: diffusion.reflectance(real(1.0), real(0.1), real(v), 1.4)),
+            ("sigma_a_per_mm", stack),
+            ("c_m", lambda v: tissue_optics.two_layer_reflectance(500.0, real(v), 0.05)),
+            ("wavelength", lambda v: tissue_optics.two_layer_reflectance(real(v), 0.02, 0.05)),
+        ]
+    )
 
 
 def _single_pixels(real: Real) -> str:
@@ -145,9 +147,9 @@ def _missed_range(_: Real) -> str:
     from capture import hdr
 
     # rows: below the noise of all, saturated in all, in all but the shortest, in none
-    dn = np.array([
-        [512, 16383, 16383, 9000], [512, 16383, 16383, 2634], [512, 16383, 3000, 1042],
-    ], np.uint16)[:, :, None]  # fmt: skip
+    dn = np.array(
+        [[512, 16383, 16383, 9000], [512, 16383, 16383, 2634], [512, 16383, 3000, 1042]], np.uint16
+    )[:, :, None]
     radiance, variance, valid = hdr.merge(
         dn, (1.0, 0.25, 0.0625), gain=0.5, read_noise=3.0, black=512.0, white=16383.0
     )
@@ -203,10 +205,12 @@ def _light_in_renderer(_: Real) -> str:
     def scene(emitter: dict[str, object]) -> dict[str, object]:
         film = {"type": "hdrfilm", "width": 4, "height": 4}
         return {
-            "type": "scene", "sensor": {"type": "perspective", "film": film},
-            "shape": {"type": "sphere", "center": [0.0, 0.0, 5.0]}, "light": emitter,
+            "type": "scene",
+            "sensor": {"type": "perspective", "film": film},
+            "shape": {"type": "sphere", "center": [0.0, 0.0, 5.0]},
+            "light": emitter,
             "integrator": {"type": "path"},
-        }  # fmt: skip
+        }
 
     emitters: list[dict[str, object]] = []
     for bad in (np.nan, np.inf, -1.0):
@@ -219,37 +223,94 @@ def _light_in_renderer(_: Real) -> str:
     for emitter in emitters:
         refused(
             lambda emitter=emitter: render.radiance(scene(emitter), kind="rgb", samples=1),  # type: ignore[misc]
-            render.RenderError, "light",
-        )  # fmt: skip
+            render.RenderError,
+            "light",
+        )
     return f"RenderError naming light, for {len(emitters)} lights"
 
 
 CASES = (
-    Case("no numbers in light", "photometric stereo", "NaN and infinities, in one light and in all",
-         "NaN spreads through sums", "the others' normal; the pixel without any masked",
-         _no_numbers_in_light),
-    Case("mirror, chalk and varnish", "photometric stereo", "a pixel that shows one light of 36",
-         "a highlight passes for shape", "the mirror masked, chalk and varnish within 0.1 degrees",
-         _mirror_and_chalk),
-    Case("no numbers in normals", "normal integration", "a NaN and an infinity",
-         "one hole spoils the whole height", "the plane beside the holes", _no_numbers_in_normals),
-    Case("no numbers in a map", "local statistics", "a NaN, an infinity",
-         "running sums keep a NaN for ever", "means of the others", _no_numbers_in_statistics),
-    Case("no numbers in a medium", "dipole", "NaN and infinities for each coefficient",
-         "NaN without a mask", "ValueError naming the argument", _no_numbers_in_media),
-    Case("single pixels", "pictures", "1 x 1", "differences of neighbors that do not exist",
-         "values of that pixel", _single_pixels),
-    Case("8K pictures", "hdr", "7680 x 4320, two exposures", "indices and memory",
-         "the values of a small picture", _eight_thousand,
-         one_precision=INTEGERS),
-    Case("brackets that miss the range", "hdr", "darker than all noise, brighter than the shortest",
-         "0/0 of weights", "darkness within its error; saturated pixels masked", _missed_range,
-         one_precision=INTEGERS),
-    Case("conditions 1 to 1e12", "non-negative mixtures", "six materials ever more alike",
-         "a Gram matrix squares the condition", "samples again within 1e-6, shares bounded",
-         _conditions),
-    Case("light that no lamp gives", "renderer", "negative, NaN, infinite",
-         "the renderer draws it without a word", "RenderError naming the light",
-         _light_in_renderer,
-         one_precision=RENDERER),
-)  # fmt: skip
+    Case(
+        "no numbers in light",
+        "photometric stereo",
+        "NaN and infinities, in one light and in all",
+        "NaN spreads through sums",
+        "the others' normal; the pixel without any masked",
+        _no_numbers_in_light,
+    ),
+    Case(
+        "mirror, chalk and varnish",
+        "photometric stereo",
+        "a pixel that shows one light of 36",
+        "a highlight passes for shape",
+        "the mirror masked, chalk and varnish within 0.1 degrees",
+        _mirror_and_chalk,
+    ),
+    Case(
+        "no numbers in normals",
+        "normal integration",
+        "a NaN and an infinity",
+        "one hole spoils the whole height",
+        "the plane beside the holes",
+        _no_numbers_in_normals,
+    ),
+    Case(
+        "no numbers in a map",
+        "local statistics",
+        "a NaN, an infinity",
+        "running sums keep a NaN for ever",
+        "means of the others",
+        _no_numbers_in_statistics,
+    ),
+    Case(
+        "no numbers in a medium",
+        "dipole",
+        "NaN and infinities for each coefficient",
+        "NaN without a mask",
+        "ValueError naming the argument",
+        _no_numbers_in_media,
+    ),
+    Case(
+        "single pixels",
+        "pictures",
+        "1 x 1",
+        "differences of neighbors that do not exist",
+        "values of that pixel",
+        _single_pixels,
+    ),
+    Case(
+        "8K pictures",
+        "hdr",
+        "7680 x 4320, two exposures",
+        "indices and memory",
+        "the values of a small picture",
+        _eight_thousand,
+        one_precision=INTEGERS,
+    ),
+    Case(
+        "brackets that miss the range",
+        "hdr",
+        "darker than all noise, brighter than the shortest",
+        "0/0 of weights",
+        "darkness within its error; saturated pixels masked",
+        _missed_range,
+        one_precision=INTEGERS,
+    ),
+    Case(
+        "conditions 1 to 1e12",
+        "non-negative mixtures",
+        "six materials ever more alike",
+        "a Gram matrix squares the condition",
+        "samples again within 1e-6, shares bounded",
+        _conditions,
+    ),
+    Case(
+        "light that no lamp gives",
+        "renderer",
+        "negative, NaN, infinite",
+        "the renderer draws it without a word",
+        "RenderError naming the light",
+        _light_in_renderer,
+        one_precision=RENDERER,
+    ),
+)

@@ -61,9 +61,17 @@ def all_cases() -> tuple[Case, ...]:
     from skinrig.extremes import surface as extremes_surface
 
     groups = (
-        transport, photons, rendering, pictures, extremes_surface,
-        reflectance, interior, motion, arrays, domains,
-    )  # fmt: skip
+        transport,
+        photons,
+        rendering,
+        pictures,
+        extremes_surface,
+        reflectance,
+        interior,
+        motion,
+        arrays,
+        domains,
+    )
     return tuple(case for group in groups for case in group.CASES)
 
 

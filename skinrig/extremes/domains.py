@@ -36,8 +36,9 @@ def _far_lights(real: Real) -> str:
         lambda: stereo.estimate_normals(
             lit, way, light_positions_mm=np.inf * np.sign(way), points_mm=np.zeros((1, 1, 3))
         ),
-        stereo.PhotometricStereoError, "light_positions_mm",
-    )  # fmt: skip
+        stereo.PhotometricStereoError,
+        "light_positions_mm",
+    )
     return "at 1 km as without a distance; at infinity refused"
 
 
@@ -80,14 +81,19 @@ def _one_turned_triangle(real: Real) -> str:
     flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
     cell = np.arange(81).reshape(9, 9)
     a, b, c, d = (
-        cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel(), cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
-    )  # fmt: skip
+        cell[:-1, :-1].ravel(),
+        cell[:-1, 1:].ravel(),
+        cell[1:, 1:].ravel(),
+        cell[1:, :-1].ravel(),
+    )
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     faces[20] = faces[20][::-1]
     found = microstructure.strain(
-        as_real(flat, real), as_real(flat * [1.1, 1.0, 1.0], real), faces,
+        as_real(flat, real),
+        as_real(flat * [1.1, 1.0, 1.0], real),
+        faces,
         as_real(np.stack([u.ravel(), v.ravel()], -1), real),
-    )  # fmt: skip
+    )
     masked(found.valid, share=(1.0, 1.0))
     return near(found.r_s, np.full(81, 1.1), relative=1e-5)
 
@@ -115,8 +121,11 @@ def _layers_of_no_medium(real: Real) -> str:
     for solver in (adding_doubling, layered_diffusion):
         for place, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
             for bad in (np.nan, -1.0):
-                values = [as_real([[0.1, 0.1]], real), as_real([[1.0, 1.0]], real),
-                          as_real([[0.2, np.inf]], real)]  # fmt: skip
+                values = [
+                    as_real([[0.1, 0.1]], real),
+                    as_real([[1.0, 1.0]], real),
+                    as_real([[0.2, np.inf]], real),
+                ]
                 values[place][0, 0] = bad
                 refused(lambda v=values, s=solver: s.reflectance(*v), ValueError, name)  # type: ignore[misc]
                 told += 1
@@ -150,26 +159,60 @@ def _index_of_nothing(real: Real) -> str:
 
 
 CASES = (
-    Case("light at infinity", "photometric stereo", "no distance, 1 km, and infinity as a place",
-         "infinity over infinity in the falloff", "the same normals; PhotometricStereoError",
-         _far_lights),
-    Case("one photon per pixel", "photometric stereo", "1 photon, 1 electron of noise",
-         "chance passes for shape", "at most 5 % given a normal; of 100 photons all, 68 % held",
-         _one_photon),
-    Case("one triangle turned over", "strain", "one of 128 wound the other way",
-         "its stretch changes sign among its neighbors'", "the stretch of all, 1.1",
-         _one_turned_triangle),
-    Case("photon table beyond numbers", "photon table",
-         "r of 1e-50 and 1e50 mm (float32: 1e-18 and 1e18); NaN, infinity, negative",
-         "squares over- and underflow", "finite, none far away; ValueError naming the argument",
-         _profile_beyond_numbers),
-    Case("layers of no medium", "layers", "NaN and negative coefficients and thicknesses",
-         "NaN through every layer without a mask", "ValueError naming the argument",
-         _layers_of_no_medium),
-    Case("texture with nothing valid", "texture fill", "an empty mask; NaN around one texel",
-         "levels halved for ever", "ValueError naming valid; the one color everywhere",
-         _nothing_to_continue),
-    Case("index of nothing", "fresnel", "eta NaN, 0, negative, infinite, and the largest number",
-         "its square overflows, 0/0 where media match", "ValueError naming eta; from 0 to 1",
-         _index_of_nothing),
-)  # fmt: skip
+    Case(
+        "light at infinity",
+        "photometric stereo",
+        "no distance, 1 km, and infinity as a place",
+        "infinity over infinity in the falloff",
+        "the same normals; PhotometricStereoError",
+        _far_lights,
+    ),
+    Case(
+        "one photon per pixel",
+        "photometric stereo",
+        "1 photon, 1 electron of noise",
+        "chance passes for shape",
+        "at most 5 % given a normal; of 100 photons all, 68 % held",
+        _one_photon,
+    ),
+    Case(
+        "one triangle turned over",
+        "strain",
+        "one of 128 wound the other way",
+        "its stretch changes sign among its neighbors'",
+        "the stretch of all, 1.1",
+        _one_turned_triangle,
+    ),
+    Case(
+        "photon table beyond numbers",
+        "photon table",
+        "r of 1e-50 and 1e50 mm (float32: 1e-18 and 1e18); NaN, infinity, negative",
+        "squares over- and underflow",
+        "finite, none far away; ValueError naming the argument",
+        _profile_beyond_numbers,
+    ),
+    Case(
+        "layers of no medium",
+        "layers",
+        "NaN and negative coefficients and thicknesses",
+        "NaN through every layer without a mask",
+        "ValueError naming the argument",
+        _layers_of_no_medium,
+    ),
+    Case(
+        "texture with nothing valid",
+        "texture fill",
+        "an empty mask; NaN around one texel",
+        "levels halved for ever",
+        "ValueError naming valid; the one color everywhere",
+        _nothing_to_continue,
+    ),
+    Case(
+        "index of nothing",
+        "fresnel",
+        "eta NaN, 0, negative, infinite, and the largest number",
+        "its square overflows, 0/0 where media match",
+        "ValueError naming eta; from 0 to 1",
+        _index_of_nothing,
+    ),
+)

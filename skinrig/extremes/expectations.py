@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skinrig.arrays import Float64Array
+
 Real = type[np.float32] | type[np.float64]
 
 
@@ -111,7 +113,7 @@ def as_real(values: ArrayLike, real: Real) -> NDArray[Any]:
     return np.asarray(values, real)
 
 
-def _short(value: NDArray[np.float64]) -> str:
+def _short(value: Float64Array) -> str:
     if value.size <= 4:
         return ", ".join(f"{v:.6g}" for v in value.ravel())
     return f"{value.size} values from {np.nanmin(value):.4g} to {np.nanmax(value):.4g}"

@@ -78,8 +78,9 @@ def _single(real: Real) -> str:
     from model.dipole.gather import exitance
 
     one = as_real([[1.0, 2.0, 3.0]], real)
-    return near(exitance(one, as_real([0.1], real), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]],
-                relative=1e-6)  # fmt: skip
+    return near(
+        exitance(one, as_real([0.1], real), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]], relative=1e-6
+    )
 
 
 def _empty(real: Real) -> str:
@@ -88,9 +89,11 @@ def _empty(real: Real) -> str:
 
     shape = (2, 2, 3)
     found = DipoleMaps.of(
-        as_real(np.full(shape, 0.5), real), as_real(np.ones(shape), real), eta=1.4,
+        as_real(np.full(shape, 0.5), real),
+        as_real(np.ones(shape), real),
+        eta=1.4,
         valid=np.zeros((2, 2), bool),
-    )  # fmt: skip
+    )
     none = as_real(np.zeros((0, 3)), real)
     near(exitance(none, none[:, 0], none, as_real(np.zeros((2, 3)), real), 0.5, 1.0), 0.0)
     return masked(found.valid) + ", nothing leaves"
@@ -112,26 +115,74 @@ def _opaque(real: Real) -> str:
 
     place, area = _patch(real)
     light = as_real(np.ones((len(area), 3)), real)
-    return refused(lambda: exitance(place, area, light, place, 0.5, 0.0), GatherError,
-                   "translucency_mm")  # fmt: skip
+    return refused(
+        lambda: exitance(place, area, light, place, 0.5, 0.0), GatherError, "translucency_mm"
+    )
 
 
 CASES = (
-    Case("even light on any medium", STAGE, "R_d 0 to 1, 1/sigma_tr 0.01 to 100 mm",
-         "peaks finer than texels, tails beyond the face", "R_d times what entered", _even),
-    Case("texels far wider than light spreads", STAGE, "5 mm apart, 1/sigma_tr 0.01 mm",
-         "a dipole between its samples: all light lost", "the local term, all light kept",
-         _coarse),
-    Case("albedo above one", STAGE, "R_d 1.2", "no reduced albedo", "a named outlier, masked",
-         _above_one),
-    Case("albedo near one and near none", STAGE, "R_d 1e-6 to 1 - 1e-9",
-         "an infinite slope at alpha' = 1", "1 - alpha' falls as R_d rises", _inverse),
-    Case("a single texel", STAGE, "one source, one exit point at the same place",
-         "a singular distance", "R_d times what entered", _single),
-    Case("nothing valid", STAGE, "an empty mask, no source", "empty sums",
-         "nothing valid, nothing leaves", _empty),
-    Case("skin on skin", STAGE, "a fold 1 um wide, one side dark", "light counted twice",
-         "between none and the brightest", _folded),
-    Case("translucency of zero", STAGE, "1/sigma_tr = 0", "division by it",
-         "GatherError naming translucency_mm", _opaque),
-)  # fmt: skip
+    Case(
+        "even light on any medium",
+        STAGE,
+        "R_d 0 to 1, 1/sigma_tr 0.01 to 100 mm",
+        "peaks finer than texels, tails beyond the face",
+        "R_d times what entered",
+        _even,
+    ),
+    Case(
+        "texels far wider than light spreads",
+        STAGE,
+        "5 mm apart, 1/sigma_tr 0.01 mm",
+        "a dipole between its samples: all light lost",
+        "the local term, all light kept",
+        _coarse,
+    ),
+    Case(
+        "albedo above one",
+        STAGE,
+        "R_d 1.2",
+        "no reduced albedo",
+        "a named outlier, masked",
+        _above_one,
+    ),
+    Case(
+        "albedo near one and near none",
+        STAGE,
+        "R_d 1e-6 to 1 - 1e-9",
+        "an infinite slope at alpha' = 1",
+        "1 - alpha' falls as R_d rises",
+        _inverse,
+    ),
+    Case(
+        "a single texel",
+        STAGE,
+        "one source, one exit point at the same place",
+        "a singular distance",
+        "R_d times what entered",
+        _single,
+    ),
+    Case(
+        "nothing valid",
+        STAGE,
+        "an empty mask, no source",
+        "empty sums",
+        "nothing valid, nothing leaves",
+        _empty,
+    ),
+    Case(
+        "skin on skin",
+        STAGE,
+        "a fold 1 um wide, one side dark",
+        "light counted twice",
+        "between none and the brightest",
+        _folded,
+    ),
+    Case(
+        "translucency of zero",
+        STAGE,
+        "1/sigma_tr = 0",
+        "division by it",
+        "GatherError naming translucency_mm",
+        _opaque,
+    ),
+)

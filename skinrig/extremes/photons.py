@@ -37,10 +37,13 @@ def _z_of_layers(real: Real, *layers: Matter, eta: float = 1.4) -> str:
     found = _walked(real, *layers, eta=eta)
     told = float(
         tissue_optics.layer_stack_reflectance(
-            as_real(absorption, real), as_real(scattering, real), as_real(depth, real),
-            eta=float(real(eta)), directions=32,
+            as_real(absorption, real),
+            as_real(scattering, real),
+            as_real(depth, real),
+            eta=float(real(eta)),
+            directions=32,
         )
-    )  # fmt: skip
+    )
     # the layers' own error: half a percent of what comes back
     error = math.hypot(found.reflectance_stderr, 0.005 * told)
     z = (found.reflectance - told) / error
@@ -98,20 +101,61 @@ def _strong_boundary(real: Real) -> str:
 
 AGREE = "the layers' reflectance (z of both errors, 6e-5 false alarms)"
 CASES = (
-    Case("photons that nothing absorbs", STAGE, "sigma_a 0, 1e-30 and 1e-12",
-         "roulette and weights of walks without an end", "all light comes back or goes through",
-         _nothing_absorbed),
-    Case("photons that are absorbed at once", STAGE, "sigma_a 1000, sigma_s' 1",
-         "weights that underflow", "the surface's reflection, and hardly more", _all_absorbed),
-    Case("single-scattering albedo to 1", STAGE, "sigma_a 1e-5, sigma_s' 1, 20 mm",
-         "walks cut short lose light", AGREE, _albedo_to_one),
-    Case("film on the skin", STAGE, "0.1 nm of sigma_a 50", "steps longer than the layer",
-         "bare skin's reflectance (z, 6e-5 false alarms)", _thin),
-    Case("dark layer on a light one", STAGE, "sigma_a 60 over 0.05 per mm",
-         "steps that cross a stiff boundary", AGREE, _stiff),
-    Case("light layer on a dark one", STAGE, "sigma_a 0.001 over 60 per mm",
-         "steps that cross a stiff boundary", AGREE, _stiff_below),
+    Case(
+        "photons that nothing absorbs",
+        STAGE,
+        "sigma_a 0, 1e-30 and 1e-12",
+        "roulette and weights of walks without an end",
+        "all light comes back or goes through",
+        _nothing_absorbed,
+    ),
+    Case(
+        "photons that are absorbed at once",
+        STAGE,
+        "sigma_a 1000, sigma_s' 1",
+        "weights that underflow",
+        "the surface's reflection, and hardly more",
+        _all_absorbed,
+    ),
+    Case(
+        "single-scattering albedo to 1",
+        STAGE,
+        "sigma_a 1e-5, sigma_s' 1, 20 mm",
+        "walks cut short lose light",
+        AGREE,
+        _albedo_to_one,
+    ),
+    Case(
+        "film on the skin",
+        STAGE,
+        "0.1 nm of sigma_a 50",
+        "steps longer than the layer",
+        "bare skin's reflectance (z, 6e-5 false alarms)",
+        _thin,
+    ),
+    Case(
+        "dark layer on a light one",
+        STAGE,
+        "sigma_a 60 over 0.05 per mm",
+        "steps that cross a stiff boundary",
+        AGREE,
+        _stiff,
+    ),
+    Case(
+        "light layer on a dark one",
+        STAGE,
+        "sigma_a 0.001 over 60 per mm",
+        "steps that cross a stiff boundary",
+        AGREE,
+        _stiff_below,
+    ),
     Case("walks without a surface", STAGE, "eta 1", "Fresnel's 0/0", AGREE, _no_boundary),
-    Case("walks under a strong surface", STAGE, "eta 1.6", "many total reflections", AGREE,
-         _strong_boundary),
-)  # fmt: skip
+    Case(
+        "walks under a strong surface",
+        STAGE,
+        "eta 1.6",
+        "many total reflections",
+        AGREE,
+        _strong_boundary,
+    ),
+)

@@ -7,9 +7,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import load_rig
+from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
     RENDERER,
     Case,
@@ -34,14 +34,17 @@ def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float
     points = np.stack([x, y, height_mm(x, y)], -1).reshape(-1, 3) + np.asarray(offset_mm)
     cell = np.arange(side * side).reshape(side, side)
     a, b, c, d = (
-        cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel(), cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
-    )  # fmt: skip
+        cell[:-1, :-1].ravel(),
+        cell[:-1, 1:].ravel(),
+        cell[1:, 1:].ravel(),
+        cell[1:, :-1].ravel(),
+    )
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     uv = np.stack([(x / across[-1] + 1) / 2, (y / across[-1] + 1) / 2], -1).reshape(-1, 2)
     return build_mesh(points, faces, uv)
 
 
-def _seen(mesh, light_mm) -> NDArray[np.floating]:  # type: ignore[no-untyped-def]
+def _seen(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
     from rigsim.render import Caster, visibility
 
     return visibility(
@@ -117,11 +120,12 @@ def _wrong_unit(real: Real) -> str:
     points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
     return refused(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
-        MeshError, "millimetres",
-    )  # fmt: skip
+        MeshError,
+        "millimetres",
+    )
 
 
-def _surface(direction: NDArray[np.float64], roughness: float, real: Real) -> tuple[float, float]:
+def _surface(direction: Float64Array, roughness: float, real: Real) -> tuple[float, float]:
     from rigsim.light import surface_brdf
 
     packed = as_real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0], real)
@@ -130,7 +134,7 @@ def _surface(direction: NDArray[np.float64], roughness: float, real: Real) -> tu
     return float(total[0].max()), float(specular[0])
 
 
-def _tilted(degrees: float) -> NDArray[np.float64]:
+def _tilted(degrees: float) -> Float64Array:
     angle = math.radians(degrees)
     return np.array([math.sin(angle), 0.0, math.cos(angle)])
 
@@ -178,8 +182,9 @@ def _furnace(real: Real) -> str:
     rng = np.random.default_rng(7)
     count = 200_000
     u, v = rng.random(count), rng.random(count)
-    light = np.stack([np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v),
-                      np.sqrt(1 - u)], -1)  # fmt: skip
+    light = np.stack(
+        [np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v), np.sqrt(1 - u)], -1
+    )
     packed = as_real([1.0, 1.0, 1.0, 0.35, 0.6, 0.0015, 1.0], real)
     back = []
     for degrees in (0.0, 45.0, 80.0):
@@ -224,50 +229,130 @@ def _negative_environment(_: Real) -> str:
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
         "light": {"type": "constant", "radiance": {"type": "rgb", "value": [-1.0, -1.0, -1.0]}},
         "integrator": {"type": "path"},
-    }  # fmt: skip
+    }
     return refused(
         lambda: render.radiance(scene, kind="rgb", samples=1), render.RenderError, "light.radiance"
     )
 
 
 CASES = (
-    Case("shadow far from the origin", "ray casting", "300 mm off",
-         "offsets of rays grow with the distance from the origin", "the same shadow",
-         _shadow_off_origin,
-         one_precision=RENDERER),
-    Case("shadow of furrows far from the origin", "ray casting", "60 um deep, 1000 mm off",
-         "offsets of rays wider than the relief", "the same shadows", _fine_shadow_off_origin,
-         one_precision=RENDERER),
-    Case("light along a plane", "ray casting", "0.1 degrees above it",
-         "a flat sheet shadows itself", "all lit", _no_self_shadow,
-         one_precision=RENDERER),
-    Case("light on the skin", "ray casting", "1 mm away", "rays shorter than their offset",
-         "all lit", _light_on_skin,
-         one_precision=RENDERER),
-    Case("light on skin far from the origin", "ray casting", "0.1 mm away, 1000 mm off",
-         "offsets as long as the ray", "all lit", _light_near_far_skin,
-         one_precision=RENDERER),
-    Case("light behind the skin", "ray casting", "a closed horizon", "light leaks through",
-         "nothing lit", _light_behind,
-         one_precision=RENDERER),
-    Case("triangles without area", "mesh", "three points in a line", "normal 0/0",
-         "unit normals, and rays that hit the others", _zero_triangles),
-    Case("mesh in metres", "mesh", "an extent of 0.1", "offsets larger than the face",
-         "MeshError saying millimetres", _wrong_unit),
-    Case("light and view at 89.9 degrees", "surface reflection", "cosines of 0.0017",
-         "1/(4 cos cos)",
-         "finite, the same both ways, no more than a mirror", _grazing),
-    Case("roughness 0.01 and 1", "microfacets", "a mirror and chalk", "overflow of 1/alpha^4",
-         "closed forms", _roughness_ends),
-    Case("white furnace", "surface reflection", "R_d 1 under films of oil",
-         "lobes that add up to more than all light", "0.7 to 1 (1 % for the random directions)",
-         _furnace),
-    Case("light that is none", "sensor", "negative, NaN, infinite", "noise of a negative mean",
-         "SensorError", _bad_light),
-    Case("a billion times full scale", "sensor", "light 1e9", "Poisson numbers overflow",
-         "white", _very_bright),
-    Case("negative environment", "renderer", "radiance -1",
-         "the renderer makes a negative picture without a word", "RenderError",
-         _negative_environment,
-         one_precision=RENDERER),
-)  # fmt: skip
+    Case(
+        "shadow far from the origin",
+        "ray casting",
+        "300 mm off",
+        "offsets of rays grow with the distance from the origin",
+        "the same shadow",
+        _shadow_off_origin,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "shadow of furrows far from the origin",
+        "ray casting",
+        "60 um deep, 1000 mm off",
+        "offsets of rays wider than the relief",
+        "the same shadows",
+        _fine_shadow_off_origin,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "light along a plane",
+        "ray casting",
+        "0.1 degrees above it",
+        "a flat sheet shadows itself",
+        "all lit",
+        _no_self_shadow,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "light on the skin",
+        "ray casting",
+        "1 mm away",
+        "rays shorter than their offset",
+        "all lit",
+        _light_on_skin,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "light on skin far from the origin",
+        "ray casting",
+        "0.1 mm away, 1000 mm off",
+        "offsets as long as the ray",
+        "all lit",
+        _light_near_far_skin,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "light behind the skin",
+        "ray casting",
+        "a closed horizon",
+        "light leaks through",
+        "nothing lit",
+        _light_behind,
+        one_precision=RENDERER,
+    ),
+    Case(
+        "triangles without area",
+        "mesh",
+        "three points in a line",
+        "normal 0/0",
+        "unit normals, and rays that hit the others",
+        _zero_triangles,
+    ),
+    Case(
+        "mesh in metres",
+        "mesh",
+        "an extent of 0.1",
+        "offsets larger than the face",
+        "MeshError saying millimetres",
+        _wrong_unit,
+    ),
+    Case(
+        "light and view at 89.9 degrees",
+        "surface reflection",
+        "cosines of 0.0017",
+        "1/(4 cos cos)",
+        "finite, the same both ways, no more than a mirror",
+        _grazing,
+    ),
+    Case(
+        "roughness 0.01 and 1",
+        "microfacets",
+        "a mirror and chalk",
+        "overflow of 1/alpha^4",
+        "closed forms",
+        _roughness_ends,
+    ),
+    Case(
+        "white furnace",
+        "surface reflection",
+        "R_d 1 under films of oil",
+        "lobes that add up to more than all light",
+        "0.7 to 1 (1 % for the random directions)",
+        _furnace,
+    ),
+    Case(
+        "light that is none",
+        "sensor",
+        "negative, NaN, infinite",
+        "noise of a negative mean",
+        "SensorError",
+        _bad_light,
+    ),
+    Case(
+        "a billion times full scale",
+        "sensor",
+        "light 1e9",
+        "Poisson numbers overflow",
+        "white",
+        _very_bright,
+    ),
+    Case(
+        "negative environment",
+        "renderer",
+        "radiance -1",
+        "the renderer makes a negative picture without a word",
+        "RenderError",
+        _negative_environment,
+        one_precision=RENDERER,
+    ),
+)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
     Case,
     Real,
@@ -22,7 +23,7 @@ from skinrig.extremes.expectations import (
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def _ring(count: int, tilt_rad: float) -> NDArray[np.float64]:
+def _ring(count: int, tilt_rad: float) -> Float64Array:
     turn = np.arange(count) * (2.0 * np.pi / count)
     side = np.sin(tilt_rad)
     return np.stack(
@@ -30,13 +31,13 @@ def _ring(count: int, tilt_rad: float) -> NDArray[np.float64]:
     )
 
 
-def _degrees_off(normals: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
     from model.metrics import angular_error_rad
 
     return float(np.degrees(np.max(angular_error_rad(normals, truth))))
 
 
-def _lit(lights: NDArray[np.float64], normal: NDArray[np.float64], real: Real) -> NDArray[Any]:
+def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]:
     return as_real(np.clip(lights @ normal, 0.0, None)[:, None, None], real)
 
 
@@ -46,8 +47,10 @@ def _coplanar(real: Real) -> str:
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
-        stereo.PhotometricStereoError, "plane", "along (0.0, -1.0, 0.0);",
-    )  # fmt: skip
+        stereo.PhotometricStereoError,
+        "plane",
+        "along (0.0, -1.0, 0.0);",
+    )
 
 
 def _collinear(real: Real) -> str:
@@ -56,8 +59,10 @@ def _collinear(real: Real) -> str:
     lights = np.repeat(UP[None], 5, axis=0)
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
-        stereo.PhotometricStereoError, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)",
-    )  # fmt: skip
+        stereo.PhotometricStereoError,
+        "line",
+        "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)",
+    )
 
 
 def _all_shadowed(real: Real) -> str:
@@ -82,8 +87,12 @@ def _two_lights_left(real: Real) -> str:
 def _nearly_coplanar(real: Real) -> str:
     from reconstruction import photometric_stereo as stereo
 
-    lights = np.array([[np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)]
-                       for k, t in enumerate(np.linspace(-0.6, 0.6, 9))])  # fmt: skip
+    lights = np.array(
+        [
+            [np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)]
+            for k, t in enumerate(np.linspace(-0.6, 0.6, 9))
+        ]
+    )
     lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
     rng = np.random.default_rng(2)
     noisy = _lit(lights, UP, real) + as_real(rng.normal(0, 1e-3, (9, 1, 1)), real)
@@ -107,8 +116,9 @@ def _grazing(real: Real) -> str:
     from reconstruction import photometric_stereo as stereo
 
     lights = _ring(12, np.radians(89.9))
-    found = stereo.estimate_normals(_lit(np.vstack([lights, UP]), UP, real),
-                                    np.vstack([lights, UP]))  # fmt: skip
+    found = stereo.estimate_normals(
+        _lit(np.vstack([lights, UP]), UP, real), np.vstack([lights, UP])
+    )
     clean(found.normals, found.valid, what="normals")
     if not np.all(found.valid):
         return masked(found.valid)
@@ -123,9 +133,11 @@ def _near_light(real: Real) -> str:
     away = np.linalg.norm(places, axis=-1)
     lit = np.clip(places @ UP / away, 0, None) / away**2
     found = stereo.estimate_normals(
-        as_real(lit[:, None, None], real), places / away[:, None],
-        light_positions_mm=places, points_mm=np.zeros((1, 1, 3)),
-    )  # fmt: skip
+        as_real(lit[:, None, None], real),
+        places / away[:, None],
+        light_positions_mm=places,
+        points_mm=np.zeros((1, 1, 3)),
+    )
     masked(found.valid, share=(1.0, 1.0))
     return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
 
@@ -136,10 +148,12 @@ def _far_light(real: Real) -> str:
     places = 1e7 * _ring(8, 0.6)
     lit = np.clip(_ring(8, 0.6) @ UP, 0, None) / 1e14
     found = stereo.estimate_normals(
-        as_real(1e14 * lit[:, None, None], real), _ring(8, 0.6),
-        light_positions_mm=places, points_mm=np.zeros((1, 1, 3)),
+        as_real(1e14 * lit[:, None, None], real),
+        _ring(8, 0.6),
+        light_positions_mm=places,
+        points_mm=np.zeros((1, 1, 3)),
         light_intensity=np.full(8, 1e14),
-    )  # fmt: skip
+    )
     masked(found.valid, share=(1.0, 1.0))
     return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
 
@@ -201,8 +215,9 @@ def _empty_mask(real: Real) -> str:
     normals[..., 2] = 1.0
     return refused(
         lambda: normal_integration.integrate(as_real(normals, real), valid=np.zeros((4, 4), bool)),
-        normal_integration.IntegrationError, "valid",
-    )  # fmt: skip
+        normal_integration.IntegrationError,
+        "valid",
+    )
 
 
 def _flat_height(real: Real) -> str:
@@ -227,9 +242,8 @@ def _one_point(real: Real) -> str:
     from reconstruction import normal_histogram
 
     return refused(
-        lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0),
-        ValueError,
-    )  # fmt: skip
+        lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0), ValueError
+    )
 
 
 def _relief_without_relief(real: Real) -> str:
@@ -273,43 +287,149 @@ def _nothing_to_fill(real: Real) -> str:
 
 
 CASES = (
-    Case("lights in a plane", "photometric stereo", "nine directions of one plane",
-         "a matrix of rank 2", "PhotometricStereoError naming the direction that is not seen",
-         _coplanar),
-    Case("one direction only", "photometric stereo", "five equal lights", "a matrix of rank 1",
-         "PhotometricStereoError naming both directions that are not seen", _collinear),
-    Case("lights almost in a plane", "photometric stereo", "0.06 degrees out of it, noise 0.1 %",
-         "condition 1e3 and more", "masked, refused, or an error within 4 stated ones",
-         _nearly_coplanar),
-    Case("every light in shadow", "photometric stereo", "no light at all", "0/0 of the normal",
-         "not valid", _all_shadowed),
-    Case("two lights left", "photometric stereo", "six of eight in shadow", "fewer than unknowns",
-         "not valid", _two_lights_left),
-    Case("light at 89.9 degrees", "photometric stereo", "cosine 0.0017", "division by a cosine",
-         "masked, or within 0.1 degrees", _grazing),
-    Case("light at 1 mm", "photometric stereo", "inverse squares near the skin",
-         "direction differs over the face", "within 0.05 degrees", _near_light),
-    Case("light at 10 km", "photometric stereo", "inverse squares far away",
-         "float32 of squared distances", "within 0.05 degrees", _far_light),
-    Case("units of intensity", "photometric stereo", "1e-12 and 1e12", "thresholds with a unit",
-         "within 0.05 degrees", _scales),
-    Case("a wall", "normal integration", "slope 20 in one column", "one gradient rules all",
-         "a step of about its height, flat beside it", _cliff),
-    Case("a normal on the horizon", "normal integration", "n_z = 0", "infinite slope",
-         "refused, or height finite", _horizontal_normals),
-    Case("islands", "normal integration", "three parts, one of a single pixel",
-         "a constant is free for each", "each flat at 0", _islands),
-    Case("empty mask", "normal integration", "no pixel is valid", "an empty system",
-         "IntegrationError naming valid", _empty_mask),
-    Case("no relief", "normal histogram", "height 0", "all in one bucket", "sum 1, at the middle",
-         _flat_height),
-    Case("cliffs", "normal histogram", "slope 1e6", "normals beyond the last bucket",
-         "sum 1, at the edge", _steep_height),
+    Case(
+        "lights in a plane",
+        "photometric stereo",
+        "nine directions of one plane",
+        "a matrix of rank 2",
+        "PhotometricStereoError naming the direction that is not seen",
+        _coplanar,
+    ),
+    Case(
+        "one direction only",
+        "photometric stereo",
+        "five equal lights",
+        "a matrix of rank 1",
+        "PhotometricStereoError naming both directions that are not seen",
+        _collinear,
+    ),
+    Case(
+        "lights almost in a plane",
+        "photometric stereo",
+        "0.06 degrees out of it, noise 0.1 %",
+        "condition 1e3 and more",
+        "masked, refused, or an error within 4 stated ones",
+        _nearly_coplanar,
+    ),
+    Case(
+        "every light in shadow",
+        "photometric stereo",
+        "no light at all",
+        "0/0 of the normal",
+        "not valid",
+        _all_shadowed,
+    ),
+    Case(
+        "two lights left",
+        "photometric stereo",
+        "six of eight in shadow",
+        "fewer than unknowns",
+        "not valid",
+        _two_lights_left,
+    ),
+    Case(
+        "light at 89.9 degrees",
+        "photometric stereo",
+        "cosine 0.0017",
+        "division by a cosine",
+        "masked, or within 0.1 degrees",
+        _grazing,
+    ),
+    Case(
+        "light at 1 mm",
+        "photometric stereo",
+        "inverse squares near the skin",
+        "direction differs over the face",
+        "within 0.05 degrees",
+        _near_light,
+    ),
+    Case(
+        "light at 10 km",
+        "photometric stereo",
+        "inverse squares far away",
+        "float32 of squared distances",
+        "within 0.05 degrees",
+        _far_light,
+    ),
+    Case(
+        "units of intensity",
+        "photometric stereo",
+        "1e-12 and 1e12",
+        "thresholds with a unit",
+        "within 0.05 degrees",
+        _scales,
+    ),
+    Case(
+        "a wall",
+        "normal integration",
+        "slope 20 in one column",
+        "one gradient rules all",
+        "a step of about its height, flat beside it",
+        _cliff,
+    ),
+    Case(
+        "a normal on the horizon",
+        "normal integration",
+        "n_z = 0",
+        "infinite slope",
+        "refused, or height finite",
+        _horizontal_normals,
+    ),
+    Case(
+        "islands",
+        "normal integration",
+        "three parts, one of a single pixel",
+        "a constant is free for each",
+        "each flat at 0",
+        _islands,
+    ),
+    Case(
+        "empty mask",
+        "normal integration",
+        "no pixel is valid",
+        "an empty system",
+        "IntegrationError naming valid",
+        _empty_mask,
+    ),
+    Case(
+        "no relief",
+        "normal histogram",
+        "height 0",
+        "all in one bucket",
+        "sum 1, at the middle",
+        _flat_height,
+    ),
+    Case(
+        "cliffs",
+        "normal histogram",
+        "slope 1e6",
+        "normals beyond the last bucket",
+        "sum 1, at the edge",
+        _steep_height,
+    ),
     Case("one height", "normal histogram", "1 x 1", "no slope exists", "ValueError", _one_point),
-    Case("kernel of no relief", "kernel fit", "flat skin to flat skin",
-         "every kernel fits the same", "refused, or not valid", _relief_without_relief),
-    Case("no light from inside", "diffuse albedo", "all samples 0", "minimum over nothing",
-         "R_d 0 or masked", _no_diffuse),
-    Case("texture of one texel", "texture fill", "nothing, and one known texel",
-         "division by no weight", "finite; the one value everywhere", _nothing_to_fill),
-)  # fmt: skip
+    Case(
+        "kernel of no relief",
+        "kernel fit",
+        "flat skin to flat skin",
+        "every kernel fits the same",
+        "refused, or not valid",
+        _relief_without_relief,
+    ),
+    Case(
+        "no light from inside",
+        "diffuse albedo",
+        "all samples 0",
+        "minimum over nothing",
+        "R_d 0 or masked",
+        _no_diffuse,
+    ),
+    Case(
+        "texture of one texel",
+        "texture fill",
+        "nothing, and one known texel",
+        "division by no weight",
+        "finite; the one value everywhere",
+        _nothing_to_fill,
+    ),
+)

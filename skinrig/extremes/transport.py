@@ -53,8 +53,9 @@ def _all_light_back(real: Real) -> str:
 
     return near(
         [dipole.total_reflectance(real(1.0), eta) for eta in (1.0, 1.3, 1.4, 1.6)],
-        [1.0] * 4, absolute=0.0,
-    )  # fmt: skip
+        [1.0] * 4,
+        absolute=0.0,
+    )
 
 
 def _more_than_all(real: Real) -> str:
@@ -62,8 +63,9 @@ def _more_than_all(real: Real) -> str:
 
     return refused(
         lambda: dipole.invert_total_reflectance(real(1.02), 1.4),
-        dipole.ReflectanceOutlierError, "1.02",
-    )  # fmt: skip
+        dipole.ReflectanceOutlierError,
+        "1.02",
+    )
 
 
 def _no_absorption(real: Real) -> str:
@@ -82,8 +84,9 @@ def _black_medium(real: Real) -> str:
         as_real([1e3], real), as_real([1.0], real), as_real([math.inf], real)
     )
     said = within(inside, 0.0, 2e-3, what="R_d of layers")
-    value = dipole.reflectance(as_real([0.0, 0.01, 0.1, 1.0, 10.0], real), real(1e3), real(1.0),
-                               1.4)  # fmt: skip
+    value = dipole.reflectance(
+        as_real([0.0, 0.01, 0.1, 1.0, 10.0], real), real(1e3), real(1.0), 1.4
+    )
     rising(-np.asarray(value, np.float64), strictly=False, what="-R(r)")
     # of 1000 / 1001 that is absorbed at each event hardly anything comes back
     total = dipole.total_reflectance(1.0 / 1001.0, 1.4)
@@ -101,8 +104,11 @@ def _radius_ends(real: Real) -> str:
     near(one[0], one[1], relative=1e-5)
     far = as_real([1e30], real)
     within(dipole.reflectance(far, real(0.02), real(1.0), 1.4), 0.0, 0.0, what="at 1e30 mm")
-    refused(lambda: dipole.reflectance(real(np.inf), real(0.02), real(1.0), 1.4), ValueError,
-            "radius_mm")  # fmt: skip
+    refused(
+        lambda: dipole.reflectance(real(np.inf), real(0.02), real(1.0), 1.4),
+        ValueError,
+        "radius_mm",
+    )
     rising(-np.asarray(one, np.float64)[1:], strictly=False, what="-R(r)")
     return f"dipole {within(one, 0.0, 10.0)}; diffusion {within(two, -1e-9, 10.0)}"
 
@@ -129,8 +135,9 @@ def _index_not_physical(real: Real) -> str:
     eta = float(real(0.9))
     return refused(
         lambda: tissue_optics.layer_stack_reflectance([0.01], [1.0], [math.inf], eta=eta),
-        ValueError, "eta",
-    )  # fmt: skip
+        ValueError,
+        "eta",
+    )
 
 
 def _thin_layer(real: Real) -> str:
@@ -160,13 +167,17 @@ def _stiff_layers(real: Real) -> str:
     from model import tissue_optics
 
     fine = tissue_optics.layer_stack_reflectance(
-        as_real([60.0, 0.05], real), as_real([7.0, 3.5], real), as_real([0.25, math.inf], real),
+        as_real([60.0, 0.05], real),
+        as_real([7.0, 3.5], real),
+        as_real([0.25, math.inf], real),
         directions=16,
-    )  # fmt: skip
+    )
     finer = tissue_optics.layer_stack_reflectance(
-        as_real([60.0, 0.05], real), as_real([7.0, 3.5], real), as_real([0.25, math.inf], real),
+        as_real([60.0, 0.05], real),
+        as_real([7.0, 3.5], real),
+        as_real([0.25, math.inf], real),
         directions=32,
-    )  # fmt: skip
+    )
     return near(fine, finer, relative=0.01)
 
 
@@ -196,8 +207,9 @@ def _pigment_beyond(real: Real) -> str:
 
     return refused(
         lambda: tissue_optics.two_layer_reflectance(real(500.0), real(-0.01), real(0.05)),
-        ValueError, "c_m",
-    )  # fmt: skip
+        ValueError,
+        "c_m",
+    )
 
 
 def _table_far(real: Real) -> str:
@@ -253,46 +265,164 @@ def _one_photon(real: Real) -> str:
 
 
 CASES = (
-    Case("reduced albedo to 1", "dipole", "1 - alpha' from 1e-1 down to 1e-15",
-         "R_d has infinite slope at 1: digits are lost", "1 - R_d rises; inverse to rounding",
-         _albedo_near_one),
-    Case("reflectance from 1e-6 to 1 - 1e-9", "dipole", "both ends of R_d at once",
-         "the inverse of eq. (5) stalls or jumps", "alpha' rises with R_d", _reflectance_ends),
-    Case("no loss at all", "dipole", "alpha' = 1 for eta from 1 to 1.6",
-         "0/0 in the boundary's term", "R_d = 1 for every eta", _all_light_back),
-    Case("more light than fell", "dipole", "R_d = 1.02", "a root that does not exist",
-         "ReflectanceOutlierError naming the value", _more_than_all),
-    Case("absorption to zero", "dipole", "sigma_a = 0 and 1e-12", "sigma_tr = 0 under a root",
-         "both profiles agree", _no_absorption),
-    Case("absorption far above scattering", "layers", "sigma_a = 1000, sigma_s' = 1",
-         "exponentials under- and overflow", "R_d below 0.002, finite", _black_medium),
-    Case("distance to zero and infinity", "dipole", "r = 0, 1e-9, 100, 10,000 and 1e30 mm",
-         "1/r and e^-r", "finite, smooth at 0, none far away; infinity refused", _radius_ends),
-    Case("index 1 and 1.6", "layers", "no boundary, and a strong one", "Fresnel's averages",
-         "less light leaves the denser medium", _index_ends),
-    Case("index below 1", "layers", "eta = 0.9", "total reflection outside", "ValueError",
-         _index_not_physical),
-    Case("layer thinner than a mean free path", "layers", "1e-9 mm over an infinite layer",
-         "doubling from an empty start", "the lower layer alone", _thin_layer),
-    Case("empty layer", "layers", "no absorption, no scattering", "0/0 in the albedo",
-         "a pane's back surface, in closed form", _no_layer_at_all),
-    Case("blue light in the darkest skin", "layers", "sigma_a 60 over 0.05 per mm",
-         "stiff absorption across a boundary", "1 % of twice as many directions", _stiff_layers),
-    Case("white skin without end", "layers", "sigma_a = 0, infinite depth",
-         "doubling never converges", "all that entered comes back", _conserving_layers),
-    Case("pigment at its ends", "two-layer skin", "C_m 0 and 0.5, C_hd 0 and 0.32",
-         "absorption over four decades", "darker with each pigment, in (0, 1)", _pigment_ends),
-    Case("negative pigment", "two-layer skin", "C_m = -0.01", "gain instead of loss",
-         "ValueError naming c_m", _pigment_beyond),
-    Case("photon table beyond its rings", "photon table", "r = 0, 1e-4 and 1000 mm",
-         "a pole at 0, extrapolation off the table", "ValueError at 0, else finite and falling",
-         _table_far),
-    Case("profile without decay", "subsurface fit", "28 equal readings", "sigma_tr runs to zero",
-         "not valid, no NaN", _profile_flat),
-    Case("profile of darkness", "subsurface fit", "28 zeros", "logarithm of 0",
-         "not valid, no NaN", _profile_dark),
-    Case("profile with a dead fibre", "subsurface fit", "one NaN of 28, masked",
-         "NaN spreads through sums", "the fit of the other 27", _profile_broken),
-    Case("one photon", "Monte Carlo", "a single path", "no spread to take an error from",
-         "a share from 0 to 1", _one_photon),
-)  # fmt: skip
+    Case(
+        "reduced albedo to 1",
+        "dipole",
+        "1 - alpha' from 1e-1 down to 1e-15",
+        "R_d has infinite slope at 1: digits are lost",
+        "1 - R_d rises; inverse to rounding",
+        _albedo_near_one,
+    ),
+    Case(
+        "reflectance from 1e-6 to 1 - 1e-9",
+        "dipole",
+        "both ends of R_d at once",
+        "the inverse of eq. (5) stalls or jumps",
+        "alpha' rises with R_d",
+        _reflectance_ends,
+    ),
+    Case(
+        "no loss at all",
+        "dipole",
+        "alpha' = 1 for eta from 1 to 1.6",
+        "0/0 in the boundary's term",
+        "R_d = 1 for every eta",
+        _all_light_back,
+    ),
+    Case(
+        "more light than fell",
+        "dipole",
+        "R_d = 1.02",
+        "a root that does not exist",
+        "ReflectanceOutlierError naming the value",
+        _more_than_all,
+    ),
+    Case(
+        "absorption to zero",
+        "dipole",
+        "sigma_a = 0 and 1e-12",
+        "sigma_tr = 0 under a root",
+        "both profiles agree",
+        _no_absorption,
+    ),
+    Case(
+        "absorption far above scattering",
+        "layers",
+        "sigma_a = 1000, sigma_s' = 1",
+        "exponentials under- and overflow",
+        "R_d below 0.002, finite",
+        _black_medium,
+    ),
+    Case(
+        "distance to zero and infinity",
+        "dipole",
+        "r = 0, 1e-9, 100, 10,000 and 1e30 mm",
+        "1/r and e^-r",
+        "finite, smooth at 0, none far away; infinity refused",
+        _radius_ends,
+    ),
+    Case(
+        "index 1 and 1.6",
+        "layers",
+        "no boundary, and a strong one",
+        "Fresnel's averages",
+        "less light leaves the denser medium",
+        _index_ends,
+    ),
+    Case(
+        "index below 1",
+        "layers",
+        "eta = 0.9",
+        "total reflection outside",
+        "ValueError",
+        _index_not_physical,
+    ),
+    Case(
+        "layer thinner than a mean free path",
+        "layers",
+        "1e-9 mm over an infinite layer",
+        "doubling from an empty start",
+        "the lower layer alone",
+        _thin_layer,
+    ),
+    Case(
+        "empty layer",
+        "layers",
+        "no absorption, no scattering",
+        "0/0 in the albedo",
+        "a pane's back surface, in closed form",
+        _no_layer_at_all,
+    ),
+    Case(
+        "blue light in the darkest skin",
+        "layers",
+        "sigma_a 60 over 0.05 per mm",
+        "stiff absorption across a boundary",
+        "1 % of twice as many directions",
+        _stiff_layers,
+    ),
+    Case(
+        "white skin without end",
+        "layers",
+        "sigma_a = 0, infinite depth",
+        "doubling never converges",
+        "all that entered comes back",
+        _conserving_layers,
+    ),
+    Case(
+        "pigment at its ends",
+        "two-layer skin",
+        "C_m 0 and 0.5, C_hd 0 and 0.32",
+        "absorption over four decades",
+        "darker with each pigment, in (0, 1)",
+        _pigment_ends,
+    ),
+    Case(
+        "negative pigment",
+        "two-layer skin",
+        "C_m = -0.01",
+        "gain instead of loss",
+        "ValueError naming c_m",
+        _pigment_beyond,
+    ),
+    Case(
+        "photon table beyond its rings",
+        "photon table",
+        "r = 0, 1e-4 and 1000 mm",
+        "a pole at 0, extrapolation off the table",
+        "ValueError at 0, else finite and falling",
+        _table_far,
+    ),
+    Case(
+        "profile without decay",
+        "subsurface fit",
+        "28 equal readings",
+        "sigma_tr runs to zero",
+        "not valid, no NaN",
+        _profile_flat,
+    ),
+    Case(
+        "profile of darkness",
+        "subsurface fit",
+        "28 zeros",
+        "logarithm of 0",
+        "not valid, no NaN",
+        _profile_dark,
+    ),
+    Case(
+        "profile with a dead fibre",
+        "subsurface fit",
+        "one NaN of 28, masked",
+        "NaN spreads through sums",
+        "the fit of the other 27",
+        _profile_broken,
+    ),
+    Case(
+        "one photon",
+        "Monte Carlo",
+        "a single path",
+        "no spread to take an error from",
+        "a share from 0 to 1",
+        _one_photon,
+    ),
+)

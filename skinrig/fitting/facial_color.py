@@ -72,9 +72,12 @@ def fit_facial_color(
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
     try:
         found = facial_color_fit.fit(
-            subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size,
+            subject,
+            radius_px=radius_px,
+            landmarks=marks,
+            stored_size=stored_size,
             progress=progress,
-        )  # fmt: skip
+        )
     except (FacialColorError, UnknownBloodError) as error:
         if subject.has_white:
             raise

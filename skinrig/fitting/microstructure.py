@@ -65,17 +65,14 @@ class SiteFit:
             "kernels": self.kernels,
             "stretch_range": list(self.table.stretch_range),
             "alpha_rms": self.alpha_rms,
-            "sigma_rms_um": None if self.sigma_rms_um is None
+            "sigma_rms_um": None
+            if self.sigma_rms_um is None
             else [v if np.isfinite(v) else None for v in self.sigma_rms_um],
-        }  # fmt: skip
+        }
 
 
 def fit_microstructure(
-    appearances: Sequence[Path],
-    *,
-    out: Path,
-    paper_table: bool = False,
-    on_message: Any = None,
+    appearances: Sequence[Path], *, out: Path, paper_table: bool = False, on_message: Any = None
 ) -> dict[str, SiteFit]:
     """Fit the microstructure part of a dynamic appearance.
 

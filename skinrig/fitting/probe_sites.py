@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
 from reconstruction.subsurface import translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
-
-FloatArray = NDArray[np.float64]
+from skinrig.arrays import Float32Array, Float64Array
 
 FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead": (0.0, 76.0),
@@ -164,7 +162,10 @@ def place(
     valid = known & found_map.valid.all(axis=(0, 1)).all()
     return PlacedTranslucency(
         map=SkinMap(
-            spread[..., :3], "mm", spread[..., 3:], valid,
+            spread[..., :3],
+            "mm",
+            spread[..., 3:],
+            valid,
             "1/sigma_tr of red, green and blue light, between measured sites by kriging",
         ),
         sites=tuple(sites),
@@ -172,12 +173,10 @@ def place(
         conflicts=found_map.conflicts,
         assumed=assumed,
         p_value=tuple(float(p) for p in found_map.p_value),
-    )  # fmt: skip
+    )
 
 
-def _measured(
-    probe: SkinAppearance,
-) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
+def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
     """Return sigma_tr and its standard error of each site by channel."""
     if SUBSURFACE_FILE not in probe.files:
         raise ProbeSiteError(
@@ -206,7 +205,7 @@ def _measured(
     }
 
 
-def _mean_place(name: str, points_mm: FloatArray) -> tuple[FloatArray, float]:
+def _mean_place(name: str, points_mm: Float64Array) -> tuple[Float64Array, float]:
     """Return the point at a mean face's distance from the foremost one, the nose, and how far off.
 
     Distances are as seen from the front; of what lies behind each other the foremost counts.
@@ -225,11 +224,11 @@ class _Chart:
     axis_mm: tuple[float, float] | None
     """x and z of the vertical axis; None: the surface is not round, x counts."""
     radius_mm: float
-    corner_mm: FloatArray
-    size_mm: FloatArray
+    corner_mm: Float64Array
+    size_mm: Float64Array
 
     @staticmethod
-    def of(points_mm: FloatArray, sites: Sequence[Site]) -> _Chart:
+    def of(points_mm: Float64Array, sites: Sequence[Site]) -> _Chart:
         """Find the axis of a face: the centre of the circle nearest to its girth."""
         middle = np.median([site.position_mm[1] for site in sites])
         girth = points_mm[np.abs(points_mm[:, 1] - middle) < 60.0]
@@ -248,7 +247,7 @@ class _Chart:
         low, high = over.min(axis=0), over.max(axis=0)
         return _Chart(axis, radius, low, np.maximum(high - low, 1.0))
 
-    def coordinates(self, points_mm: FloatArray) -> FloatArray:
+    def coordinates(self, points_mm: Float64Array) -> Float64Array:
         """Return (..., 2): along the girth and up, mm, from the corner."""
         along = points_mm[..., 0]
         if self.axis_mm is not None:
@@ -256,7 +255,7 @@ class _Chart:
             along = self.radius_mm * np.arctan2(points_mm[..., 0] - a, points_mm[..., 2] - b)
         return np.asarray(np.stack([along, points_mm[..., 1]], axis=-1) - self.corner_mm)
 
-    def lay(self, found: TranslucencyMap, points_mm: FloatArray) -> NDArray[np.float32]:
+    def lay(self, found: TranslucencyMap, points_mm: Float64Array) -> Float32Array:
         """Return values and standard errors, (H, W, 6), at the places of texels, linear."""
         both = np.concatenate([found.values, found.stderr], axis=-1)
         share = self.coordinates(points_mm) / self.size_mm

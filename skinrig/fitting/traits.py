@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from model.texture_statistics.space import TextureSpace
@@ -30,10 +29,6 @@ from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 from skinrig.traits.labels import Labels
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 RANK: Final = 8
 """Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
@@ -135,9 +130,14 @@ def fit_traits(
         spaces,
         "measured" if all(f.appearance.source == "measured" for f in faces) else "simulated",
         regions.library_parameters(
-            frame, vectors, contrast=contrast, seed=seed, faces=[face.name for face in faces],
-            labels={n: v.astype(float).tolist() for n, v in
-                    {**table.binary, **table.continuous}.items()},
+            frame,
+            vectors,
+            contrast=contrast,
+            seed=seed,
+            faces=[face.name for face in faces],
+            labels={
+                n: v.astype(float).tolist() for n, v in {**table.binary, **table.continuous}.items()
+            },
             landmarks=sorted({face.marked_by for face in faces}),
             inputs={"labels": face_textures.digest(labels)}
             | {f.name: face_textures.digest(f.path / store.DOCUMENT) for f in faces},
@@ -145,7 +145,7 @@ def fit_traits(
             consent=consent.carried(*(face.appearance for face in faces)),
         ),
         {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
-    )  # fmt: skip
+    )
     _write(out, library)
     rows, warnings = summary(library)
     return TraitFit(
@@ -205,11 +205,17 @@ def summary(
 ) -> tuple[tuple[tuple[str, str, int, int, float, float], ...], tuple[str, ...]]:
     """Return a row for each trait and part, and all warnings, each once."""
     rows = tuple(
-        (part, name, trait.members, trait.others, trait.confidence.p_value,
-         trait.confidence.expected_cosine)
+        (
+            part,
+            name,
+            trait.members,
+            trait.others,
+            trait.confidence.p_value,
+            trait.confidence.expected_cosine,
+        )
         for part, space in library.spaces.items()
         for name, trait in space.traits.items()
-    )  # fmt: skip
+    )
     said = [f"{part}: {w}" for part, space in library.spaces.items() for w in space.warnings]
     return rows, tuple(dict.fromkeys(said))
 
@@ -281,9 +287,16 @@ def _surface(
     # the paper's: traits in the space of few non-negative lobes of the population
     mix = brdf_basis.reduce(means, rank, basis=tables, seed=seed)[1]
     return TraitSpace.fit(
-        means, labels.binary, continuous=labels.continuous, space="nmf", basis=mix,
-        metric=products, contrast=contrast, names=first.materials, seed=seed,
-    )  # fmt: skip
+        means,
+        labels.binary,
+        continuous=labels.continuous,
+        space="nmf",
+        basis=mix,
+        metric=products,
+        contrast=contrast,
+        names=first.materials,
+        seed=seed,
+    )
 
 
 def _write(out: Path, library: TraitLibrary) -> None:

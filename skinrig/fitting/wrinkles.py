@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance
@@ -23,6 +22,7 @@ from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import WRINKLES, Part
+from skinrig.arrays import BoolArray, Float32Array
 
 STATE = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMALS = ("normals_refined", "normals")
@@ -102,9 +102,10 @@ def fit_wrinkles(
     if masks is None:
         small = min(mask_size, side)
         found_zones = fit_zones(
-            amplitudes(neutral, measured, size=(small, small)), zones=ZONES,
+            amplitudes(neutral, measured, size=(small, small)),
+            zones=ZONES,
             rng=np.random.default_rng(seed),
-        )  # fmt: skip
+        )
         stack = found_zones.masks
     else:
         stack = _read_masks(masks)
@@ -128,8 +129,9 @@ def fit_wrinkles(
                 "distinct_zones": None if found_zones is None else found_zones.distinct,
                 "smoothing_mm": smoothing_mm,
                 "consent": consent.carried(*(one for _, one in read.values())),
-                "truth": {state: one.parameters.get("truth", "") for state, (_, one) in
-                          read.items()},
+                "truth": {
+                    state: one.parameters.get("truth", "") for state, (_, one) in read.items()
+                },
             },
             inputs={
                 state: hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
@@ -142,7 +144,7 @@ def fit_wrinkles(
             ),
             seed=read["neutral"][1].seed,
         ),
-    )  # fmt: skip
+    )
     return FittedWrinkles(found, found_zones)
 
 
@@ -216,9 +218,7 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
     return _as_maps(found.normals, found.stderr, found.valid)
 
 
-def _as_maps(
-    normals: NDArray[np.float32], stderr: NDArray[np.float32] | None, valid: NDArray[np.bool_]
-) -> NormalMaps:
+def _as_maps(normals: Float32Array, stderr: Float32Array | None, valid: BoolArray) -> NormalMaps:
     """Return normals with the angle that their components' errors make."""
     shape = valid.shape
     error = np.zeros(shape) if stderr is None else np.sqrt((stderr.astype(float) ** 2).sum(axis=2))
@@ -231,11 +231,11 @@ def _as_maps(
     )
 
 
-def _read_masks(paths: Sequence[Path]) -> NDArray[np.float32]:
+def _read_masks(paths: Sequence[Path]) -> Float32Array:
     """Return zones from RGBA pictures, (Z, h, w)."""
     import cv2
 
-    planes: list[NDArray[np.float32]] = []
+    planes: list[Float32Array] = []
     for path in paths:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if picture is None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan import Plan
 from capture.plan.dome import EXPOSURES_S, dome_plan
@@ -23,10 +22,9 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Prediction
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
+from skinrig.arrays import Float64Array
 from skinrig.planning.dome_observation import LIGHT_ERROR, Sight, sight
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
-
-Floats = NDArray[np.float64]
 
 VALID_SHARE = 0.9
 """Of the points that the whole dome gives an estimate, so many must keep one."""
@@ -84,15 +82,22 @@ def choose(
     target = math.radians(wants.get("normals", 90.0))
     share = valid_share * best.valid_share
     selected = light_selection.select(
-        look.information(every_view), median_rad=target, valid_share=share, least=least,
+        look.information(every_view),
+        median_rad=target,
+        valid_share=share,
+        least=least,
         most=most_lights,
-    )  # fmt: skip
+    )
     lights, prediction = list(selected.lights), selected.prediction
     while not _r_d_reached(prediction, look, wants) and len(lights) < len(rig.lights):
         selected = light_selection.select(
-            look.information(every_view), median_rad=0.0, valid_share=2.0, least=least,
-            most=len(lights) + 1, fixed=tuple(lights),
-        )  # fmt: skip
+            look.information(every_view),
+            median_rad=0.0,
+            valid_share=2.0,
+            least=least,
+            most=len(lights) + 1,
+            fixed=tuple(lights),
+        )
         lights, prediction = list(selected.lights), selected.prediction
         if most_lights is not None and len(lights) >= most_lights:
             break
@@ -168,9 +173,12 @@ def confirm(
     )
     progress("reconstruct")
     pipeline.reconstruct(
-        done.session, want=("normals", "r_d"), out=out / "appearance", calibration=calibration,
+        done.session,
+        want=("normals", "r_d"),
+        out=out / "appearance",
+        calibration=calibration,
         truth=done.truth.name if done.truth else "",
-    )  # fmt: skip
+    )
     appearance, truth = (store.read(out / name) for name in ("appearance", "truth-face"))
     pairs = surface_evaluation.match(appearance, truth)
     rows = []
@@ -179,20 +187,31 @@ def confirm(
         median = float(np.nanmedian(error))
         rows.append(
             {
-                "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+                "name": one.name,
+                "unit": one.unit,
+                "median": median,
+                "forecast": one.value,
                 "within": one.interval[0] <= median <= one.interval[1],
                 "valid_share": float(np.isfinite(error).mean()),
             }
-        )  # fmt: skip
+        )
     return rows
 
 
 def _choice(
-    rig: Rig, look: Sight, lights: list[int], views: list[int], prediction: Prediction,
-    wants: Mapping[str, float], kept: Rig, full: Any, *,
-    path: tuple[Mapping[str, float], ...] = (), reasons: tuple[str, ...] = (),
+    rig: Rig,
+    look: Sight,
+    lights: list[int],
+    views: list[int],
+    prediction: Prediction,
+    wants: Mapping[str, float],
+    kept: Rig,
+    full: Any,
+    *,
+    path: tuple[Mapping[str, float], ...] = (),
+    reasons: tuple[str, ...] = (),
     plan: Plan | None = None,
-) -> Choice:  # fmt: skip
+) -> Choice:
     plan = dome_plan(kept) if plan is None else plan
     forecasts = tuple(
         Forecast(name, unit, value, _interval(name, value), wants.get(name))
@@ -204,26 +223,37 @@ def _choice(
     left_out = []
     if len(lights) < len(rig.lights):
         names = [light.name for k, light in enumerate(rig.lights) if k not in lights]
-        left_out.append((
-            f"{len(names)} of {len(rig.lights)} lights: {', '.join(names)}",
-            "the others reach what is wanted",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{len(names)} of {len(rig.lights)} lights: {', '.join(names)}",
+                "the others reach what is wanted",
+            )
+        )
     if len(views) < len(rig.views):
         names = [view.name for k, view in enumerate(rig.views) if k not in views]
-        left_out.append((
-            f"{len(names)} of {len(rig.views)} cameras: {', '.join(names)}",
-            "two others see each point that is asked for",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{len(names)} of {len(rig.views)} cameras: {', '.join(names)}",
+                "two others see each point that is asked for",
+            )
+        )
     return Choice(
-        kept, plan, forecasts, plan.estimated_s(kept), full.estimated_s(rig),
+        kept,
+        plan,
+        forecasts,
+        plan.estimated_s(kept),
+        full.estimated_s(rig),
         {
             "lights": [rig.lights[k].name for k in sorted(lights)],
             "views": [rig.views[k].name for k in sorted(views)],
             "valid_share": prediction.valid_share,
             "exposures_s": list(EXPOSURES_S),
         },
-        tuple(left_out), path, reasons, light_of(plan, kept),
-    )  # fmt: skip
+        tuple(left_out),
+        path,
+        reasons,
+        light_of(plan, kept),
+    )
 
 
 def _interval(name: str, value: float) -> tuple[float, float]:
@@ -243,7 +273,7 @@ def _r_d_error(prediction: Prediction, look: Sight) -> float:
     return _median_magnitude(look.unresolved[good], sigma)
 
 
-def _median_magnitude(offset: Floats, sigma: Floats) -> float:
+def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
     """Return the median of |error| of a mixture of Gaussian errors about offsets."""
     from scipy.special import ndtr
 
@@ -260,9 +290,12 @@ def _r_d_reached(prediction: Prediction, look: Sight, wants: Mapping[str, float]
 
 
 def _fewer_views(
-    look: Sight, lights: list[int], prediction: Prediction, wants: Mapping[str, float],
+    look: Sight,
+    lights: list[int],
+    prediction: Prediction,
+    wants: Mapping[str, float],
     valid_share: float,
-) -> tuple[list[int], Prediction]:  # fmt: skip
+) -> tuple[list[int], Prediction]:
     """Take off cameras, the one that is missed least first, while what is wanted is reached."""
     views = list(range(look.variance.shape[2]))
     least = surface_estimates.LEAST_LIGHTS

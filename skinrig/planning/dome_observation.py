@@ -16,8 +16,7 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Information
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
-
-Floats = NDArray[np.float64]
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 POINTS = 1500
 """Points of the face that are looked at."""
@@ -36,23 +35,23 @@ TEXELS = 512
 class Sight:
     """What the dome's lights and cameras reach of a face."""
 
-    normals: Floats
+    normals: Float64Array
     """(P, 3)."""
-    to_light: Floats
+    to_light: Float64Array
     """(P, L, 3)."""
-    variance: Floats
+    variance: Float64Array
     """(P, L, V): variance of a sample over its square; infinite where it tells nothing."""
-    lit: NDArray[np.bool_]
+    lit: BoolArray
     """(P, L): nothing stands between the point and the light."""
-    seen: NDArray[np.bool_]
+    seen: BoolArray
     """(P, V): nothing stands between the point and the camera."""
-    area_mm2: Floats
+    area_mm2: Float64Array
     """(P,)."""
-    systematic_rad: Floats
+    systematic_rad: Float64Array
     """(P,)."""
-    unresolved: Floats
+    unresolved: Float64Array
     """(P, 3): what the albedo of camera RGB is off where it is averaged over pixels, relative."""
-    r_d: Floats
+    r_d: Float64Array
     """(P, 3): that albedo."""
     pixel_mm: float
 
@@ -64,9 +63,13 @@ class Sight:
         enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.LEAST_VIEWS
         noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
         return light_selection.information(
-            self.normals, self.to_light, noise, reaches=self.lit & enough[:, None],
-            importance=self.area_mm2, systematic_rad=self.systematic_rad,
-        )  # fmt: skip
+            self.normals,
+            self.to_light,
+            noise,
+            reaches=self.lit & enough[:, None],
+            importance=self.area_mm2,
+            systematic_rad=self.systematic_rad,
+        )
 
 
 def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -> Sight:
@@ -143,8 +146,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
 
 
 def _toward(
-    caster: Any, start: Floats, normal: Floats, places_mm: Floats
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    caster: Any, start: Float64Array, normal: Float64Array, places_mm: Float64Array
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return unit vectors, distances and free sight from points to places."""
     away = places_mm[None] - start[:, None]
     length = np.linalg.norm(away, axis=-1)
@@ -158,7 +161,7 @@ def _toward(
     return way, length, free
 
 
-def _relative_variance(rate: Floats, full_well_e: float, read_noise_e: float) -> Floats:
+def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
     """Return the variance of merged brackets over the square of the light."""
     told = np.zeros(rate.shape)
     for seconds in EXPOSURES_S:
@@ -169,7 +172,7 @@ def _relative_variance(rate: Floats, full_well_e: float, read_noise_e: float) ->
         return np.asarray(np.where(told > 0, 1.0 / told, np.inf))
 
 
-def _averaged(r_d: NDArray[np.floating], atlas: Any, sigma_mm: float) -> Floats:
+def _averaged(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
     """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
     from rigsim.light.lateral import spread_light
 
@@ -179,7 +182,7 @@ def _averaged(r_d: NDArray[np.floating], atlas: Any, sigma_mm: float) -> Floats:
     return np.asarray(spread.reshape(-1, field.shape[-1]), np.float64)
 
 
-def _bend(face: Any, drawn: NDArray[np.intp], pixel_mm: float) -> Floats:
+def _bend(face: Any, drawn: NDArray[np.intp], pixel_mm: float) -> Float64Array:
     """Return how fast the face's normals turn at texels, rad/mm, over edges as in the scan."""
     mesh = face.mesh
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])

@@ -13,17 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.detectability import detectable
 from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
-
-Floats = NDArray[np.float64]
 
 NAMES = ("melanin", "hemoglobin")
 REPEATS = (1, 2, 4, 8, 16)
@@ -53,19 +51,19 @@ that at 640."""
 class Sight:
     """What the crossed camera sees of a face at full power, by superpixels."""
 
-    melanin: Floats
+    melanin: Float64Array
     """(H, W) volume fraction, as the light's spreading leaves it to be seen."""
-    hemoglobin: Floats
+    hemoglobin: Float64Array
     """(H, W)."""
-    light: Floats
+    light: Float64Array
     """(H, W, 3) fraction of full scale."""
-    skin: NDArray[np.bool_]
+    skin: BoolArray
     """(H, W)."""
     gain: float
     """Variance of a pixel of full scale by its photons."""
     floor: float
     """Variance of a pixel without light."""
-    shares: Floats
+    shares: Float64Array
     """(3,) variance of a superpixel's channels over that of a sensor's pixel."""
     table: Any
     """Color table of the camera and the light."""
@@ -79,11 +77,11 @@ class Sight:
 class Prediction:
     """Relative errors of the face's pixels, standard deviations, by chromophore."""
 
-    sigma: Mapping[str, Floats]
+    sigma: Mapping[str, Float64Array]
     """(H, W)."""
-    valid: Mapping[str, NDArray[np.bool_]]
+    valid: Mapping[str, BoolArray]
     """(H, W) where the estimate would not be masked."""
-    skin: NDArray[np.bool_]
+    skin: BoolArray
 
     def median(self, name: str) -> float:
         """Return the predicted median relative error."""
@@ -120,9 +118,10 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     )
     truth = scene.truth()
     chip = sensor_of(view)
-    light = scene.radiance("crossed") * vignetting_map(
-        chip.vignetting, view.height_px, view.width_px
-    )[..., None]  # fmt: skip
+    light = (
+        scene.radiance("crossed")
+        * vignetting_map(chip.vignetting, view.height_px, view.width_px)[..., None]
+    )
     bare = np.asarray(truth["mask"], bool) & (np.asarray(truth["melanin"]) > 0)
     table = color_table.build(
         view.spectral_sensitivity, small.lights[0].illuminant, anisotropy=ANISOTROPY_SKIN
@@ -135,10 +134,17 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     skin &= (hemoglobin > 0) & (hemoglobin <= table.c_hd_max)
     gain, floor = chip.noise_profile(0.008)
     return Sight(
-        melanin, hemoglobin, to_superpixels(light.astype(np.float64)), skin, gain, floor,
-        _shares(view.cfa), table, light_spread(),
+        melanin,
+        hemoglobin,
+        to_superpixels(light.astype(np.float64)),
+        skin,
+        gain,
+        floor,
+        _shares(view.cfa),
+        table,
+        light_spread(),
         max(1.0, CONFIRM_PX / rig.views[0].width_px) ** MIXING_POWER,
-    )  # fmt: skip
+    )
 
 
 def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Prediction:
@@ -162,9 +168,13 @@ def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Predictio
         relative = variance / np.square(power * look.light)
     skin = look.skin & (relative < 1.0 / DARKEST_SIGMAS**2).all(axis=-1)
     bounds = relative_bounds(
-        look.table, look.melanin[skin], look.hemoglobin[skin], relative[skin],
-        shading_spread=look.light_spread, model_scale=look.mixing,
-    )  # fmt: skip
+        look.table,
+        look.melanin[skin],
+        look.hemoglobin[skin],
+        relative[skin],
+        shading_spread=look.light_spread,
+        model_scale=look.mixing,
+    )
     sigma, valid = {}, {}
     for name, truth, bound in zip(NAMES, (look.melanin, look.hemoglobin), bounds, strict=True):
         told = np.full(skin.shape, np.inf)
@@ -175,9 +185,13 @@ def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Predictio
 
 
 def choose(
-    rig: Rig, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0,
+    rig: Rig,
+    wants: Mapping[str, float],
+    *,
+    subject: str = "III",
+    seed: int = 0,
     valid_share: float = 0.9,
-) -> Choice:  # fmt: skip
+) -> Choice:
     """Choose the quickest plan, and of those the one with the least light, for a face.
 
     Parameters
@@ -209,9 +223,7 @@ def choose(
             )
         chosen = settings
         if _good(found, best, wants, valid_share):
-            return _choice(
-                rig, look, crossed_plan(rig, **chosen), chosen, wants, path=tuple(path)
-            )  # fmt: skip
+            return _choice(rig, look, crossed_plan(rig, **chosen), chosen, wants, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
     reasons = _out_of_reach(best, look, wants, valid_share)
     # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
@@ -223,7 +235,7 @@ def choose(
             break
     return _choice(
         rig, look, crossed_plan(rig, **least), least, wants, path=tuple(path), reasons=reasons
-    )  # fmt: skip
+    )
 
 
 def foresee(
@@ -278,13 +290,17 @@ def confirm(
     )
     progress("reconstruct")
     pipeline.reconstruct(
-        done.session, want=NAMES, out=out / "appearance", calibration=calibration,
+        done.session,
+        want=NAMES,
+        out=out / "appearance",
+        calibration=calibration,
         truth=done.truth.name if done.truth else "",
-    )  # fmt: skip
+    )
     rows = flash.compare(
-        store.read(out / "appearance"), store.read(out / "truth-face"),
+        store.read(out / "appearance"),
+        store.read(out / "truth-face"),
         rng=np.random.default_rng(seed),
-    )  # fmt: skip
+    )
     found = {row.name: row for row in rows if row.band is None and row.against == "blurred"}
     out_rows = []
     for one in choice.forecasts:
@@ -293,11 +309,14 @@ def confirm(
         median = 100.0 * found[one.name].median_relative
         out_rows.append(
             {
-                "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+                "name": one.name,
+                "unit": one.unit,
+                "median": median,
+                "forecast": one.value,
                 "within": one.interval[0] <= median <= one.interval[1],
                 "valid_share": 1.0 - found[one.name].masked,
             }
-        )  # fmt: skip
+        )
     return out_rows
 
 
@@ -327,10 +346,7 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     ]
     yield from sorted(
         every,
-        key=lambda one: (
-            crossed_plan(rig, **one | {"power": 1.0}).estimated_s(rig),
-            one["power"],
-        ),
+        key=lambda one: (crossed_plan(rig, **one | {"power": 1.0}).estimated_s(rig), one["power"]),
     )
 
 
@@ -345,38 +361,55 @@ def _good(
 
 
 def _choice(
-    rig: Rig, look: Sight, plan: Plan, settings: Mapping[str, Any], wants: Mapping[str, float], *,
-    path: tuple[Mapping[str, float], ...] = (), reasons: tuple[str, ...] = (),
-) -> Choice:  # fmt: skip
+    rig: Rig,
+    look: Sight,
+    plan: Plan,
+    settings: Mapping[str, Any],
+    wants: Mapping[str, float],
+    *,
+    path: tuple[Mapping[str, float], ...] = (),
+    reasons: tuple[str, ...] = (),
+) -> Choice:
     parallel = bool(settings.get("parallel", False))
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(look, **own)
     full = flash_plan(rig, repeats=max(int(own["repeats"]), 1))
     forecasts = tuple(
         Forecast(
-            name, "%", 100.0 * found.median(name),
-            interval_of(100.0 * found.median(name), FORECAST_SPREAD[name]), wants.get(name),
+            name,
+            "%",
+            100.0 * found.median(name),
+            interval_of(100.0 * found.median(name), FORECAST_SPREAD[name]),
+            wants.get(name),
         )
         for name in NAMES
-    )  # fmt: skip
+    )
     left_out = []
     if not parallel:
-        left_out.append((
-            f"{own['repeats']} parallel frames",
-            "the crossed ones alone hold the light that melanin and hemoglobin color; the parallel "
-            "ones add the gloss",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{own['repeats']} parallel frames",
+                "the crossed ones alone hold the light that melanin and hemoglobin color; the "
+                "parallel ones add the gloss",
+            )
+        )
     if own["darks"] < 4:
-        left_out.append((
-            f"{4 - own['darks']} of 4 dark frames",
-            "at this exposure the black level that the camera states is off by less than the noise",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{4 - own['darks']} of 4 dark frames",
+                "at this exposure the black level that the camera states is off by less than the "
+                "noise",
+            )
+        )
     if own["power"] < 1.0:
-        left_out.append((
-            f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
-            "what is left errs by at most a twentieth more" if reasons
-            else "what is left reaches what is wanted",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
+                "what is left errs by at most a twentieth more"
+                if reasons
+                else "what is left reaches what is wanted",
+            )
+        )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     pops = len([power for power in powers if power > 0])
     energy = sum(light.energy_ws or 0.0 for light in rig.lights)
@@ -387,13 +420,21 @@ def _choice(
         "flashes_per_s": min(rig.max_pops_per_min / 60.0, pops / max(plan.estimated_s(rig), 1e-9)),
     }
     return Choice(
-        rig, plan, forecasts, plan.estimated_s(rig), full.estimated_s(rig),
+        rig,
+        plan,
+        forecasts,
+        plan.estimated_s(rig),
+        full.estimated_s(rig),
         {
-            **own, "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
+            **own,
+            "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
             "valid_share": {name: found.valid_share(name) for name in NAMES},
         },
-        tuple(left_out), path, reasons, light,
-    )  # fmt: skip
+        tuple(left_out),
+        path,
+        reasons,
+        light,
+    )
 
 
 def _out_of_reach(
@@ -432,13 +473,12 @@ def light_spread() -> float:
     return float(1.0 / np.sqrt(np.sum(slope**2 / prior.density) * prior.step))
 
 
-def _shares(pattern: str) -> Floats:
+def _shares(pattern: str) -> Float64Array:
     """Return the variance of superpixels over that of the sensor's pixels, by channel, (3,)."""
     from capture import raw
 
     frame = raw.RawFrame(
-        cfa=np.full((8, 8), 500, np.uint16), pattern=pattern,
-        black=(0.0,) * 4, white=1000,
-    )  # fmt: skip
+        cfa=np.full((8, 8), 500, np.uint16), pattern=pattern, black=(0.0,) * 4, white=1000
+    )
     image = raw.linear_rgb(frame, demosaic="centered", gain=1.0, read_noise=0.0)
     return np.asarray(image.variance[2, 2] / (0.5 / 1000.0), np.float64)

@@ -15,24 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import PATTERNS
 from capture.rig import Rig
 from rigsim.scenes.gradient.truth import appearance as ground_truth
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
 
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Key = tuple[str, str]
 
 PATCH_PX = 96
 """Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
 SETS: tuple[tuple[str, ...], ...] = (
-    ("x", "-x", "y", "z"), ("full", "x", "y", "z", "-x", "-y", "-z"), tuple(PATTERNS),
-)  # fmt: skip
+    ("x", "-x", "y", "z"),
+    ("full", "x", "y", "z", "-x", "-y", "-z"),
+    tuple(PATTERNS),
+)
 """Patterns that tell light and three gradients: one complement instead of full, which lowers the
 noise more; all complements; and dark."""
 EXPOSURES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
@@ -54,13 +54,13 @@ WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
 class Sight:
     """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
 
-    rates: Mapping[Key, Float32]
+    rates: Mapping[Key, Float32Array]
     """By pattern and polarizer, (H, W), full scales per second at full level."""
     told: Mapping[str, Any]
     """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
     chip: Any
     """The sensor, see `rigsim.sensor.Sensor`."""
-    seen: Floats
+    seen: Float64Array
     """(H, W, 3) normals as the lens shows them."""
     lost_rad: float
     """Median angle between the relief's normals before and behind the lens."""
@@ -143,8 +143,8 @@ def predict(look: Sight, setting: Setting) -> Prediction:
 
     rng = np.random.default_rng([look.seed, 23])
     gain, floor = look.chip.noise_profile(setting.exposure_s)
-    values: dict[Key, Float32] = {}
-    variance: dict[Key, Float32] = {}
+    values: dict[Key, Float32Array] = {}
+    variance: dict[Key, Float32Array] = {}
     for key, rate in look.rates.items():
         if key[0] not in setting.patterns:
             continue
@@ -163,15 +163,20 @@ def predict(look: Sight, setting: Setting) -> Prediction:
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
     return Prediction(
-        median_of_rayleigh(np.hypot(tilt, BEYOND_RAD)), median_of_rayleigh(tilt),
+        median_of_rayleigh(np.hypot(tilt, BEYOND_RAD)),
+        median_of_rayleigh(tilt),
         float(valid.mean()),
-    )  # fmt: skip
+    )
 
 
 def choose(
-    rig: Rig, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0,
+    rig: Rig,
+    wants: Mapping[str, float],
+    *,
+    subject: str = "III",
+    seed: int = 0,
     valid_share: float = 0.9,
-) -> Choice:  # fmt: skip
+) -> Choice:
     """Choose the quickest scan of the neutral skin that reaches what is wanted.
 
     Parameters
@@ -203,12 +208,15 @@ def choose(
         raise PlanningError("rig: got limits that no pattern keeps to")
     path = tuple(
         {
-            "patterns": float(len(one.patterns)), "exposure_s": one.exposure_s,
-            "darks": float(one.darks), "seconds": plan.estimated_s(rig),
-            "normals_deg": math.degrees(found.median_rad), "valid_share": found.valid_share,
+            "patterns": float(len(one.patterns)),
+            "exposure_s": one.exposure_s,
+            "darks": float(one.darks),
+            "seconds": plan.estimated_s(rig),
+            "normals_deg": math.degrees(found.median_rad),
+            "valid_share": found.valid_share,
         }
         for one, plan, found in tried
-    )  # fmt: skip
+    )
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if found.median_rad > target:
@@ -246,14 +254,21 @@ def confirm(
         calibrate(kind, [out / "session-ball"], calibration)
     progress(f"simulate the skin {subject}")
     done = simulate_session(
-        "gradient", out / "session-face", subject=subject, seed=seed, width_px=width,
+        "gradient",
+        out / "session-face",
+        subject=subject,
+        seed=seed,
+        width_px=width,
         plan=choice.plan,
-    )  # fmt: skip
+    )
     progress("reconstruct")
     pipeline.reconstruct(
-        done.session, want=("normals",), out=out / "appearance", calibration=calibration,
+        done.session,
+        want=("normals",),
+        out=out / "appearance",
+        calibration=calibration,
         truth=done.truth.name if done.truth else "",
-    )  # fmt: skip
+    )
     appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
     state = next(name for name in map(state_of, choice.plan.steps) if name is not None)
     made = appearance.maps[f"normals_{state}"]
@@ -265,11 +280,14 @@ def confirm(
     one = choice.forecasts[0]
     return [
         {
-            "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+            "name": one.name,
+            "unit": one.unit,
+            "median": median,
+            "forecast": one.value,
             "within": one.interval[0] <= median <= one.interval[1],
             "valid_share": float(good[inner].mean()),
         }
-    ]  # fmt: skip
+    ]
 
 
 def candidates(rig: Rig, look: Sight | None = None) -> Iterator[tuple[Setting, Plan]]:
@@ -292,9 +310,14 @@ def candidates(rig: Rig, look: Sight | None = None) -> Iterator[tuple[Setting, P
             for darks in (0, 2):
                 try:
                     plan = gradient_plan(
-                        rig, angles=[angle], steps=(0, 0), patterns=patterns, darks=darks,
-                        exposure_s=exposure_s, dwell_s=exposure_s + WHOLE_READOUT_S,
-                    )  # fmt: skip
+                        rig,
+                        angles=[angle],
+                        steps=(0, 0),
+                        patterns=patterns,
+                        darks=darks,
+                        exposure_s=exposure_s,
+                        dwell_s=exposure_s + WHOLE_READOUT_S,
+                    )
                 except PlanError:
                     continue  # beyond what an LED may do
                 setting = setting_of(plan)
@@ -333,9 +356,11 @@ def setting_of(plan: Plan) -> Setting:
     darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
     first = own[0].settings
     return Setting(
-        tuple(name for name in PATTERNS if name in both), float(first["exposure_s"]), darks,
+        tuple(name for name in PATTERNS if name in both),
+        float(first["exposure_s"]),
+        darks,
         max(float(step.settings.get("level", 1.0)) for step in own),
-    )  # fmt: skip
+    )
 
 
 def _angles(rig: Rig) -> Sequence[float]:
@@ -351,10 +376,16 @@ def _brightest(look: Sight, exposure_s: float) -> float:
 
 
 def _choice(
-    rig: Rig, look: Sight, plan: Plan, setting: Setting, wants: Mapping[str, float], *,
-    found: Prediction | None = None, path: tuple[Mapping[str, float], ...] = (),
+    rig: Rig,
+    look: Sight,
+    plan: Plan,
+    setting: Setting,
+    wants: Mapping[str, float],
+    *,
+    found: Prediction | None = None,
+    path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
-) -> Choice:  # fmt: skip
+) -> Choice:
     found = predict(look, setting) if found is None else found
     full = gradient_plan(rig)
     value = math.degrees(found.median_rad)
@@ -364,28 +395,33 @@ def _choice(
     left_out = []
     missing = [name for name in PATTERNS if name not in setting.patterns]
     if missing:
-        left_out.append((
-            f"patterns {', '.join(missing)}",
-            "full light and three gradients are told without them; they would lower the noise",
-        ))  # fmt: skip
-    states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
-    if len(states) < len(every):
-        left_out.append((
-            f"{len(every) - len(states)} of {len(every)} states of strain",
-            "normals are wanted of neutral skin",
-        ))  # fmt: skip
-    if setting.exposure_s < EXPOSURE_S:
-        left_out.append((
-            f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
-            "what is left errs by at most a twentieth more" if reasons
-            else "what is left reaches what is wanted",
-        ))  # fmt: skip
-    if not setting.darks:
         left_out.append(
             (
-                "dark frames",
-                "at this exposure the fixed pattern of the sensor is below its noise",
+                f"patterns {', '.join(missing)}",
+                "full light and three gradients are told without them; they would lower the noise",
             )
+        )
+    states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
+    if len(states) < len(every):
+        left_out.append(
+            (
+                f"{len(every) - len(states)} of {len(every)} states of strain",
+                "normals are wanted of neutral skin",
+            )
+        )
+    if setting.exposure_s < EXPOSURE_S:
+        left_out.append(
+            (
+                f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms "
+                "exposed",
+                "what is left errs by at most a twentieth more"
+                if reasons
+                else "what is left reaches what is wanted",
+            )
+        )
+    if not setting.darks:
+        left_out.append(
+            ("dark frames", "at this exposure the fixed pattern of the sensor is below its noise")
         )
     lost = math.degrees(look.lost_rad)
     reasons += (
@@ -393,18 +429,28 @@ def _choice(
         f"{lost:.2g}° off them, which no pattern brings back",
     )
     return Choice(
-        rig, plan, (forecast,), plan.estimated_s(rig), full.estimated_s(rig),
+        rig,
+        plan,
+        (forecast,),
+        plan.estimated_s(rig),
+        full.estimated_s(rig),
         {
-            "patterns": list(setting.patterns), "polarizers": ["parallel", "crossed"],
+            "patterns": list(setting.patterns),
+            "polarizers": ["parallel", "crossed"],
             "states": sorted(str(name) for name in states),
             "exposure_s": round(setting.exposure_s, 6),
             "dwell_s": next(
                 round(float(s.settings["dwell_s"]), 6) for s in plan.steps if state_of(s)
             ),
-            "darks": setting.darks, "level": setting.level, "valid_share": found.valid_share,
+            "darks": setting.darks,
+            "level": setting.level,
+            "valid_share": found.valid_share,
         },
-        tuple(left_out), path, reasons, light_of(plan, rig),
-    )  # fmt: skip
+        tuple(left_out),
+        path,
+        reasons,
+        light_of(plan, rig),
+    )
 
 
 def _why(best: Prediction, look: Sight) -> str:

@@ -104,8 +104,12 @@ class Choice:
             "reached": self.reached,
             "forecasts": [
                 {
-                    "name": one.name, "unit": one.unit, "median": one.value,
-                    "interval": list(one.interval), "wanted": one.wanted, "reached": one.reached,
+                    "name": one.name,
+                    "unit": one.unit,
+                    "median": one.value,
+                    "interval": list(one.interval),
+                    "wanted": one.wanted,
+                    "reached": one.reached,
                 }
                 for one in self.forecasts
             ],
@@ -117,7 +121,7 @@ class Choice:
             "path": [dict(step) for step in self.path],
             "reasons": list(self.reasons),
             "light": dict(self.light),
-        }  # fmt: skip
+        }
 
 
 def read_wants(text: str, rig: str) -> dict[str, float]:

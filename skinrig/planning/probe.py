@@ -30,9 +30,19 @@ from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
 from skinrig.planning.probe_sight import Sight, sight
 
 __all__ = [
-    "Memory", "Prediction", "Setting", "Sight", "candidates", "choose", "confirm", "foresee",
-    "predict", "setting_of", "sight", "without_sites",
-]  # fmt: skip
+    "Memory",
+    "Prediction",
+    "Setting",
+    "Sight",
+    "candidates",
+    "choose",
+    "confirm",
+    "foresee",
+    "predict",
+    "setting_of",
+    "sight",
+    "without_sites",
+]
 
 
 SHORTEST_S = exposure_series_s()[0]
@@ -46,9 +56,13 @@ DARKS = (1, 2)
 
 
 def choose(
-    rig: Rig, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0,
+    rig: Rig,
+    wants: Mapping[str, float],
+    *,
+    subject: str = "III",
+    seed: int = 0,
     valid_share: float = 0.9,
-) -> Choice:  # fmt: skip
+) -> Choice:
     """Choose the quickest plan that reaches what is wanted.
 
     Parameters
@@ -87,12 +101,15 @@ def choose(
             break
     path = tuple(
         {
-            "exposures": float(len(one.exposures_s)), "longest_s": one.exposures_s[-1],
-            "repeats": float(one.repeats), "seconds": plan.estimated_s(rig),
-            "sigma_tr_percent": 100.0 * found.median, "valid_share": found.valid_share,
+            "exposures": float(len(one.exposures_s)),
+            "longest_s": one.exposures_s[-1],
+            "repeats": float(one.repeats),
+            "seconds": plan.estimated_s(rig),
+            "sigma_tr_percent": 100.0 * found.median,
+            "valid_share": found.valid_share,
         }
         for one, plan, found in tried
-    )  # fmt: skip
+    )
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if good(found):
@@ -137,9 +154,12 @@ def confirm(
     )
     progress("reconstruct")
     pipeline.reconstruct(
-        done.session, want=("subsurface",), out=out / "appearance",
-        calibration=out / "calibration", truth=done.truth.name if done.truth else "",
-    )  # fmt: skip
+        done.session,
+        want=("subsurface",),
+        out=out / "appearance",
+        calibration=out / "calibration",
+        truth=done.truth.name if done.truth else "",
+    )
     rows = [
         row
         for row in subsurface.compare_fits(
@@ -152,11 +172,14 @@ def confirm(
     one = choice.forecasts[0]
     return [
         {
-            "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+            "name": one.name,
+            "unit": one.unit,
+            "median": median,
+            "forecast": one.value,
             "within": one.interval[0] <= median <= one.interval[1],
             "valid_share": len(good) / max(len(rows), 1),
         }
-    ]  # fmt: skip
+    ]
 
 
 def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
@@ -166,9 +189,14 @@ def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
         step_ev = math.log2(longest_s / SHORTEST_S) / (brackets - 1)
         try:
             plan = probe_plan(
-                rig, sites=look.sites, repeats=repeats, brackets=brackets, longest_s=longest_s,
-                step_ev=step_ev, darks=darks,
-            )  # fmt: skip
+                rig,
+                sites=look.sites,
+                repeats=repeats,
+                brackets=brackets,
+                longest_s=longest_s,
+                step_ev=step_ev,
+                darks=darks,
+            )
         except PlanError:
             continue  # beyond what the head may do
         found.append((plan.estimated_s(rig), plan))
@@ -177,9 +205,13 @@ def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
 
 
 def without_sites(
-    look: Sight, setting: Setting, plan: Plan, good: Callable[[Prediction], bool], *,
+    look: Sight,
+    setting: Setting,
+    plan: Plan,
+    good: Callable[[Prediction], bool],
+    *,
     memory: Memory | None = None,
-) -> tuple[Setting, Plan]:  # fmt: skip
+) -> tuple[Setting, Plan]:
     """Take off sites that the others, and people in general, tell of as well as is wanted.
 
     Parameters
@@ -224,56 +256,81 @@ def setting_of(plan: Plan) -> Setting:
     first = [step for step in shots if placement_of(step) == placements[0]]
     times = {float(step.settings["exposure_s"]) for step in darks}
     return Setting(
-        sites, tuple(sorted(float(step.settings["exposure_s"]) for step in first)),
-        max(1, len(placements) // len(sites)), max(1, len(darks) // max(len(times), 1)),
+        sites,
+        tuple(sorted(float(step.settings["exposure_s"]) for step in first)),
+        max(1, len(placements) // len(sites)),
+        max(1, len(darks) // max(len(times), 1)),
         float(first[0].settings.get("level", 1.0)),
-    )  # fmt: skip
+    )
 
 
 def _choice(
-    rig: Rig, look: Sight, plan: Plan, setting: Setting, found: Prediction,
-    wants: Mapping[str, float], *, path: tuple[Mapping[str, float], ...] = (),
+    rig: Rig,
+    look: Sight,
+    plan: Plan,
+    setting: Setting,
+    found: Prediction,
+    wants: Mapping[str, float],
+    *,
+    path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
-) -> Choice:  # fmt: skip
+) -> Choice:
     full = probe_plan(rig, repeats=setting.repeats)
     value = 100.0 * found.median
     low, high = found.interval()
     forecast = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
     left_out = []
     if len(setting.exposures_s) < BRACKETS:
-        left_out.append((
-            f"{BRACKETS - len(setting.exposures_s)} of {BRACKETS} exposures of a series",
-            "wider steps still show every fibre unsaturated and above the noise",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"{BRACKETS - len(setting.exposures_s)} of {BRACKETS} exposures of a series",
+                "wider steps still show every fibre unsaturated and above the noise",
+            )
+        )
     if setting.exposures_s[-1] < 0.99 * LONGEST_S:
-        left_out.append((
-            f"exposures above {setting.exposures_s[-1]:.3g} s",
-            "what the farthest fibres would add does not show beside misfit and certificate",
-        ))  # fmt: skip
+        left_out.append(
+            (
+                f"exposures above {setting.exposures_s[-1]:.3g} s",
+                "what the farthest fibres would add does not show beside misfit and certificate",
+            )
+        )
     for k, site in enumerate(look.sites):
         if not found.measured[k]:
-            left_out.append((
-                f"the {site}",
-                f"the other sites and people in general tell its sigma_tr to "
-                f"{100.0 * float(np.median(found.sigma[k])):.2g} %",
-            ))  # fmt: skip
+            left_out.append(
+                (
+                    f"the {site}",
+                    f"the other sites and people in general tell its sigma_tr to "
+                    f"{100.0 * float(np.median(found.sigma[k])):.2g} %",
+                )
+            )
     if "angle" not in {name for step in plan.steps for name in step.index if step.index[name]}:
-        left_out.append((
-            "further directions of the head", "sigma_tr is wanted, not how it changes with them"
-        ))  # fmt: skip
+        left_out.append(
+            ("further directions of the head", "sigma_tr is wanted, not how it changes with them")
+        )
     by_site = {
         site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
         for k, site in enumerate(look.sites)
     }
     return Choice(
-        rig, plan, (forecast,), plan.estimated_s(rig), full.estimated_s(rig),
+        rig,
+        plan,
+        (forecast,),
+        plan.estimated_s(rig),
+        full.estimated_s(rig),
         {
-            "sites": list(setting.sites), "repeats": setting.repeats, "directions": 1,
+            "sites": list(setting.sites),
+            "repeats": setting.repeats,
+            "directions": 1,
             "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
-            "darks": setting.darks, "valid_share": found.valid_share, BY_SITE: by_site,
+            "darks": setting.darks,
+            "valid_share": found.valid_share,
+            BY_SITE: by_site,
         },
-        tuple(left_out), path, reasons, light_of(plan, rig),
-    )  # fmt: skip
+        tuple(left_out),
+        path,
+        reasons,
+        light_of(plan, rig),
+    )
 
 
 def _why(look: Sight, whole: Prediction, target: float) -> str:

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan.probe import exposure_series_s
 from capture.plan.suction import Placement
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.planning.plans import median_of_normals
 from skinrig.planning.probe_sight import Sight, reading_variance
-
-Floats = NDArray[np.float64]
 
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
 """Standard error of the share of a fibre's light in a spot so many places away, the last of all
@@ -50,22 +48,22 @@ class Prediction:
     """Relative errors of sigma_tr by site and color."""
 
     sites: tuple[str, ...]
-    sigma: Floats
+    sigma: Float64Array
     """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
     the others and people in general leave open. What a fit without noise is off on this skin is
     one draw of the misfit that this states, and not counted beside it."""
-    shared: Floats
+    shared: Float64Array
     """(T, S, 3) the calibration's part, certificate and far cross-talk: what each of its errors
     does to all sites and colors together, which no median averages out."""
-    misfit: Floats
+    misfit: Float64Array
     """(S, 3) what stays without any noise."""
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     """(S, 3)."""
-    measured: NDArray[np.bool_]
+    measured: BoolArray
     """(S,)."""
 
     @property
-    def total(self) -> Floats:
+    def total(self) -> Float64Array:
         """Standard deviation of the error of what is measured and valid."""
         return np.asarray(self.sigma[self.valid & self.measured[:, None]])
 
@@ -75,7 +73,7 @@ class Prediction:
         return median_of_normals(self.total)
 
     @property
-    def common(self) -> Floats:
+    def common(self) -> Float64Array:
         """Standard error of the calibration's part, (S, 3)."""
         return np.asarray(np.sqrt(np.square(self.shared).sum(axis=0)))
 
@@ -172,7 +170,7 @@ def _fits(
 
 
 def _fitted(
-    look: Sight, read: Sequence[Floats], places: Sequence[int], exposures: int, *, noise: bool
+    look: Sight, read: Sequence[Float64Array], places: Sequence[int], exposures: int, *, noise: bool
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fiber.gains import FibreReflectance
@@ -193,9 +191,14 @@ def _fitted(
         told = (value, look.phantom, value / look.phantom)
         doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
         reflectance = FibreReflectance(
-            names, radius, value, variance + gain * value**2 + doubt,
-            np.concatenate([value * look.common, shared]), valid, ~valid,
-        )  # fmt: skip
+            names,
+            radius,
+            value,
+            variance + gain * value**2 + doubt,
+            np.concatenate([value * look.common, shared]),
+            valid,
+            ~valid,
+        )
         head = Measurement(Placement(look.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
         profiles.append(Profile(head, reflectance))
     return fit_profiles(profiles, look.probe) if profiles else []
@@ -217,7 +220,9 @@ def _crosstalk(count: int) -> Any:
     return CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
 
 
-def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_]) -> Floats:
+def _between(
+    look: Sight, found: Float64Array, sigma: Float64Array, good: BoolArray
+) -> Float64Array:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
     from reconstruction.subsurface import translucency
 
@@ -230,8 +235,9 @@ def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_])
         [translucency.SITE_UV[look.sites[k]] for k in measured],
         np.where(good[measured], found[measured], 1.0),
         np.where(good[measured], sigma[measured] * found[measured], np.inf),
-        (MAP_PX, MAP_PX), valid=good[measured],
-    )  # fmt: skip
+        (MAP_PX, MAP_PX),
+        valid=good[measured],
+    )
     for k in known:
         u, v = translucency.SITE_UV[look.sites[k]]
         at = min(int((1.0 - v) * MAP_PX), MAP_PX - 1), min(int(u * MAP_PX), MAP_PX - 1)

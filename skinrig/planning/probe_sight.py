@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan.probe import SITES
 from capture.rig import Rig
+from skinrig.arrays import Float64Array
 from skinrig.planning.plans import PlanningError
-
-Floats = NDArray[np.float64]
 
 SATURATED = 0.95
 """Of the full scale: what is above it is not read."""
@@ -25,18 +23,18 @@ class Sight:
     """What the fibres take from simulated skin, and what the camera makes of it."""
 
     sites: tuple[str, ...]
-    reflectance: Floats
+    reflectance: Float64Array
     """(S, F, 3) in 1/mm^2."""
-    phantom: Floats
+    phantom: Float64Array
     """(F, 3) of the block that the probe is calibrated with."""
-    phantom_error: Floats
+    phantom_error: Float64Array
     """(F, 3) relative error of what the block is expected to give, each fibre's own: the photon
     table's."""
-    common: Floats
+    common: Float64Array
     """(T, F, 3) relative errors of all gains together, by the certificate."""
-    unit: Floats
+    unit: Float64Array
     """(3,) full scales per second in the middle of a spot, for 1/mm^2."""
-    pixels: Floats
+    pixels: Float64Array
     """(3,) of each color in a spot."""
     chip: Any
     """The sensor, see `rigsim.sensor.Sensor`."""
@@ -76,15 +74,21 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2
     return Sight(
-        tuple(sites), reflectance, block.per_mm2, block.stderr / block.per_mm2, block.common,
-        METER_RATE_PER_S * np.asarray(white, np.float64), area * np.array([0.25, 0.5, 0.25]),
-        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING), rig.probe,
-    )  # fmt: skip
+        tuple(sites),
+        reflectance,
+        block.per_mm2,
+        block.stderr / block.per_mm2,
+        block.common,
+        METER_RATE_PER_S * np.asarray(white, np.float64),
+        area * np.array([0.25, 0.5, 0.25]),
+        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING),
+        rig.probe,
+    )
 
 
 def reading_variance(
-    look: Sight, value: Floats, exposures_s: Sequence[float], darks: int, level: float
-) -> Floats:
+    look: Sight, value: Float64Array, exposures_s: Sequence[float], darks: int, level: float
+) -> Float64Array:
     """Return the variance of readings in 1/mm^4, (F, 3); infinite where all are saturated.
 
     Parameters

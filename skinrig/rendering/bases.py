@@ -6,13 +6,11 @@ import dataclasses
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
 from reconstruction import brdf_basis
-
-FloatArray = NDArray[np.float64]
+from skinrig.arrays import Float64Array
 
 POINTS: Final = 5_000
 """Texels, drawn at random, that the mixtures are found on."""
@@ -62,7 +60,7 @@ def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> S
     return dataclasses.replace(model, weights=weights, lobes=model.lobes.mixed(mix))
 
 
-def nearest_shares(shares: FloatArray, mix: FloatArray, lobes: BrdfBasis) -> FloatArray:
+def nearest_shares(shares: Float64Array, mix: Float64Array, lobes: BrdfBasis) -> Float64Array:
     """Return non-negative shares of mixtures whose BRDFs are nearest to given ones.
 
     Parameters

@@ -7,10 +7,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.calibration.geometry import CameraPose
-from rigsim.geometry.mesh import Float32Array
+from skinrig.arrays import Float32Array, Float64Array
 
 Camera = CameraPose
 """Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s centre is (0, 0)."""
@@ -137,7 +137,7 @@ def rays(
     first, last = (0, height) if rows is None else rows
     x = (np.arange(columns * subpixels) + 0.5) / subpixels - 0.5
     y = (np.arange(first * subpixels, last * subpixels) + 0.5) / subpixels - 0.5
-    pixels: NDArray[np.float64] = np.stack(np.meshgrid(x, y), axis=-1)
+    pixels: Float64Array = np.stack(np.meshgrid(x, y), axis=-1)
     directions = camera.rays(pixels).astype(np.float32)
     origin = camera.center_mm.astype(np.float32)
     return np.broadcast_to(origin, directions.shape), directions

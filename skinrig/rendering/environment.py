@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import store
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light, LightError
-
-FloatArray = NDArray[np.float64]
 
 WIDEST_RAD: Final = 0.35
 """Largest angular radius of a light that stands for a part of the map."""
 MOST_LIGHTS: Final = 65_536
 
 
-def directions(height: int, width: int) -> tuple[FloatArray, FloatArray]:
+def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
     """Return unit vectors to the middles of the map's pixels, (H, W, 3), and solid angles, (H, W).
 
     Examples
@@ -118,7 +117,7 @@ def environment_lights(
     )
 
 
-def read_environment(path: str | Path) -> NDArray[np.float32]:
+def read_environment(path: str | Path) -> Float32Array:
     """Read a map from an OpenEXR file, shape (H, W, 3); a gray one has one color.
 
     Raises
@@ -130,6 +129,6 @@ def read_environment(path: str | Path) -> NDArray[np.float32]:
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
-def _vector(values: FloatArray) -> tuple[float, float, float]:
+def _vector(values: Float64Array) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in values)
     return x, y, z

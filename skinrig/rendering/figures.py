@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
 from rigsim.render import Caster
 from skinrig import consent
+from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, reduced
@@ -117,7 +117,7 @@ def draw(
     seen = _rendered(subject.laid, camera, lights, effort)
     seconds = time.perf_counter() - start
     exposure = effort.exposure or exposure_of(seen.radiance, seen.coverage)
-    images: dict[str, NDArray[np.float32]] = {"radiance": seen.radiance}
+    images: dict[str, Float32Array] = {"radiance": seen.radiance}
     pictures = {"radiance": _png(seen.radiance, exposure)}
     if components:
         images |= {"diffuse": seen.diffuse, "surface": seen.surface, "coverage": seen.coverage}
@@ -125,12 +125,16 @@ def draw(
             pictures[name] = _png(images[name], exposure)
         pictures["components"] = sheet([component_panels(seen, exposure)])
     return folder.write(
-        out, images=images, pictures=pictures,
+        out,
+        images=images,
+        pictures=pictures,
         document={
             **_record([subject], camera, lights, effort, seen, assumed),
-            "kind": "picture", "exposure": exposure, "seconds": seconds,
+            "kind": "picture",
+            "exposure": exposure,
+            "seconds": seconds,
         },
-    )  # fmt: skip
+    )
 
 
 def draw_photograph(
@@ -183,20 +187,27 @@ def draw_photograph(
     return folder.write(
         out,
         images={
-            "photograph": photo, "diffuse": seen.diffuse, "photograph_less_diffuse": left,
-            "radiance": seen.radiance, "surface": seen.surface, "coverage": seen.coverage,
+            "photograph": photo,
+            "diffuse": seen.diffuse,
+            "photograph_less_diffuse": left,
+            "radiance": seen.radiance,
+            "surface": seen.surface,
+            "coverage": seen.coverage,
         },
         pictures={"components": sheet([component_panels(seen, exposure, photo)])},
         document={
             **_record([subject], camera, [lamp], effort, seen, photographs.assumed),
-            "kind": "components", "exposure": exposure, "session": session,
-            "held_out": shot.held_out, "seconds": time.perf_counter() - start,
+            "kind": "components",
+            "exposure": exposure,
+            "session": session,
+            "held_out": shot.held_out,
+            "seconds": time.perf_counter() - start,
         },
-    )  # fmt: skip
+    )
 
 
 def component_panels(
-    seen: Rendering, exposure: float, photograph: NDArray[np.floating] | None = None
+    seen: Rendering, exposure: float, photograph: FloatArray | None = None
 ) -> list[Panel]:
     """Return the panels of the paper's figure 12, those that need a photograph where there is one.
 
@@ -210,7 +221,7 @@ def component_panels(
         In the unit of the rendering, (H, W, 3).
     """
 
-    def panel(label: str, image: NDArray[np.floating]) -> Panel:
+    def panel(label: str, image: FloatArray) -> Panel:
         return Panel(label, tone(image, exposure))
 
     out = [] if photograph is None else [panel("(a) photograph", photograph)]
@@ -254,7 +265,7 @@ def draw_bases(
     models = {rank: _of_rank(subjects, rank, effort) for rank in ranks}
     interiors: dict[int, Interior] = {}
     rows: tuple[list[Panel], list[Panel]] = ([], [])
-    images: dict[str, NDArray[np.float32]] = {}
+    images: dict[str, Float32Array] = {}
     exposure, seen = effort.exposure, None
     start = time.perf_counter()
     against = max(ranks)
@@ -277,10 +288,14 @@ def draw_bases(
         for rank, shown in pictures.items()
     }
     return folder.write(
-        out, images=images, pictures={"bases": sheet(rows)},
+        out,
+        images=images,
+        pictures={"bases": sheet(rows)},
         document={
             **_record(list(subjects), camera, lights, effort, seen, assumed),
-            "kind": "bases", "exposure": exposure, "seconds": time.perf_counter() - start,
+            "kind": "bases",
+            "exposure": exposure,
+            "seconds": time.perf_counter() - start,
             "bases": [
                 {
                     "lobes": rank,
@@ -291,7 +306,7 @@ def draw_bases(
                 for rank in ranks
             ],
         },
-    )  # fmt: skip
+    )
 
 
 def draw_shadow_boundary(
@@ -313,7 +328,7 @@ def draw_shadow_boundary(
     folder.check(out)
     media = {"most_translucent": MOST_TRANSLUCENT, "least_translucent": LEAST_TRANSLUCENT}
     rows, widths = [], []
-    images: dict[str, NDArray[np.float32]] = {}
+    images: dict[str, Float32Array] = {}
     start = time.perf_counter()
     for boundary in (
         Boundary.on_face(subject.laid, size_px=size_px),
@@ -337,21 +352,27 @@ def draw_shadow_boundary(
         f"translucent skin; {shadow.WIDTH_MM:g} mm across"
     )
     return folder.write(
-        out, images=images, pictures={"shadow_boundary": sheet(rows, title=title)},
+        out,
+        images=images,
+        pictures={"shadow_boundary": sheet(rows, title=title)},
         document={
-            **subject.record(), "kind": "shadow boundary", "unit": UNIT, "boundaries": widths,
-            "seconds": time.perf_counter() - start, "samples": effort.subpixels**2,
+            **subject.record(),
+            "kind": "shadow boundary",
+            "unit": UNIT,
+            "boundaries": widths,
+            "seconds": time.perf_counter() - start,
+            "samples": effort.subpixels**2,
             "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
             "sigma_tr: here everything is labelled by sigma_tr",
         },
-    )  # fmt: skip
+    )
 
 
 def _words(sigma: Sequence[float]) -> str:
     return "sigma_tr " + ", ".join(f"{value:.4g}" for value in sigma)
 
 
-def _png(image: NDArray[np.floating], exposure: float) -> bytes:
+def _png(image: FloatArray, exposure: float) -> bytes:
     from skinrig.drawing import png
 
     return png.encode(tone(image, exposure))
@@ -365,11 +386,17 @@ def _rendered(
     interior: Interior | None = None,
 ) -> Rendering:
     return render(
-        laid.model, laid, camera, lights, subsurface=effort.subsurface,
-        subpixels=effort.subpixels, shadow_samples=effort.shadow_samples,
+        laid.model,
+        laid,
+        camera,
+        lights,
+        subsurface=effort.subsurface,
+        subpixels=effort.subpixels,
+        shadow_samples=effort.shadow_samples,
         interior=None if interior is None else interior.of_surface(laid),
-        caster=Caster(laid.mesh), progress=effort.progress,
-    )  # fmt: skip
+        caster=Caster(laid.mesh),
+        progress=effort.progress,
+    )
 
 
 def _of_rank(
@@ -386,9 +413,7 @@ def _of_rank(
     return subject, subject.laid.with_lobes(model)
 
 
-def _difference(
-    one: NDArray[np.float32], other: NDArray[np.float32], lit: NDArray[np.bool_]
-) -> float:
+def _difference(one: Float32Array, other: Float32Array, lit: BoolArray) -> float:
     """Return the mean absolute difference over the mean, on lit pixels; NaN without any."""
     if not lit.any() or not other[lit].mean() > 0.0:
         return float("nan")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
+from skinrig.arrays import Float32Array
 from skinrig.console import plain
 
 DOCUMENT: Final = "render.json"
@@ -40,7 +40,7 @@ def check(out: Path) -> None:
 def write(
     out: Path,
     *,
-    images: Mapping[str, NDArray[np.float32]],
+    images: Mapping[str, Float32Array],
     pictures: Mapping[str, bytes],
     document: Mapping[str, Any],
 ) -> dict[str, Any]:

@@ -15,10 +15,9 @@ from scipy.spatial import cKDTree
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
 from rigsim.geometry.atlas import Atlas, spread, unwrap
-from rigsim.geometry.mesh import Float32Array, Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from rigsim.geometry.mesh import Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.rendering.lookup_kernels import look_up
-
-BoolArray = NDArray[np.bool_]
 
 MESH_FILES: Final = ("mesh.obj", "mesh.ply")
 """Names under which an appearance holds the mesh that its maps lie on."""
@@ -184,9 +183,15 @@ class FittedSurface:
         rows = np.zeros((len(uv), self._values.shape[-1]), np.float32)
         share = np.zeros(len(uv), np.float32)
         look_up(
-            self._values, self._known, self.atlas.position_mm, self._width_mm,
-            np.ascontiguousarray(uv, np.float32), point, rows, share,
-        )  # fmt: skip
+            self._values,
+            self._known,
+            self.atlas.position_mm,
+            self._width_mm,
+            np.ascontiguousarray(uv, np.float32),
+            point,
+            rows,
+            share,
+        )
         lobes = self.model.weights.shape[-1]
         measured = share > LEAST_BLEND
         lost = np.flatnonzero(~measured)
@@ -336,7 +341,7 @@ def unit(vectors: ArrayLike) -> Float32Array:
     return np.asarray(np.where(length > 1e-9, given / np.maximum(length, 1e-9), up), np.float32)
 
 
-def _frames(atlas: Atlas) -> NDArray[np.float64]:
+def _frames(atlas: Atlas) -> Float64Array:
     """Return the tangents along u and v and the normal, as rows, shape (N, N, 3, 3)."""
     layers = np.concatenate([atlas.dp_du_mm, atlas.dp_dv_mm, atlas.normal], axis=-1)
     wide = spread(layers, atlas.covered, steps=SPREAD)
@@ -349,7 +354,7 @@ def _same(one: Mesh, other: Mesh) -> bool:
     return bool(np.abs(one.vertices_mm - other.vertices_mm).max() < 1e-3)
 
 
-def _rounding(uv: NDArray[np.floating]) -> tuple[float, float]:
+def _rounding(uv: FloatArray) -> tuple[float, float]:
     """Return the range that rounded coordinates are put into; what is farther out stays wrong."""
     low, high = float(uv.min()), float(uv.max())
     return (0.0 if low > -1e-5 else low), (1.0 if high < 1.0 + 1e-5 else high)

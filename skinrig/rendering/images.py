@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skinrig.arrays import UInt8Array
 from skinrig.drawing import png
-
-UInt8Array = NDArray[np.uint8]
 
 BRIGHT: Final = 0.75
 """Linear value at which the brightest skin is shown."""
@@ -107,9 +106,13 @@ def sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
             y, x = top + i * (height + LABEL_PX + MARGIN_PX), MARGIN_PX + k * (width + MARGIN_PX)
             canvas[y : y + height, x : x + width] = panel.image
             figure.text(
-                (x + 0.5 * width) / total_width, 1.0 - (y + height + 0.5 * LABEL_PX) / total_height,
-                panel.label, ha="center", va="center", **small,
-            )  # fmt: skip
+                (x + 0.5 * width) / total_width,
+                1.0 - (y + height + 0.5 * LABEL_PX) / total_height,
+                panel.label,
+                ha="center",
+                va="center",
+                **small,
+            )
     if title:
         figure.text(0.5, 1.0 - 0.5 * top / total_height, title, ha="center", va="center", **small)
     figure.figimage(canvas, zorder=-1)

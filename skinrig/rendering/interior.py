@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.dipole import gather as dipole_gather
 from model.dipole.gather import SourceTree
 from model.skin_reflectance import transmitted
 from rigsim.geometry.atlas import unwrap
-from rigsim.geometry.mesh import Float32Array
 from rigsim.render import Caster, thread_count, visibility
+from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.lights import Light
-
-FloatArray = NDArray[np.float64]
 
 POINTS: Final = 2
 """Points along each side of a piece that light is looked for at."""
@@ -47,7 +45,7 @@ class Interior:
     across_mm: Float32Array
     along_mm: Float32Array
     normals: Float32Array
-    prim: NDArray[np.int32]
+    prim: Int32Array
     tree: SourceTree
 
     @staticmethod
@@ -79,15 +77,20 @@ class Interior:
         area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
         held = laid.at(uv.astype(np.float32), position, atlas.normal[chosen])
         return Interior(
-            laid, position, across, along, held.normals,
-            atlas.prim[chosen], SourceTree.of(position, area),
-        )  # fmt: skip
+            laid,
+            position,
+            across,
+            along,
+            held.normals,
+            atlas.prim[chosen],
+            SourceTree.of(position, area),
+        )
 
     def of_surface(self, laid: FittedSurface) -> Interior:
         """Return the same pieces below other maps on the same mesh with the same normals."""
         return replace(self, laid=laid)
 
-    def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> FloatArray:
+    def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> Float64Array:
         """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
         faces = shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
@@ -105,9 +108,14 @@ class Interior:
         return total
 
     def leaving(
-        self, entered: FloatArray, position_mm: Float32Array, rows: Rows, entered_at: FloatArray,
-        *, tolerance: float = dipole_gather.TOLERANCE,
-    ) -> FloatArray:  # fmt: skip
+        self,
+        entered: Float64Array,
+        position_mm: Float32Array,
+        rows: Rows,
+        entered_at: Float64Array,
+        *,
+        tolerance: float = dipole_gather.TOLERANCE,
+    ) -> Float64Array:
         """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
 
         Parameters
@@ -122,10 +130,16 @@ class Interior:
             Aimed-at error over the brightest light that entered.
         """
         return dipole_gather.gather(
-            self.tree, entered, position_mm, rows.r_d, rows.translucency_mm,
-            eta=self.laid.model.eta, tolerance=tolerance, entered_at=entered_at,
+            self.tree,
+            entered,
+            position_mm,
+            rows.r_d,
+            rows.translucency_mm,
+            eta=self.laid.model.eta,
+            tolerance=tolerance,
+            entered_at=entered_at,
             workers=min(thread_count(), 4),
-        ).exitance  # fmt: skip
+        ).exitance
 
 
 def entering(
@@ -136,7 +150,7 @@ def entering(
     shadows: Caster,
     samples: int,
     eta: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Return what a light brings to points.
 
     Parameters
@@ -167,9 +181,12 @@ def entering(
     seen = np.zeros(len(cosine))
     center, radius = lamp.disc()
     seen[faced] = visibility(
-        shadows, np.ascontiguousarray(position_mm[faced]),
-        np.ascontiguousarray(face_normal[faced]), center,
-        radius_mm=radius, samples=samples if radius > 0.0 else 1,
-    )  # fmt: skip
+        shadows,
+        np.ascontiguousarray(position_mm[faced]),
+        np.ascontiguousarray(face_normal[faced]),
+        center,
+        radius_mm=radius,
+        samples=samples if radius > 0.0 else 1,
+    )
     arriving = white * (np.maximum(cosine, 0.0) * seen)[:, None]
     return arriving * transmitted(cosine, eta)[:, None], arriving, towards, seen

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.calibration.lights import LightTable
+from skinrig.arrays import Float64Array
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 FAR_MM: Final = 1e5
@@ -114,12 +114,16 @@ class Light:
         place = _three(name, "position_mm", table.position_mm[row])
         away = math.hypot(*place)
         return Light(
-            name=name, position_mm=place, radius=radius_mm, reference_mm=away,
+            name=name,
+            position_mm=place,
+            radius=radius_mm,
+            reference_mm=away,
             intensity=_three(name, "intensity", table.intensity[row] / away**2),
-            axis=_three(name, "axis", table.axis[row]), exponent=float(table.exponent[row]),
-        )  # fmt: skip
+            axis=_three(name, "axis", table.axis[row]),
+            exponent=float(table.exponent[row]),
+        )
 
-    def reach(self, points_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def reach(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return the directions to the light and what a white that faces it would show.
 
         Parameters
@@ -154,7 +158,7 @@ class Light:
             strength = strength * cosine[:, None] ** self.exponent
         return direction, strength * np.asarray(self.intensity)
 
-    def disc(self) -> tuple[FloatArray, float]:
+    def disc(self) -> tuple[Float64Array, float]:
         """Return the centre of the disc, mm, shape (3,), and its radius, mm: shadow rays end there.
 
         A light that is far away stands at `FAR_MM`.

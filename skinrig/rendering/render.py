@@ -22,25 +22,17 @@ from numpy.typing import NDArray
 
 from model.dipole.gather import TOLERANCE
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
-from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.interior import Interior, entering
 from skinrig.rendering.lights import Light
 
-__all__ = [
-    "Camera",
-    "Light",
-    "Rendering",
-    "RenderingError",
-    "Subsurface",
-    "render",
-]
+__all__ = ["Camera", "Light", "Rendering", "RenderingError", "Subsurface", "render"]
 
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 Subsurface = Literal["local", "dipole", "none"]
 """Light from inside leaves where it entered, spreads by the dipole, or is left out."""
@@ -186,10 +178,17 @@ def render(
             progress(f"render: {100 * part[1] // height} %")
     seen.require(camera)
     return Rendering(
-        film.diffuse + film.surface, film.diffuse, film.surface, film.coverage,
-        film.measured & (film.coverage > 1.0 - 1e-6), film.lit & (film.coverage > 1.0 - 1e-6),
-        film.uv, camera, tuple(dict.fromkeys(lamp.name for lamp in lamps)), subsurface,
-    )  # fmt: skip
+        film.diffuse + film.surface,
+        film.diffuse,
+        film.surface,
+        film.coverage,
+        film.measured & (film.coverage > 1.0 - 1e-6),
+        film.lit & (film.coverage > 1.0 - 1e-6),
+        film.uv,
+        camera,
+        tuple(dict.fromkeys(lamp.name for lamp in lamps)),
+        subsurface,
+    )
 
 
 def joined(*meshes: Mesh) -> Mesh:
@@ -229,8 +228,8 @@ class _Points:
 class _Shaded:
     """What n points send to the camera."""
 
-    diffuse: FloatArray
-    surface: FloatArray
+    diffuse: Float64Array
+    surface: Float64Array
     lit: BoolArray
 
 
@@ -288,7 +287,7 @@ class _Film:
         count = np.bincount(pixel, minlength=tall * width).astype(np.float64)
         rows = slice(*part)
 
-        def total(values: NDArray[np.generic]) -> FloatArray:
+        def total(values: NDArray[np.generic]) -> Float64Array:
             sums = np.bincount(pixel, weights=values, minlength=tall * width)
             return np.asarray(sums, np.float64)
 
@@ -313,7 +312,7 @@ def _inside(
     shadow_samples: int,
     interior: Interior | None,
     tolerance: float,
-) -> Callable[[_Points, FloatArray], FloatArray]:
+) -> Callable[[_Points, Float64Array], Float64Array]:
     """Return what gives the light that comes from inside at points, of what enters there."""
     if subsurface == "none":
         return lambda points, entered: np.zeros_like(entered)
@@ -339,7 +338,7 @@ def _shade(
     shadows: Caster,
     shadow_samples: int,
     laid: FittedSurface,
-    inside: Callable[[_Points, FloatArray], FloatArray],
+    inside: Callable[[_Points, Float64Array], Float64Array],
 ) -> _Shaded:
     """Return what points send to the camera by all lights."""
     count = len(points.uv)
@@ -349,16 +348,24 @@ def _shade(
     cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
     for lamp in lamps:
         through, arriving, towards, seen = entering(
-            lamp, points.position_mm, points.face_normal, rows.normals, shadows, shadow_samples,
+            lamp,
+            points.position_mm,
+            points.face_normal,
+            rows.normals,
+            shadows,
+            shadow_samples,
             laid.model.eta,
-        )  # fmt: skip
+        )
         entered += through
         lit |= seen >= LIT
         shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
         lobe = lobe_brdf(
-            laid.model.lobes, rows.weights[shown], towards[shown], points.view[shown],
+            laid.model.lobes,
+            rows.weights[shown],
+            towards[shown],
+            points.view[shown],
             rows.normals[shown],
-        )  # fmt: skip
+        )
         surface[shown] += np.pi * lobe[:, None] * arriving[shown]
     leaving = transmitted(cos_view, laid.model.eta)[:, None]
     return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

@@ -16,19 +16,17 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin_reflectance import SkinReflectance
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light, Vector
 from skinrig.rendering.render import Rendering, RenderingError, render
-
-FloatArray = NDArray[np.float64]
 
 MOST_TRANSLUCENT: Final = (0.3558, 0.7932, 1.5173)
 LEAST_TRANSLUCENT: Final = (0.9171, 1.5682, 1.6569)
@@ -99,16 +97,20 @@ class Boundary:
         at = ((np.arange(PATCH_TEXELS) + 0.5) / PATCH_TEXELS - 0.5) * PATCH_MM
         x, y = np.meshgrid(at, -at)
 
-        def even(name: str) -> NDArray[np.float32]:
+        def even(name: str) -> Float32Array:
             median = np.median(getattr(model, name)[model.valid], axis=0).astype(np.float32)
             return np.broadcast_to(median, (*shape, len(median))).copy()
 
         skin = SkinReflectance(
-            even("r_d"), even("weights"), model.lobes, even("translucency_mm"),
+            even("r_d"),
+            even("weights"),
+            model.lobes,
+            even("translucency_mm"),
             np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)).copy(),
             np.stack([x, y, np.zeros(shape)], axis=-1).astype(np.float32),
-            np.ones(shape, np.bool_), model.eta,
-        )  # fmt: skip
+            np.ones(shape, np.bool_),
+            model.eta,
+        )
         laid = FittedSurface.of(skin, mesh)
         up = np.array([0.0, 0.0, 1.0])
         return _boundary("flat patch", laid, Caster(mesh), np.zeros(3), up, size_px)
@@ -117,19 +119,24 @@ class Boundary:
         """Render it above a medium; None: light leaves where it entered."""
         laid = self.laid if sigma_tr_per_mm is None else self.laid.of_medium(sigma_tr_per_mm)
         return render(
-            laid.model, laid, self.camera, self.light,
-            subsurface="local" if sigma_tr_per_mm is None else "dipole", subpixels=subpixels,
-            blockers=self.card, caster=self.caster,
+            laid.model,
+            laid,
+            self.camera,
+            self.light,
+            subsurface="local" if sigma_tr_per_mm is None else "dipole",
+            subpixels=subpixels,
+            blockers=self.card,
+            caster=self.caster,
             interior=self.interior.of_surface(laid),
-        )  # fmt: skip
+        )
 
 
 def _boundary(
     name: str,
     laid: FittedSurface,
     caster: Caster,
-    target: FloatArray,
-    normal: FloatArray,
+    target: Float64Array,
+    normal: Float64Array,
     size_px: int,
     *,
     finer: int = 1,
@@ -139,9 +146,13 @@ def _boundary(
     up /= np.linalg.norm(up)
     right = np.cross(up, normal)
     camera = rendering_camera.looking_at(
-        target + AWAY_MM * normal, target_mm=target, up=up, size_px=(size_px, size_px // 2),
-        fov_deg=math.degrees(2.0 * math.atan(0.5 * WIDTH_MM / AWAY_MM)), name=name,
-    )  # fmt: skip
+        target + AWAY_MM * normal,
+        target_mm=target,
+        up=up,
+        size_px=(size_px, size_px // 2),
+        fov_deg=math.degrees(2.0 * math.atan(0.5 * WIDTH_MM / AWAY_MM)),
+        name=name,
+    )
     towards = math.cos(SLANT_RAD) * normal - math.sin(SLANT_RAD) * right
     edge = target + CARD_MM * towards
     away = np.cross(up, towards)  # across the light, to the right
@@ -153,7 +164,7 @@ def _boundary(
     return Boundary(name, laid, camera, light, card, caster, below)
 
 
-def profile(seen: Rendering) -> tuple[FloatArray, FloatArray]:
+def profile(seen: Rendering) -> tuple[Float64Array, Float64Array]:
     """Return places across the boundary in mm, (W,), and light from inside there, (W, 3).
 
     The mean over the middle half of the rows; the lit side is at negative places.
@@ -164,7 +175,7 @@ def profile(seen: Rendering) -> tuple[FloatArray, FloatArray]:
     return place, rows.mean(axis=0)
 
 
-def rise_mm(place_mm: FloatArray, level: FloatArray) -> FloatArray:
+def rise_mm(place_mm: Float64Array, level: Float64Array) -> Float64Array:
     """Return how far apart 90 % and 10 % of the fall from light to shadow lie, mm, (3,).
 
     Parameters

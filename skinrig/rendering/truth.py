@@ -10,7 +10,6 @@ from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
@@ -19,9 +18,8 @@ from rigsim.geometry.atlas import spread
 from rigsim.light import surface_brdf
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import Subject
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light
-
-FloatArray = NDArray[np.float64]
 
 ROUGHNESS: Final = np.linspace(0.12, 0.6, 9)
 """Nodes of the roughness."""
@@ -94,15 +92,18 @@ def true_light(scene: DomeScene, index: int, view: str) -> Light:
     half = 60.0 if led.half_intensity_deg is None else led.half_intensity_deg
     red, green, blue = (scene.intensity(index, view_name=view) / away**2).tolist()
     return Light(
-        name=led.name, position_mm=(x, y, z), radius=led.radius_mm, reference_mm=away,
+        name=led.name,
+        position_mm=(x, y, z),
+        radius=led.radius_mm,
+        reference_mm=away,
         intensity=(red, green, blue),
         exponent=float(np.log(0.5) / np.log(np.cos(np.radians(half)))),
-    )  # fmt: skip
+    )
 
 
 def _lobe(
-    roughness: float, oil: float, fuzz: float, light: FloatArray, view: FloatArray
-) -> FloatArray:
+    roughness: float, oil: float, fuzz: float, light: Float64Array, view: Float64Array
+) -> Float64Array:
     packed = np.array([0.0, 0.0, 0.0, roughness, oil, fuzz, 1.0], np.float32)
     up = np.array([0.0, 0.0, 1.0], np.float32)
     to_light, to_view = (_raised(w.reshape(-1, 3)) for w in (light, view))
@@ -110,15 +111,16 @@ def _lobe(
     return np.asarray(found.reshape(light.shape[:-1]), np.float64)
 
 
-def _raised(directions: FloatArray) -> NDArray[np.float32]:
+def _raised(directions: Float64Array) -> Float32Array:
     """Return directions above the horizon, where hair would glow without end."""
     up = np.maximum(directions[:, 2:], LEAST_COSINE)
     across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)
     scale = np.sqrt(1.0 - up**2) / np.maximum(across, 1e-9)
-    flat = np.where(across > np.sqrt(1.0 - LEAST_COSINE**2), directions[:, :2] * scale,
-                    directions[:, :2])  # fmt: skip
+    flat = np.where(
+        across > np.sqrt(1.0 - LEAST_COSINE**2), directions[:, :2] * scale, directions[:, :2]
+    )
     return np.ascontiguousarray(np.concatenate([flat, up], axis=-1), np.float32)
 
 
-def _hair(light: FloatArray, view: FloatArray) -> FloatArray:
+def _hair(light: Float64Array, view: Float64Array) -> Float64Array:
     return _lobe(0.3, 0.0, FUZZ, light, view) - _lobe(0.3, 0.0, 0.0, light, view)

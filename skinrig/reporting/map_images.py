@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting.page import escape, number
 from skinrig.written_units import written
@@ -24,12 +25,12 @@ def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
 
 def scalar_picture(
     title: str,
-    values: NDArray[np.floating],
+    values: FloatArray,
     *,
     low: float,
     high: float,
     scale: str = "viridis",
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     unit: str = "",
     width: int = 280,
     of: str = "",
@@ -71,7 +72,7 @@ def scalar_picture(
     )
 
 
-def _told(values: NDArray[np.float64], mask: NDArray[np.bool_] | None, unit: str) -> str:
+def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     """Return a map's median, its middle 90 %, and how much of it has no value."""
     shown = np.isfinite(values) if mask is None else mask & np.isfinite(values)
     if not shown.any():
@@ -83,9 +84,7 @@ def _told(values: NDArray[np.float64], mask: NDArray[np.bool_] | None, unit: str
     return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
 
 
-def color_picture(
-    title: str, linear: NDArray[np.floating], *, width: int = 320, of: str = ""
-) -> str:
+def color_picture(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> str:
     """Return a figure of a linear sRGB image, (H, W, 3)."""
     small = shrink(np.asarray(linear), width).astype(float)
     finite = np.isfinite(small).all(axis=2)
@@ -96,18 +95,13 @@ def color_picture(
     return plain_picture(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
 
 
-def plain_picture(title: str, image: NDArray[np.uint8], *, alt: str = "") -> str:
+def plain_picture(title: str, image: UInt8Array, *, alt: str = "") -> str:
     """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
 
 
 def normal_picture(
-    title: str,
-    normals: NDArray[np.floating],
-    *,
-    valid: NDArray[np.bool_],
-    width: int = 280,
-    of: str = "normals",
+    title: str, normals: FloatArray, *, valid: BoolArray, width: int = 280, of: str = "normals"
 ) -> str:
     """Return a figure of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
     small = shrink(normals, width).astype(float)
@@ -137,7 +131,7 @@ def _stored(title: str, data: bytes, alt: str, shape: tuple[int, ...] | None) ->
     )
 
 
-def reach_of(values: NDArray[np.floating], shown: NDArray[np.bool_], percentile: float) -> float:
+def reach_of(values: FloatArray, shown: BoolArray, percentile: float) -> float:
     """Return how far a color scale must reach for that percentage of shown |values|."""
     inside = np.abs(values[shown & np.isfinite(values)])
     return float(np.percentile(inside, percentile)) if inside.size else 1.0
@@ -147,10 +141,10 @@ def map_panel(
     name: str,
     unit: str,
     *,
-    estimate: NDArray[np.floating],
-    standard_error: NDArray[np.floating] | None = None,
-    truth: NDArray[np.floating] | None = None,
-    valid: NDArray[np.bool_] | None = None,
+    estimate: FloatArray,
+    standard_error: FloatArray | None = None,
+    truth: FloatArray | None = None,
+    valid: BoolArray | None = None,
     width: int = 280,
 ) -> str:
     """Return truth | estimate | error | standard error of a map, truth and estimate to one scale.
@@ -175,17 +169,21 @@ def map_panel(
     parts = []
 
     def add(
-        title: str,
-        values: NDArray[np.floating],
-        ends: tuple[float, float],
-        scale: str = "viridis",
+        title: str, values: FloatArray, ends: tuple[float, float], scale: str = "viridis"
     ) -> None:
         parts.append(
             scalar_picture(
-                title, values, low=ends[0], high=ends[1], scale=scale, valid=mask, unit=unit,
-                width=width, of=name,
+                title,
+                values,
+                low=ends[0],
+                high=ends[1],
+                scale=scale,
+                valid=mask,
+                unit=unit,
+                width=width,
+                of=name,
             )
-        )  # fmt: skip
+        )
 
     if truth is not None:
         add("truth", truth, (low, high))

@@ -20,9 +20,10 @@ WORDS: Final = {
 _STATE: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
 _NUMBERED: Final = {"basis_weight_": "share of lobe "}
 _OF: Final = {
-    "change_": "change of hemoglobin, ", "hemoglobin_": "hemoglobin, ",
+    "change_": "change of hemoglobin, ",
+    "hemoglobin_": "hemoglobin, ",
     "microrelief_": "microrelief, ",
-}  # fmt: skip
+}
 
 
 def words(name: str) -> str:

@@ -91,9 +91,16 @@ def checks_table(checks: Sequence[Check]) -> str:
             f"<td>{_joined(check.note)}</td></tr>"
         )
     head = (
-        ("verdict", ""), ("check", ""), ("measured", "n"), ("limit", "n"), ("of the limit", "n"),
-        ("truths in 68 % intervals", "n"), ("masked", "n"), ("worst", ""), ("remark", ""),
-    )  # fmt: skip
+        ("verdict", ""),
+        ("check", ""),
+        ("measured", "n"),
+        ("limit", "n"),
+        ("of the limit", "n"),
+        ("truths in 68 % intervals", "n"),
+        ("masked", "n"),
+        ("worst", ""),
+        ("remark", ""),
+    )
     caption = "What was promised and what was measured; missed checks stand first"
     return _scrollable(_head(head, caption) + "".join(rows) + "</tbody></table>", caption)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band, words
@@ -80,11 +80,18 @@ def section(appearance: SkinAppearance) -> str:
     )
     if spreads:
         body += page.table(
-            ("map", "unit", "with a value, %", "median", "median standard error",
-             "of the value, %", "95th percentile of standard errors"),
+            (
+                "map",
+                "unit",
+                "with a value, %",
+                "median",
+                "median standard error",
+                "of the value, %",
+                "95th percentile of standard errors",
+            ),
             spreads,
             caption="Standard errors, of all pixels that have a value",
-        )  # fmt: skip
+        )
     if residuals:
         body += page.table(
             ("map", "unit", "median", "68th percentile", "95th percentile"),
@@ -94,7 +101,7 @@ def section(appearance: SkinAppearance) -> str:
     return body + _by_band(appearance)
 
 
-def _values(one: SkinMap) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _values(one: SkinMap) -> tuple[Float64Array, BoolArray]:
     values = one.values.astype(np.float64)
     good = np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
     return values, good if one.valid is None else good & one.valid
@@ -108,16 +115,26 @@ def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
     share = 100.0 * float(good.mean())
     if "normals" in name:
         degrees = np.degrees(stderr)
-        return (words(name), "°", share, "", float(np.median(degrees)), "",
-                float(np.percentile(degrees, 95)))  # fmt: skip
+        return (
+            words(name),
+            "°",
+            share,
+            "",
+            float(np.median(degrees)),
+            "",
+            float(np.percentile(degrees, 95)),
+        )
     size = np.abs(values[good])
     relative = stderr[size > 0] / size[size > 0]
     return (
-        words(name), page.short_unit(one.unit), share, float(np.median(values[good])),
+        words(name),
+        page.short_unit(one.unit),
+        share,
+        float(np.median(values[good])),
         float(np.median(stderr)),
         100.0 * float(np.median(relative)) if relative.size else float("nan"),
         float(np.percentile(stderr, 95)),
-    )  # fmt: skip
+    )
 
 
 def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
@@ -146,9 +163,14 @@ def _by_band(appearance: SkinAppearance) -> str:
                 continue
             relative = 100.0 * one.stderr[chosen] / np.abs(values[chosen])
             rows.append(
-                (words(name), melanin_band(low, high), int(np.count_nonzero(chosen)),
-                 float(np.median(relative)), float(np.percentile(relative, 95)))
-            )  # fmt: skip
+                (
+                    words(name),
+                    melanin_band(low, high),
+                    int(np.count_nonzero(chosen)),
+                    float(np.median(relative)),
+                    float(np.percentile(relative, 95)),
+                )
+            )
     if not rows:
         return ""
     return page.table(

@@ -47,8 +47,8 @@ def simulate_dome(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False,
-    )  # fmt: skip
+        "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False
+    )
     state = _state(order)
     conditions = _conditions(order)
     rig = _rig(order)
@@ -60,11 +60,19 @@ def simulate_dome(order: Order) -> Simulated:
             order.progress(line)
     shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "dome", "width_px": rig.views[0].width_px, "subject": shown,
-        "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
-        "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
-        "wrapped": order.wrapped, "plan": "" if order.plan is None else order.plan.to_json(),
-    }  # fmt: skip
+        "rig": "dome",
+        "width_px": rig.views[0].width_px,
+        "subject": shown,
+        "target": order.target or "",
+        "mesh": str(order.mesh or ""),
+        "lights": len(rig.lights),
+        "views": len(rig.views),
+        "move": order.move,
+        "state": state,
+        "movement": order.movement,
+        "wrapped": order.wrapped,
+        "plan": "" if order.plan is None else order.plan.to_json(),
+    }
     if order.target is None:
         asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
         if order.leave_out:
@@ -88,9 +96,8 @@ def simulate_dome(order: Order) -> Simulated:
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or figures["open_eyes"] != "allowed"
     rig_seconds = drive(
-        session, rig, scene, order.seed, prompt, order.progress,
-        eyes="closed" if safe else "open",
-    )  # fmt: skip
+        session, rig, scene, order.seed, prompt, order.progress, eyes="closed" if safe else "open"
+    )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
@@ -114,9 +121,14 @@ def simulate_dome(order: Order) -> Simulated:
         )
         store.write(truth, appearance)
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        order.out,
+        truth,
+        len(session.frames()),
+        rig_seconds,
+        tuple(scene.left_out),
+        light=figures,
         effects=effects_of(scene),
-    )  # fmt: skip
+    )
 
 
 def _state(order: Order) -> str:
@@ -296,9 +308,13 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
     few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
     return dome_calibration_plan(
-        rig, cast(DomeTarget, target), poses=few["charuco"], spheres=few["mirror"],
-        plates=few["white"], plate_normals=plate_normals(),
-    )  # fmt: skip
+        rig,
+        cast(DomeTarget, target),
+        poses=few["charuco"],
+        spheres=few["mirror"],
+        plates=few["white"],
+        plate_normals=plate_normals(),
+    )
 
 
 def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
@@ -324,9 +340,17 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
         person = subject.face(seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
-        rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
-        seed=order.seed, conditions=conditions, on_s=longest_on_s(plan), **_light_of_skin(order),
-    )  # fmt: skip
+        rig,
+        person,
+        dome=built,
+        motion=motion,
+        state=order.states[0],
+        movement=order.movement,
+        seed=order.seed,
+        conditions=conditions,
+        on_s=longest_on_s(plan),
+        **_light_of_skin(order),
+    )
 
 
 def _light_of_skin(order: Order) -> dict[str, Any]:
@@ -335,8 +359,9 @@ def _light_of_skin(order: Order) -> dict[str, Any]:
     What changes pixels is built where nothing is asked for.
     """
     asked: dict[str, bool | None] = {
-        "subsurface": order.subsurface or None, "interreflections": order.interreflections or None
-    }  # fmt: skip
+        "subsurface": order.subsurface or None,
+        "interreflections": order.interreflections or None,
+    }
     without = order.without("dome")
     for name in without:
         if asked.get(name):

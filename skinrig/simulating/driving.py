@@ -25,9 +25,12 @@ from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.subject_records import pseudonym
 
 BOXES: Mapping[str, type[Box]] = {
-    "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox, "caliper": CaliperBox,
+    "flash": FlashBox,
+    "dome": DomeBox,
+    "gradient_sphere": GradientSphereBox,
+    "caliper": CaliperBox,
     "probe": ProbeBox,
-}  # fmt: skip
+}
 """Driver of each kind of box."""
 
 
@@ -130,12 +133,21 @@ def drive(
     hear = None if signal is None else partial(signal, world)
     try:
         run_plan(
-            session.plan, rig, boxes=boxes, cameras=cameras, session=session,
-            progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
-            force_limit_n=force_limit_n, run_id=run_id, all_brackets=all_brackets, signal=hear,
+            session.plan,
+            rig,
+            boxes=boxes,
+            cameras=cameras,
+            session=session,
+            progress=progress,
+            prompt=lambda text: prompt(world, text),
+            eyes=eyes,
+            force_limit_n=force_limit_n,
+            run_id=run_id,
+            all_brackets=all_brackets,
+            signal=hear,
             timer=world.clock,
             clock=time.time if begun_s is None else lambda: begun_s + world.now,
-        )  # fmt: skip
+        )
         session.close()
         return float(world.now)
     finally:

@@ -25,9 +25,17 @@ def simulate_flash(order: Order) -> Simulated:
     if target is not None and target not in TARGETS:
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
     order.refuse(
-        "flash", lights=None, views=None, move=False, site=None, angles=None, steps=None,
-        sites=None, all_brackets=False, wrapped=False,
-    )  # fmt: skip
+        "flash",
+        lights=None,
+        views=None,
+        move=False,
+        site=None,
+        angles=None,
+        steps=None,
+        sites=None,
+        all_brackets=False,
+        wrapped=False,
+    )
     if target is None:
         from rigsim.subject.perfusion import STATES
 
@@ -39,13 +47,18 @@ def simulate_flash(order: Order) -> Simulated:
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
     shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "flash", "width_px": width, "subject": shown, "target": target or "",
-        "mesh": str(order.mesh or ""), "states": list(states), "repeats": order.repeats,
+        "rig": "flash",
+        "width_px": width,
+        "subject": shown,
+        "target": target or "",
+        "mesh": str(order.mesh or ""),
+        "states": list(states),
+        "repeats": order.repeats,
         "movement": order.movement,
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
         **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
         **({"nearer_mm": order.nearer_mm} if order.nearer_mm else {}),
-    }  # fmt: skip
+    }
     # what cannot be built must fail before a folder is made
     plan = order.plan or _plan(rig, target, states, order.repeats)
     scenes = _scenes(rig, order, plan)
@@ -67,9 +80,14 @@ def simulate_flash(order: Order) -> Simulated:
     blur = () if target else tuple(float(width) for width in first.resolution_mm())
     left_out = tuple(first.left_out)
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, left_out, blur,
+        order.out,
+        truth,
+        len(session.frames()),
+        rig_seconds,
+        left_out,
+        blur,
         effects=effects_of(first),
-    )  # fmt: skip
+    )
 
 
 def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:
@@ -95,8 +113,13 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
     person = person.moved_by(_stance_mm(rig, order.nearer_mm))
     return {
         state: FlashScene(
-            rig, person, state=state, movement=order.movement, seed=seed, power=power,
+            rig,
+            person,
+            state=state,
+            movement=order.movement,
+            seed=seed,
+            power=power,
             **order.without("flash"),
         )
         for state in order.states
-    }  # fmt: skip
+    }

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig
 from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig.arrays import BoolArray
 from skinrig.simulating.orders import SimulationError
 
 WIDTHS_PX = {"small": 768, "full": 3024}
@@ -38,7 +39,7 @@ def _nearer_mm(scene: Any) -> float:
     return float(np.dot(scene.subject.offset_mm, scene.rig.views[0].axes[2]))
 
 
-def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+def to_superpixels(values: NDArray[Any], mask: BoolArray | None = None) -> NDArray[Any]:
     """Average 2 x 2 pixels, over those inside ``mask`` only.
 
     Parameters

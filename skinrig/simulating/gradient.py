@@ -43,9 +43,18 @@ def simulate_gradient(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "gradient", states=("neutral",), movement=True, repeats=1, mesh=None, lights=None,
-        views=None, move=False, sites=None, all_brackets=False, wrapped=False,
-    )  # fmt: skip
+        "gradient",
+        states=("neutral",),
+        movement=True,
+        repeats=1,
+        mesh=None,
+        lights=None,
+        views=None,
+        move=False,
+        sites=None,
+        all_brackets=False,
+        wrapped=False,
+    )
     if order.target is not None:
         order.refuse("target of the gradient", site=None, angles=None, steps=None)
     # a ball of 12 mm fills the whole sensor, however small all else is kept
@@ -58,17 +67,25 @@ def simulate_gradient(order: Order) -> Simulated:
             order.progress(line)
     shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "gradient", "width_px": rig.views[0].width_px, "subject": shown,
-        "target": order.target or "", "site": order.site or SITE,
+        "rig": "gradient",
+        "width_px": rig.views[0].width_px,
+        "subject": shown,
+        "target": order.target or "",
+        "site": order.site or SITE,
         "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
         "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
         **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
-    }  # fmt: skip
+    }
     scene = make_scene(
-        rig, order.target, site=order.site, subject=order.subject, seed=order.seed, plan=plan,
+        rig,
+        order.target,
+        site=order.site,
+        subject=order.subject,
+        seed=order.seed,
+        plan=plan,
         without=order.without("gradient"),
-    )  # fmt: skip
+    )
     session = open_session(order, plan, rig, asked, scene)
     try:
         log = GripLog(scene, truth_folder(order.out), resume=order.resume, session=session)
@@ -76,9 +93,16 @@ def simulate_gradient(order: Order) -> Simulated:
         session.release()
         raise
     rig_seconds = drive(
-        session, rig, log, order.seed, lambda world, text: None, order.progress,
-        eyes="closed", force_limit_n=FORCE_LIMIT_N, run_id=log.run_id,
-    )  # fmt: skip
+        session,
+        rig,
+        log,
+        order.seed,
+        lambda world, text: None,
+        order.progress,
+        eyes="closed",
+        force_limit_n=FORCE_LIMIT_N,
+        run_id=log.run_id,
+    )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
@@ -97,9 +121,14 @@ def simulate_gradient(order: Order) -> Simulated:
         store.write(truth, appearance)
     log.remove()
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        order.out,
+        truth,
+        len(session.frames()),
+        rig_seconds,
+        tuple(scene.left_out),
+        light=figures,
         effects=effects_of(scene),
-    )  # fmt: skip
+    )
 
 
 def plan_of(rig: Rig, order: Order) -> Plan:
@@ -149,9 +178,11 @@ def make_scene(
         return GradientScene(rig, cast(Any, target), sphere=sphere, seed=seed)
     angles = {float(s.index["angle"]) for s in plan.steps if state_of(s)} if plan else set()
     size_mm = size_for(
-        max(rig.views[0].field_mm), STRETCHES,
-        angle_deg=angles.pop() if len(angles) == 1 else None, shift_mm=SHIFT_MM,
-    )  # fmt: skip
+        max(rig.views[0].field_mm),
+        STRETCHES,
+        angle_deg=angles.pop() if len(angles) == 1 else None,
+        shift_mm=SHIFT_MM,
+    )
     skin = subject_file.named(subject).patch(site or SITE, seed=seed, size_mm=size_mm)
     on_s = None if plan is None else longest_on_s(plan)
     return GradientScene(
@@ -220,9 +251,10 @@ class GripLog:
         for name, steps in states(session.plan):
             ids = {step.id for step in steps}
             lit = [
-                record for record in session.frames("gradient")
+                record
+                for record in session.frames("gradient")
                 if record.step_id in ids and record.settings["pattern"] != "dark"
-            ]  # fmt: skip
+            ]
             if not lit:
                 continue
             run = int(str(lit[0].actual["token"]).partition(".")[0].removeprefix("sim"))

@@ -43,21 +43,34 @@ def simulate_probe(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "probe", states=("neutral",), movement=True, mesh=None, lights=None, views=None, move=False,
-        width_px=None, site=None, steps=None, wrapped=False,
-    )  # fmt: skip
+        "probe",
+        states=("neutral",),
+        movement=True,
+        mesh=None,
+        lights=None,
+        views=None,
+        move=False,
+        width_px=None,
+        site=None,
+        steps=None,
+        wrapped=False,
+    )
     if order.target is not None:
         order.refuse("target of the probe", sites=None, angles=None)
     rig = load_rig("probe")
     plan = plan_of(rig, order)
     shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "probe", "size": order.size, "subject": shown,
-        "target": order.target or "", "sites": ",".join(order.sites or SITES),
-        "repeats": order.repeats, "angles": directions_of(order.angles),
+        "rig": "probe",
+        "size": order.size,
+        "subject": shown,
+        "target": order.target or "",
+        "sites": ",".join(order.sites or SITES),
+        "repeats": order.repeats,
+        "angles": directions_of(order.angles),
         "all_brackets": order.all_brackets,
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
-    }  # fmt: skip
+    }
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or SITES, rig)
@@ -73,9 +86,15 @@ def simulate_probe(order: Order) -> Simulated:
         raise
     # nobody has to place the head: the box is told where it is, and with it the world
     rig_seconds = drive(
-        session, rig, log, order.seed, lambda world, text: None, order.progress,
-        run_id=log.run_id, all_brackets=order.all_brackets,
-    )  # fmt: skip
+        session,
+        rig,
+        log,
+        order.seed,
+        lambda world, text: None,
+        order.progress,
+        run_id=log.run_id,
+        all_brackets=order.all_brackets,
+    )
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
@@ -83,19 +102,26 @@ def simulate_probe(order: Order) -> Simulated:
         appearance = dataclasses.replace(
             appearance,
             parameters={
-                "kind": "truth", "state": "neutral", "subject": order.subject,
+                "kind": "truth",
+                "state": "neutral",
+                "subject": order.subject,
                 **appearance.parameters,
                 **subject_records.of_truth(order.subject, "probe", order.progress),
             },
             inputs={"session": session.content_hash},
             seed=order.seed,
-        )  # fmt: skip
+        )
         store.write(truth, appearance)
     log.remove()
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        order.out,
+        truth,
+        len(session.frames()),
+        rig_seconds,
+        tuple(scene.left_out),
+        light=figures,
         effects=effects_of(scene),
-    )  # fmt: skip
+    )
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
@@ -122,12 +148,7 @@ def plan_of(rig: Rig, order: Order) -> Plan:
 
 
 def make_scene(
-    rig: Rig,
-    target: str | None = None,
-    *,
-    subject: str = "III",
-    seed: int = 0,
-    size: str = "small",
+    rig: Rig, target: str | None = None, *, subject: str = "III", seed: int = 0, size: str = "small"
 ) -> Any:
     """Return what the head is placed on, before fibres as they were built.
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import drive, effects_of, open_session
@@ -58,9 +58,19 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         expected = ", ".join(state for state in STATES if state != "neutral")
         raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")
     order.refuse(
-        "flash", target=None, lights=None, views=None, move=False, site=None, angles=None,
-        steps=None, sites=None, all_brackets=False, repeats=1, states=("neutral",),
-    )  # fmt: skip
+        "flash",
+        target=None,
+        lights=None,
+        views=None,
+        move=False,
+        site=None,
+        angles=None,
+        steps=None,
+        sites=None,
+        all_brackets=False,
+        repeats=1,
+        states=("neutral",),
+    )
     width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
     rig = load_rig("flash").resized(width)
     constant_s = order.relaxation_s
@@ -68,10 +78,14 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         raise SimulationError(f"relaxation: got {constant_s}, expected seconds > 0")
     shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "flash", "width_px": width, "subject": shown,
-        "mesh": str(order.mesh or ""), "sequence": sequence.document(),
-        "relaxation_s": constant_s, "movement": order.movement,
-    }  # fmt: skip
+        "rig": "flash",
+        "width_px": width,
+        "subject": shown,
+        "mesh": str(order.mesh or ""),
+        "sequence": sequence.document(),
+        "relaxation_s": constant_s,
+        "movement": order.movement,
+    }
     reaction_s = sequence.reaction_s
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
@@ -97,9 +111,7 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         if log is not None:  # nothing flashes before the session is open
             log.add(dataclasses.asdict(flash))
 
-    scene = FlashCourseScene(
-        rig, person, course, seed=seed, movement=order.movement, on_flash=note
-    )  # fmt: skip
+    scene = FlashCourseScene(rig, person, course, seed=seed, movement=order.movement, on_flash=note)
     session = open_session(order, plan, rig, asked, scene)
     log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
     before_s = _event_s(session)
@@ -231,7 +243,7 @@ def _constants(course: Any) -> dict[str, float]:
 
 
 def disc_mean(
-    values: NDArray[np.float64], valid: NDArray[np.bool_], place: Sequence[float], radius: float
+    values: Float64Array, valid: BoolArray, place: Sequence[float], radius: float
 ) -> float | None:
     """Return the mean of a map's valid pixels within a disc about (x, y), px; None without any."""
     rows, columns = np.indices(values.shape)

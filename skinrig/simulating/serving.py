@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
+from skinrig.arrays import UInt16Array
 from skinrig.console import Console
 from skinrig.errors import INTERRUPTED, UsageError
 from skinrig.next_steps import named
@@ -20,9 +21,6 @@ from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.subject_records import unseen
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from rigsim.scenes.probe.scene import ProbeScene
     from rigsim.world.suction import HeadState
 
@@ -188,6 +186,6 @@ class _SkinAndBlock:
     def __init__(self, skin: ProbeScene, block: ProbeScene, block_site: str) -> None:
         self._skin, self._block, self._block_site = skin, block, block_site
 
-    def exposure(self, view_name: str, *, head: HeadState, **exposed: Any) -> NDArray[np.uint16]:
+    def exposure(self, view_name: str, *, head: HeadState, **exposed: Any) -> UInt16Array:
         scene = self._block if head.site == self._block_site else self._skin
         return scene.exposure(view_name, head=head, **exposed)

@@ -139,15 +139,38 @@ def simulate_session(
         if number is not None and number < 1:
             raise SimulationError(f"{name}: got {number}, expected a number above 0, or none")
     order = Order(
-        out=Path(out), size=size, seed=seed, subject=subject, mesh=mesh, target=target,
-        states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
-        views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
-        steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
-        movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
-        sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
-        interreflections=interreflections, conditions=dict(conditions or {}),
-        plan=plan, leave_out=tuple(leave_out), nearer_mm=float(nearer_mm),
-    )  # fmt: skip
+        out=Path(out),
+        size=size,
+        seed=seed,
+        subject=subject,
+        mesh=mesh,
+        target=target,
+        states=tuple(states),
+        repeats=repeats,
+        resume=resume,
+        width_px=width_px,
+        lights=lights,
+        views=views,
+        move=move,
+        site=site,
+        angles=None if angles is None else tuple(angles),
+        steps=steps,
+        sites=None if sites is None else tuple(sites),
+        all_brackets=all_brackets,
+        movement=movement,
+        wrapped=wrapped,
+        created=created,
+        person=person,
+        progress=progress,
+        sequence=sequence,
+        relaxation_s=relaxation_s,
+        subsurface=subsurface,
+        interreflections=interreflections,
+        conditions=dict(conditions or {}),
+        plan=plan,
+        leave_out=tuple(leave_out),
+        nearer_mm=float(nearer_mm),
+    )
     order.check_stance(rig_name)
     if rig_name != "dome":
         order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})

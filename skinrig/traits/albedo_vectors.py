@@ -13,17 +13,15 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import texture_statistics
 from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace, histogram_transport
 from model.traits.feasible_sets import Free, Histograms
 from model.traits.vectors import Contrast
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 VectorKind = Literal["quantiles", "histograms"]
 
 KINDS: Final = ("quantiles", "histograms")
@@ -66,7 +64,7 @@ class AlbedoTraits:
 
     def target(
         self, histograms: ArrayLike, amounts: Mapping[str, float]
-    ) -> tuple[Floats, TextureSpace, float]:
+    ) -> tuple[Float64Array, TextureSpace, float]:
         """Return a histogram vector with more or less of some traits.
 
         Parameters
@@ -110,7 +108,7 @@ class AlbedoTraits:
         return after.reshape(-1), space, min(missed / asked, 1.0) if asked > 0 else 0.0
 
 
-def encoded(r_d: ArrayLike, kind: VectorKind) -> Floats:
+def encoded(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
     given = np.asarray(r_d, np.float64)
     if kind == "histograms":
@@ -120,7 +118,7 @@ def encoded(r_d: ArrayLike, kind: VectorKind) -> Floats:
     return np.asarray(np.log(np.maximum(given, LEAST)))
 
 
-def spread(texture: TextureSpace) -> Floats:
+def spread(texture: TextureSpace) -> Float64Array:
     """Return the scale of each response in a population, (C, responses): middle half its edges.
 
     Edges lie half evenly and half by how often values occur, so that the middle half of them spans
@@ -133,15 +131,15 @@ def spread(texture: TextureSpace) -> Floats:
     return np.maximum(middle, NEGLIGIBLE * float(middle[0, 0]))
 
 
-def telling(texture: TextureSpace) -> Bools:
+def telling(texture: TextureSpace) -> BoolArray:
     """Return the responses of more than negligible spread, (C, responses)."""
     scale = spread(texture)
     return np.asarray(scale > 1.001 * NEGLIGIBLE * scale[0, 0], np.bool_)
 
 
 def vector(
-    r_d: ArrayLike, texture: TextureSpace, kind: VectorKind, *, valid: Bools, region: ArrayLike
-) -> Floats:
+    r_d: ArrayLike, texture: TextureSpace, kind: VectorKind, *, valid: BoolArray, region: ArrayLike
+) -> Float64Array:
     """Return the vector of an albedo map, (23808,); see `model.texture_statistics.describe`."""
     found = texture_statistics.describe(
         encoded(r_d, kind), space=texture, valid=valid, region=region
@@ -165,9 +163,14 @@ def fit(
     """Learn the traits of albedo vectors (n, 23808), see `model.traits.TraitSpace.fit`."""
     inside = Free() if kind == "quantiles" else Histograms()
     found = TraitSpace.fit(
-        vectors, labels, continuous=continuous, space="pca", feasible=inside, contrast=contrast,
+        vectors,
+        labels,
+        continuous=continuous,
+        space="pca",
+        feasible=inside,
+        contrast=contrast,
         seed=seed,
-    )  # fmt: skip
+    )
     return AlbedoTraits(kind, texture, found)
 
 
@@ -175,7 +178,7 @@ def fit(
 class AlbedoSample:
     """One face's albedo in the common map."""
 
-    r_d: Image
+    r_d: Float32Array
     """(N, N, 3)."""
-    valid: Bools
+    valid: BoolArray
     """(N, N)."""

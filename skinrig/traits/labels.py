@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skinrig.arrays import BoolArray, Float64Array
 
 
 class LabelError(ValueError):
@@ -33,8 +34,8 @@ class Labels:
     """
 
     names: tuple[str, ...]
-    binary: dict[str, NDArray[np.bool_]]
-    continuous: dict[str, NDArray[np.float64]]
+    binary: dict[str, BoolArray]
+    continuous: dict[str, Float64Array]
     ignored: tuple[str, ...]
 
 

@@ -51,9 +51,12 @@ def texture_bytes(space: TextureSpace) -> bytes:
     """Return a texture space as the bytes of a file."""
     stream = io.BytesIO()
     np.savez_compressed(
-        stream, mean=space.mean, axes=space.axes, edges=space.edges,
+        stream,
+        mean=space.mean,
+        axes=space.axes,
+        edges=space.edges,
         counts=np.array([space.levels, space.orientations, space.images]),
-    )  # fmt: skip
+    )
     return stream.getvalue()
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
@@ -27,11 +27,10 @@ from reconstruction.correspondence.common_parameterization import Chart, CommonF
 from rigsim.light import surface_brdf
 from rigsim.population import conditions as skin_conditions
 from rigsim.population.population import Member
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits.albedo_vectors import AlbedoSample
 
-Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
-Labels = dict[str, NDArray[np.bool_]]
+Labels = dict[str, BoolArray]
 
 CAMERA: Final = "Nikon 5100 (NPL)"
 LIGHT: Final = "D55"
@@ -79,7 +78,7 @@ def labels_of(members: Sequence[Member], names: Sequence[str]) -> Labels:
     return {name: np.array([name in person.labels for person in members]) for name in names}
 
 
-def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> Points:
+def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> Float32Array:
     """Return what `count` random places of a face's bare skin reflect by, (count, 7 or 11)."""
     surface = person.surface(SIZE, CAMERA, LIGHT)
     packed = surface.packed()
@@ -89,13 +88,13 @@ def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> P
 
 
 def mean_mixture(
-    points: Points,
+    points: Float32Array,
     basis: BrdfBasis,
     *,
     pairs: int = 240,
     noise: float = 0.02,
     rng: np.random.Generator,
-) -> Floats:
+) -> Float64Array:
     """Fit materials to points of a face and return their mean mixture, (59,).
 
     Parameters
@@ -114,10 +113,12 @@ def mean_mixture(
     shape = (len(points), pairs)
     light, view = directions(shape, rng=rng), directions(shape, rng=rng)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    f = np.stack([
-        surface_brdf.evaluate(one, n, to, at)[0]
-        for one, n, to, at in zip(points, up, light, view, strict=True)
-    ]).astype(np.float64)  # fmt: skip
+    f = np.stack(
+        [
+            surface_brdf.evaluate(one, n, to, at)[0]
+            for one, n, to, at in zip(points, up, light, view, strict=True)
+        ]
+    ).astype(np.float64)
     cosine = light[..., 2:]
     sigma = noise * (f * cosine + 0.02 / np.pi) / cosine
     f += sigma * rng.standard_normal(f.shape)
@@ -128,7 +129,7 @@ def mean_mixture(
     return np.asarray(found.weights[found.valid].mean(axis=0))
 
 
-def directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Floats:
+def directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float64Array:
     """Draw unit vectors (..., 3) evenly over the cap above the horizon about +z."""
     z = rng.uniform(LEAST_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)
@@ -149,9 +150,9 @@ class LobeChange:
         1/sr.
     """
 
-    light: Floats
-    view: Floats
-    radiance: Floats
+    light: Float64Array
+    view: Float64Array
+    radiance: Float64Array
 
     def cosine(self, vector: ArrayLike, basis: BrdfBasis) -> float:
         """Return the cosine between the truth and what a mixture of materials (59,) reflects."""
@@ -195,13 +196,15 @@ def lobe_changes(
 ) -> dict[str, LobeChange]:
     """Return the mean changes by several traits; see `lobe_change`."""
     light, view = directions((pairs,), rng=rng), directions((pairs,), rng=rng)
-    through = np.array([
-        surface_brdf.boundary_transmittance(one[2], other[2])
-        for one, other in zip(light, view, strict=True)
-    ])  # fmt: skip
+    through = np.array(
+        [
+            surface_brdf.boundary_transmittance(one[2], other[2])
+            for one, other in zip(light, view, strict=True)
+        ]
+    )
     streams = [int(n) for n in rng.integers(2**31, size=len(before))]
 
-    def mean(people: Sequence[Member]) -> Floats:
+    def mean(people: Sequence[Member]) -> Float64Array:
         total = np.zeros(pairs)
         for person, stream in zip(people, streams, strict=True):
             # the same stream draws the same points of the same face again

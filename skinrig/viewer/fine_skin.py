@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.map_filling import filled
 
 if TYPE_CHECKING:
     from rigsim.subject import Subject
 
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 PERSON_SIZE: Final = 512
 """Most texels a side of the person that everything else comes from: half a millimeter of a face."""
@@ -50,7 +48,7 @@ class FineSkin:
         self._points = np.asarray(face_regions.on_mean_head(surface, person.mesh), np.float32)
         self._regions = face_regions.region_masks(self._points)
 
-    def melanin(self) -> Floats:
+    def melanin(self) -> Float64Array:
         """Return the volume fraction of melanosomes in the epidermis, (N, N)."""
         from rigsim.subject import pigment
 
@@ -59,14 +57,14 @@ class FineSkin:
             pigment.melanin_map(self._points, self._regions, base, seed=self._person.seed)
         )
 
-    def hemoglobin(self) -> Floats:
+    def hemoglobin(self) -> Float64Array:
         """Return the volume fraction of blood in the dermis of the neutral state, (N, N)."""
         from rigsim.subject.perfusion import perfuse
 
         found = perfuse(self._points, self._regions, seed=self._person.seed)
         return self._on_texture(found.blood("neutral"))
 
-    def height_um(self) -> Floats:
+    def height_um(self) -> Float64Array:
         """Return pores and lines over the mesh, um, (N, N)."""
         from rigsim.subject import relief
 
@@ -76,7 +74,7 @@ class FineSkin:
             relief.height_um(self._points, self._regions, texel_mm=texel_mm, seed=self._person.seed)
         )
 
-    def _on_texture(self, values: Float32) -> Floats:
+    def _on_texture(self, values: Float32Array) -> Float64Array:
         whole = np.zeros(self.covered.shape, np.float32)
         whole[self.covered] = values
         return filled(whole, self.covered)

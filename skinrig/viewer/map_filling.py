@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.facial_color.coarse_maps import Cells, fitting
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 
-def filled(values: NDArray[np.floating], valid: Mask) -> Floats:
+def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
     """Return a map whose missing texels hold what surrounds them, so that filters stay clean.
 
     Means over ever larger cells are interpolated back until nothing is missing.
@@ -42,7 +39,7 @@ def filled(values: NDArray[np.floating], valid: Mask) -> Floats:
     return out
 
 
-def halved(values: Floats, size: int) -> Floats:
+def halved(values: Float64Array, size: int) -> Float64Array:
     """Return means over cells, (size, size[, C]), of a larger map; a smaller one as it is."""
     if values.shape[0] <= size:
         return values

@@ -42,11 +42,17 @@ ACTION_UNITS: Final[Mapping[str, tuple[tuple[str, float], ...]]] = MappingProxyT
         "sadness": (("browInnerUp", 1.0), ("browDown", 0.3), ("mouthFrown", 0.9)),
         # 1 + 2 + 5 + 26
         "surprise": (
-            ("browInnerUp", 1.0), ("browOuterUp", 1.0), ("eyeWide", 0.9), ("jawOpen", 0.5),
+            ("browInnerUp", 1.0),
+            ("browOuterUp", 1.0),
+            ("eyeWide", 0.9),
+            ("jawOpen", 0.5),
         ),
         # 1 + 2 + 4 + 5 + 20
         "fear": (
-            ("browInnerUp", 1.0), ("browOuterUp", 0.4), ("browDown", 0.4), ("eyeWide", 1.0),
+            ("browInnerUp", 1.0),
+            ("browOuterUp", 0.4),
+            ("browDown", 0.4),
+            ("eyeWide", 1.0),
             ("mouthStretch", 0.7),
         ),
         # 4 + 5 + 23
@@ -56,7 +62,7 @@ ACTION_UNITS: Final[Mapping[str, tuple[tuple[str, float], ...]]] = MappingProxyT
         # 12
         "smile": (("mouthSmile", 1.0),),
     }
-)  # fmt: skip
+)
 """Shapes of ARKit, without left and right, and their weights."""
 
 

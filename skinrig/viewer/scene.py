@@ -14,15 +14,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skinrig.arrays import Float32Array, Int32Array
 
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
     from rigsim.subject import Subject
     from skinrig.viewer.fine_skin import FineSkin
 
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 Storage = Literal["u8", "u16", "f16", "f32"]
 Filter = Literal["linear", "mipmap", "nearest"]
 Kind = Literal["procedural", "mesh", "dynamic", "dome", "model"]
@@ -53,7 +52,7 @@ class Texture:
         to so many words; 1 keeps all. Noise costs the most bytes and shows the least there.
     """
 
-    values: Float32
+    values: Float32Array
     storage: Storage = "u8"
     filter: Filter = "linear"
     fine: int = 1
@@ -101,11 +100,11 @@ class ViewerMesh:
         Movement at weight 1, mm.
     """
 
-    positions: Float32
-    normals: Float32
-    uv: Float32
-    faces: Int32
-    shapes: Mapping[str, Float32] = field(default_factory=dict)
+    positions: Float32Array
+    normals: Float32Array
+    uv: Float32Array
+    faces: Int32Array
+    shapes: Mapping[str, Float32Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and indices."""
@@ -128,7 +127,7 @@ class Assets(TypedDict, total=False):
     """What an asset builder adds to a scene; every key may be missing."""
 
     textures: Mapping[str, Texture]
-    tables: Mapping[str, Float32]
+    tables: Mapping[str, Float32Array]
     params: Mapping[str, Any]
     presets: Mapping[str, Mapping[str, Any]]
     facts: Mapping[str, Any]
@@ -200,7 +199,7 @@ class ViewerScene:
 
     mesh: ViewerMesh
     textures: Mapping[str, Texture] = field(default_factory=dict)
-    tables: Mapping[str, Float32] = field(default_factory=dict)
+    tables: Mapping[str, Float32Array] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)

@@ -16,9 +16,18 @@ COMMAND = Path(sys.executable).with_name("skinrig")
 
 RENDERERS = ("mitsuba", "drjit")
 HEAVY = (
-    *RENDERERS, "cv2", "matplotlib", "scipy", "numba", "skimage", "sklearn", "colour",
-    "OpenEXR", "embreex", "trimesh",
-)  # fmt: skip
+    *RENDERERS,
+    "cv2",
+    "matplotlib",
+    "scipy",
+    "numba",
+    "skimage",
+    "sklearn",
+    "colour",
+    "OpenEXR",
+    "embreex",
+    "trimesh",
+)
 QUICK_S = 0.3
 RUNS = 5
 """The quickest of so many starts is judged: what else runs on the machine only adds to one."""
@@ -50,19 +59,25 @@ def test_a_package_alone_loads_nothing_heavy(module):
 def test_capture_and_its_devices_load_neither_renderer_nor_vision_nor_science():
     """A capture computer drives a rig without the libraries that calibrate and reconstruct."""
     every = [
-        name for name in packages("capture")
-        if "calibration" not in name and name != "capture.hdr"
-    ]  # fmt: skip
+        name for name in packages("capture") if "calibration" not in name and name != "capture.hdr"
+    ]
     assert len(every) > 50
     assert loaded_by("import " + ", ".join(every)) == []
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--version"], ["--help"], ["simulate", "--help"], ["reconstruct", "--help"],
-     ["fit", "--help"], ["render", "--help"], ["bench", "--help"]],
+    [
+        ["--version"],
+        ["--help"],
+        ["simulate", "--help"],
+        ["reconstruct", "--help"],
+        ["fit", "--help"],
+        ["render", "--help"],
+        ["bench", "--help"],
+    ],
     ids=" ".join,
-)  # fmt: skip
+)
 def test_asking_for_help_loads_no_numerics_at_all(arguments):
     code = f"from skinrig.cli import main\nassert main({arguments!r}) == 0"
     assert loaded_by(code, (*HEAVY, "numpy", "capture", "model")) == []

@@ -14,10 +14,20 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
 HEAVY = {
-    "dome-geometry", "editing", "gradient-normals", "head-motion", "intervals",
-    "normal-integration", "omissions", "probe-session", "render-dome", "render-gradient",
-    "render-model", "sphere-lights", "traits",
-}  # fmt: skip
+    "dome-geometry",
+    "editing",
+    "gradient-normals",
+    "head-motion",
+    "intervals",
+    "normal-integration",
+    "omissions",
+    "probe-session",
+    "render-dome",
+    "render-gradient",
+    "render-model",
+    "sphere-lights",
+    "traits",
+}
 LEAST_POINTS = 4
 
 

@@ -290,9 +290,11 @@ def test_touch_drags_and_pinches(open_page, procedural_html):
     def touch(kind: str, *points: tuple[float, float]) -> None:
         client.send(
             "Input.dispatchTouchEvent",
-            {"type": kind, "touchPoints": [{"x": x, "y": y, "id": i} for i, (x, y) in
-                                           enumerate(points)]},
-        )  # fmt: skip
+            {
+                "type": kind,
+                "touchPoints": [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)],
+            },
+        )
 
     x, y = center(phone)
     touch("touchStart", (x, y))
@@ -329,10 +331,7 @@ def test_the_canvas_follows_its_place_and_a_chosen_resolution(viewer):
     ("missing", "said"),
     [
         ("HTMLCanvasElement.prototype.getContext = () => null", "WebGL2"),
-        (
-            "WebGL2RenderingContext.prototype.getExtension = () => null",
-            "EXT_color_buffer_float",
-        ),
+        ("WebGL2RenderingContext.prototype.getExtension = () => null", "EXT_color_buffer_float"),
     ],
 )
 def test_a_device_that_cannot_draw_is_told_what_to_do(

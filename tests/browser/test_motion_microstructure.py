@@ -140,18 +140,29 @@ def slopes(
 
 SIDE = 256
 ALL = (
-    "relief", "window_cover", "window_pad", "window_tensor", "window_metric", "kernel_s",
-    "kernel_t", "convolved_s", "convolved", "microstructure",
-)  # fmt: skip
+    "relief",
+    "window_cover",
+    "window_pad",
+    "window_tensor",
+    "window_metric",
+    "kernel_s",
+    "kernel_t",
+    "convolved_s",
+    "convolved",
+    "microstructure",
+)
 
 
 def show(viewer: Any, scene: Any, weights: dict[str, float], at: Any, **more: Any) -> list[float]:
     """Show a pose with the window held, and return where the window is."""
     rest = dict.fromkeys(scene.mesh.shapes, 0.0)
     told = viewer.set(
-        weights=rest | weights, microstructure_at=at, microstructure_window_px=SIDE,
-        microstructure=2, **more,
-    )  # fmt: skip
+        weights=rest | weights,
+        microstructure_at=at,
+        microstructure_window_px=SIDE,
+        microstructure=2,
+        **more,
+    )
     return list(told["microstructure_place"])
 
 
@@ -215,9 +226,13 @@ def test_each_buffer_of_a_strained_window_is_the_models(
     for channels, height in ((slice(0, 2), want.convolved), (slice(2, 4), want.relief)):
         expected = slopes(height, want.tensor, want.metric, want.size)
         close(
-            got["microstructure"][..., channels], expected, middle & inside,
-            median=3e-4, p999=3e-3, most=8e-3,
-        )  # fmt: skip
+            got["microstructure"][..., channels],
+            expected,
+            middle & inside,
+            median=3e-4,
+            p999=3e-3,
+            most=8e-3,
+        )
     if at[2] == 0:  # and the bounds above tell the convolution from none at all
         moved = np.abs(want.convolved - want.relief)[middle]
         assert np.median(moved) > 100 * 5e-4
@@ -299,17 +314,23 @@ def test_a_split_view_shows_no_static_and_moved_microstructure_side_by_side(
 ):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
     viewer.set(
-        weights=rest | {"anger": 1.0}, camera_distance_mm=150.0, camera_fov_deg=8.0,
-        camera_target_mm=[0.0, 40.0, 0.0], microstructure_window_px=512,
-    )  # fmt: skip
+        weights=rest | {"anger": 1.0},
+        camera_distance_mm=150.0,
+        camera_fov_deg=8.0,
+        camera_target_mm=[0.0, 40.0, 0.0],
+        microstructure_window_px=512,
+    )
     pictures = []
     for mode in (0, 1, 2, 3):
         told = viewer.set(microstructure=mode)
         assert told["microstructure_place"][3] == 1
         pictures.append(viewer.read("specular")[..., 0])
     width = pictures[0].shape[1]
-    thirds = [slice(2, width // 3 - 2), slice(width // 3 + 2, 2 * width // 3 - 2),
-              slice(2 * width // 3 + 2, width - 2)]  # fmt: skip
+    thirds = [
+        slice(2, width // 3 - 2),
+        slice(width // 3 + 2, 2 * width // 3 - 2),
+        slice(2 * width // 3 + 2, width - 2),
+    ]
     for mode, columns in enumerate(thirds):
         np.testing.assert_array_equal(pictures[3][:, columns], pictures[mode][:, columns])
         for other in {0, 1, 2} - {mode}:

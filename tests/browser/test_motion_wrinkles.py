@@ -19,10 +19,12 @@ from skinrig.viewer.packing.arrays import as_packed
 
 ZONES = tuple("abcdefgh")
 TABLES = (
-    {"anger": (-0.6, 0.4, 0.0, 0.9, 0.0, -0.3, 0.2, 0.0),
-     "surprise": (0.8, 0.5, -0.7, 0.0, 0.3, 0.0, 0.0, 1.0)},
+    {
+        "anger": (-0.6, 0.4, 0.0, 0.9, 0.0, -0.3, 0.2, 0.0),
+        "surprise": (0.8, 0.5, -0.7, 0.0, 0.3, 0.0, 0.0, 1.0),
+    },
     {"surprise": (0.2, 0.0, 0.6, -0.9, 0.0, 0.0, 0.0, 0.5)},
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +142,11 @@ def test_wrinkles_left_out_at_a_distance_change_pixels_less_than_is_told(
 ):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
     viewer.set(
-        weights=rest | {"surprise": 1.0}, light_azimuth_deg=azimuth, microstructure=0,
+        weights=rest | {"surprise": 1.0},
+        light_azimuth_deg=azimuth,
+        microstructure=0,
         scattering=False,
-    )  # fmt: skip
+    )
     told, measured = [], []
     for distance in (620.0, 1500.0, 4000.0, 16000.0):
         pictures = []
@@ -168,9 +172,13 @@ def test_microstructure_left_out_at_a_distance_changes_pixels_less_than_is_told(
 ):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
     viewer.set(
-        weights=rest, scattering=False, microstructure=2, camera_fov_deg=8.0,
-        camera_target_mm=[0.0, 40.0, 0.0], microstructure_window_px=512,
-    )  # fmt: skip
+        weights=rest,
+        scattering=False,
+        microstructure=2,
+        camera_fov_deg=8.0,
+        camera_target_mm=[0.0, 40.0, 0.0],
+        microstructure_window_px=512,
+    )
     told, measured = [], []
     for distance in (150.0, 800.0, 2000.0):
         pictures, shown = [], []
@@ -216,7 +224,9 @@ def test_hybrid_normals_are_softest_in_red_and_sharp_in_the_highlight(viewer, pr
         error = np.abs(found - expected)[covered]
         assert np.median(error) < 2e-4
         assert np.percentile(error, 99.9) < 2e-3
-    energy = [np.mean(values[covered] ** 2) for values in
-              (red_green[..., :2], red_green[..., 2:], blue[..., :2], source[..., :2])]  # fmt: skip
+    energy = [
+        np.mean(values[covered] ** 2)
+        for values in (red_green[..., :2], red_green[..., 2:], blue[..., :2], source[..., :2])
+    ]
     assert energy[0] < 0.8 * energy[1] < 0.8 * energy[2]
     assert energy[2] <= energy[3]

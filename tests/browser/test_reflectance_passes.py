@@ -27,8 +27,14 @@ from skinrig.viewer.scene import SceneSource, Texture
 pytestmark = pytest.mark.long
 
 Floats = NDArray[np.floating]
-FLAT = {"relief": 0, "wrinkles": 0, "microstructure": 0, "hybrid_normals": 0, "detail": 0,
-        "shadows": 0}  # fmt: skip
+FLAT = {
+    "relief": 0,
+    "wrinkles": 0,
+    "microstructure": 0,
+    "hybrid_normals": 0,
+    "detail": 0,
+    "shadows": 0,
+}
 """Nothing that tilts the normals of the mesh or takes light from it."""
 HALF = 2.0**-11
 """Relative rounding of a half float."""
@@ -70,9 +76,11 @@ def fitted_page(procedural_scene, open_page) -> FittedPage:
     base = reflectance_assets.assemble(SceneSource("dome", procedural_scene.mesh, 64), traits.lobes)
     ends = (0.3 * smooth((16, 16, 12), rng)).astype(np.float32)
     albedo = AlbedoTraits(
-        ("tan", "beard"), np.moveaxis(ends.reshape(16, 16, 4, 3), 2, 0).copy(),
-        {"tan": 0.2, "beard": 0.1}, {"tan": 0.001, "beard": 0.002},
-    )  # fmt: skip
+        ("tan", "beard"),
+        np.moveaxis(ends.reshape(16, 16, 4, 3), 2, 0).copy(),
+        {"tan": 0.2, "beard": 0.1},
+        {"tan": 0.001, "beard": 0.002},
+    )
     widths = (1.0 + 0.4 * smooth((16, 16, 1), rng)).astype(np.float32)
     scene = replace(
         procedural_scene,

@@ -21,27 +21,30 @@ def pages(tmp_path_factory):
     for run in ("one", "two"):
         maps = {
             name: SkinMap(
-                melanin + rng.normal(0.0, 0.002, melanin.shape), UNITS[name],
+                melanin + rng.normal(0.0, 0.002, melanin.shape),
+                UNITS[name],
                 np.full(melanin.shape, 0.002),
             )
             for name in ("melanin", "hemoglobin")
-        }  # fmt: skip
+        }
         maps["residual"] = SkinMap(np.abs(rng.normal(0.0, 1.0, melanin.shape)), "1")
         store.write(
             folder / run / "maps",
             SkinAppearance(
-                maps, "simulated", parameters={"truth": "truth", "assumed": ["flat light"]},
-                inputs={"session": run}, left_out=(("gloss", "no parallel frames"),),
+                maps,
+                "simulated",
+                parameters={"truth": "truth", "assumed": ["flat light"]},
+                inputs={"session": run},
+                left_out=(("gloss", "no parallel frames"),),
             ),
-        )  # fmt: skip
+        )
         truth = {
             f"{name}{suffix}": SkinMap(melanin, UNITS[name] if not suffix else "1")
             for name in ("melanin", "hemoglobin")
             for suffix in ("", "_blurred")
         }
         store.write(
-            folder / run / "truth",
-            SkinAppearance(truth, "simulated", parameters={"kind": "truth"}),
+            folder / run / "truth", SkinAppearance(truth, "simulated", parameters={"kind": "truth"})
         )
     found = []
     for name, paths in (("one", [folder / "one"]), ("both", [folder / "one", folder / "two"])):

@@ -43,9 +43,13 @@ def test_any_number_of_blend_shapes_moves_a_mesh_of_a_file(open_page, tmp_path):
     shapes = np.zeros((20, *mesh.positions.shape), np.float32)
     shapes[:, :, 2] = np.linspace(0.1, 2.0, 20)[:, None]
     np.savez(
-        tmp_path / "face.npz", vertices_mm=mesh.positions, uv=mesh.uv, faces=mesh.faces,
-        shape_names=np.array(names), shape_deltas_mm=shapes,
-    )  # fmt: skip
+        tmp_path / "face.npz",
+        vertices_mm=mesh.positions,
+        uv=mesh.uv,
+        faces=mesh.faces,
+        shape_names=np.array(names),
+        shape_deltas_mm=shapes,
+    )
     grown = procedural.scene(size=64, mesh=tmp_path / "face.npz")
     assert set(names) < set(grown.mesh.shapes)
     viewer = open_page(page.build(grown))

@@ -45,9 +45,12 @@ def _blocked(positions, faces, origins, light):
     out = np.zeros(len(points), bool)
     for k, (x, y, z) in enumerate(points):
         near = np.flatnonzero(
-            (low[:, 0] <= x) & (high[:, 0] >= x) & (low[:, 1] <= y) & (high[:, 1] >= y)
+            (low[:, 0] <= x)
+            & (high[:, 0] >= x)
+            & (low[:, 1] <= y)
+            & (high[:, 1] >= y)
             & (high[:, 2] > z)
-        )  # fmt: skip
+        )
         a, b, c = np.moveaxis(corners[near], 1, 0)
         area = _turn(a, b, c)
         good = np.abs(area) > 1e-12

@@ -31,9 +31,18 @@ NAMES = (f"caliper-stateful-{number}" for number in itertools.count())
 SLACK_S = 0.05  # a request counts when the box has read it
 
 NOISE = Faults(
-    drop=0.001, flip=0.001, glue=0.01, cut=0.005, late=0.02, late_s=0.3, lose_answer=0.08,
-    duplicate=0.05, babble=0.02, jaw_stall=0.05, skin_stiff=12.0,
-)  # fmt: skip
+    drop=0.001,
+    flip=0.001,
+    glue=0.01,
+    cut=0.005,
+    late=0.02,
+    late_s=0.3,
+    lose_answer=0.08,
+    duplicate=0.05,
+    babble=0.02,
+    jaw_stall=0.05,
+    skin_stiff=12.0,
+)
 
 
 class NoisyCaliper(RuleBasedStateMachine):
@@ -181,10 +190,15 @@ def explore(examples, **more):
     run_machine(
         NoisyCaliper,
         settings=settings(
-            max_examples=examples, stateful_step_count=15, deadline=None, derandomize=True,
-            database=None, suppress_health_check=list(HealthCheck), **more,
+            max_examples=examples,
+            stateful_step_count=15,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+            **more,
         ),
-    )  # fmt: skip
+    )
 
 
 def test_a_calipers_box_behaves_on_a_noisy_line():

@@ -250,10 +250,7 @@ BROKEN = {
         manifest_with("schema", value="skinrig.session/2"),
         "got 'skinrig.session/2', expected skinrig.session/1",
     ),
-    "manifest with an unknown key": (
-        manifest_with("subjcet", value="x"),
-        "did you mean subject?",
-    ),
+    "manifest with an unknown key": (manifest_with("subjcet", value="x"), "did you mean subject?"),
     "manifest without a source": (manifest_with("source", value=None), "source"),
     "manifest with a name": (
         manifest_with("subject", "pseudonym", value="Ada Lovelace"),

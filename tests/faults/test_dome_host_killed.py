@@ -39,9 +39,15 @@ def test_a_host_that_dies_in_a_sequence_leaves_the_dome_dark_within_the_lease(
     host_at_work, last_heard, transport, blow
 ):
     served, host = host_at_work(
-        HOST, RIG, ("dome",), LEASE_S, "+".join(map(str, UNSEEN)), pty=transport == "pty",
-        word="stepping", at_work=lambda world: world.box("dome").device.running,
-    )  # fmt: skip
+        HOST,
+        RIG,
+        ("dome",),
+        LEASE_S,
+        "+".join(map(str, UNSEEN)),
+        pty=transport == "pty",
+        word="stepping",
+        at_work=lambda world: world.box("dome").device.running,
+    )
     world, box = served.world, served.world.box("dome")
     host.send_signal(blow)
     struck_s = world.now

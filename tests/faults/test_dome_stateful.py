@@ -35,9 +35,16 @@ NAMES = (f"dome-stateful-{number}" for number in itertools.count())
 SLACK_S = 0.05  # a request counts when the box has read it
 
 NOISE = Faults(
-    drop=0.001, flip=0.001, glue=0.01, cut=0.005, late=0.02, late_s=0.3, lose_answer=0.08,
-    duplicate=0.03, babble=0.02,
-)  # fmt: skip
+    drop=0.001,
+    flip=0.001,
+    glue=0.01,
+    cut=0.005,
+    late=0.02,
+    late_s=0.3,
+    lose_answer=0.08,
+    duplicate=0.03,
+    babble=0.02,
+)
 
 
 class NoisyDome(RuleBasedStateMachine):
@@ -84,8 +91,11 @@ class NoisyDome(RuleBasedStateMachine):
             assert not self.unit.lit
             assert not self.unit.running
 
-    @rule(led=st.sampled_from(LEDS), ms=st.sampled_from([20, 100, 240, 500]),
-          level=st.sampled_from([200, 1000]))  # fmt: skip
+    @rule(
+        led=st.sampled_from(LEDS),
+        ms=st.sampled_from([20, 100, 240, 500]),
+        level=st.sampled_from([200, 1000]),
+    )
     def light(self, led, ms, level):
         self.ask("SYST:ARM")
         self.ask(f"LED:ON {led},{ms},{level}")
@@ -97,8 +107,10 @@ class NoisyDome(RuleBasedStateMachine):
             self.ask(f"LED:ON {LEDS[0]},20")
             self.listen(pause_s)
 
-    @rule(leds=st.lists(st.sampled_from(LEDS), min_size=1, max_size=8),
-          ms=st.sampled_from([40, 90, 200]))  # fmt: skip
+    @rule(
+        leds=st.lists(st.sampled_from(LEDS), min_size=1, max_size=8),
+        ms=st.sampled_from([40, 90, 200]),
+    )
     def load(self, leds, ms):
         self.ask("SEQ:CLE")
         rows = ";".join(f"{led}:1000:{ms * 1000}:3" for led in leds)
@@ -184,10 +196,15 @@ def explore(examples, **more):
     run_machine(
         NoisyDome,
         settings=settings(
-            max_examples=examples, stateful_step_count=20, deadline=None, derandomize=True,
-            database=None, suppress_health_check=list(HealthCheck), **more,
+            max_examples=examples,
+            stateful_step_count=20,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+            **more,
         ),
-    )  # fmt: skip
+    )
 
 
 def test_a_domes_box_behaves_on_a_noisy_line():

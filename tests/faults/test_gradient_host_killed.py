@@ -46,9 +46,14 @@ def test_a_host_that_dies_leaves_the_sphere_dark_and_the_skin_free_within_the_le
 ):
     boxes = ("gradient_sphere", "caliper")
     served, host = host_at_work(
-        HOST, RIG, boxes, LEASE_S, pty=transport == "pty", word="stepping",
+        HOST,
+        RIG,
+        boxes,
+        LEASE_S,
+        pty=transport == "pty",
+        word="stepping",
         at_work=lambda world: world.box(boxes[0]).device.running and world.skin.state.attached,
-    )  # fmt: skip
+    )
     world = served.world
     sphere, caliper = (world.box(name) for name in boxes)
     host.send_signal(blow)

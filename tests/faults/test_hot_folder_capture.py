@@ -30,9 +30,15 @@ class Tether:
         view = self.world.rig.views[0]
         cfa = np.full((view.height_px, view.width_px), level, np.uint16)
         blob = raw.encode_dng(
-            cfa, pattern="RGGB", black=512, white=16383, exposure_s=0.008, iso=100,
-            camera_serial=view.serial, camera_model=view.camera_model,
-        )  # fmt: skip
+            cfa,
+            pattern="RGGB",
+            black=512,
+            white=16383,
+            exposure_s=0.008,
+            iso=100,
+            camera_serial=view.serial,
+            camera_model=view.camera_model,
+        )
         (self.folder / name).write_bytes(blob)
 
     def edge(self, now_s):
@@ -71,17 +77,26 @@ def capture(tmp_path, monkeypatch):
         # files bear the computer's time, the world has its own
         take = HotFolder._take
         monkeypatch.setattr(
-            HotFolder, "_take",
+            HotFolder,
+            "_take",
             lambda self, path: dataclasses.replace(take(self, path), t_start_s=tether.clock()),
-        )  # fmt: skip
+        )
         with Session.create(
-            tmp_path / f"s-{told_s}", plan=plan, rig=rig, devices={}, subject=Subject("p"),
+            tmp_path / f"s-{told_s}",
+            plan=plan,
+            rig=rig,
+            devices={},
+            subject=Subject("p"),
             source="simulated",
-        ) as session:  # fmt: skip
+        ) as session:
             run_plan(
-                plan, rig, boxes={"flash": box}, cameras={"cam": camera}, session=session,
+                plan,
+                rig,
+                boxes={"flash": box},
+                cameras={"cam": camera},
+                session=session,
                 prompt=lambda text: None,
-            )  # fmt: skip
+            )
             session.close()
         box.close()
         world.unregister()
@@ -93,8 +108,11 @@ def capture(tmp_path, monkeypatch):
 
 def test_a_plan_with_darks_runs_by_the_boxs_line_alone(capture):
     assert capture(lag_s=0.0, told_s=0.0) == {
-        "D000": LEVEL_DARK, "D001": LEVEL_DARK, "S000": LEVEL_LIT, "S001": LEVEL_LIT,
-    }  # fmt: skip
+        "D000": LEVEL_DARK,
+        "D001": LEVEL_DARK,
+        "S000": LEVEL_LIT,
+        "S001": LEVEL_LIT,
+    }
 
 
 def test_a_slow_shutter_is_met_when_the_rig_file_tells_of_it_and_missed_when_not(capture):

@@ -36,9 +36,19 @@ NAMES = (f"probe-stateful-{number}" for number in itertools.count())
 SLACK_S = 0.05  # a request counts when the box has read it
 
 NOISE = Faults(
-    drop=0.001, flip=0.001, glue=0.01, cut=0.005, late=0.02, late_s=0.3, lose_answer=0.08,
-    duplicate=0.05, babble=0.02, shutter_stuck=0.05, pump_leak=0.1, head_lifts_after=4.0,
-)  # fmt: skip
+    drop=0.001,
+    flip=0.001,
+    glue=0.01,
+    cut=0.005,
+    late=0.02,
+    late_s=0.3,
+    lose_answer=0.08,
+    duplicate=0.05,
+    babble=0.02,
+    shutter_stuck=0.05,
+    pump_leak=0.1,
+    head_lifts_after=4.0,
+)
 
 
 class NoisyProbe(RuleBasedStateMachine):
@@ -136,10 +146,20 @@ class NoisyProbe(RuleBasedStateMachine):
 
     @rule(
         text=st.sampled_from(
-            ["SYST:ARM", "HEAD:SITE chin,90", "PUMP VENT", "HEAD:FREE", "LED 500", "LED 0",
-             "SHUT CLOSE", "FIB 3", "FIB ALL", "*RST"]
+            [
+                "SYST:ARM",
+                "HEAD:SITE chin,90",
+                "PUMP VENT",
+                "HEAD:FREE",
+                "LED 500",
+                "LED 0",
+                "SHUT CLOSE",
+                "FIB 3",
+                "FIB ALL",
+                "*RST",
+            ]
         )
-    )  # fmt: skip
+    )
     def say(self, text):
         self.ask(text)
 
@@ -211,10 +231,15 @@ def explore(examples, **more):
     run_machine(
         NoisyProbe,
         settings=settings(
-            max_examples=examples, stateful_step_count=15, deadline=None, derandomize=True,
-            database=None, suppress_health_check=list(HealthCheck), **more,
+            max_examples=examples,
+            stateful_step_count=15,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+            **more,
         ),
-    )  # fmt: skip
+    )
 
 
 def test_a_probes_box_behaves_on_a_noisy_line():

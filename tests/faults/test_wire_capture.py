@@ -63,9 +63,12 @@ def capture(world, session, plan=None):
     camera = open_camera(f"sim://{world.name}/cam")
     try:
         return run_plan(
-            plan or session.plan, RIG, boxes={"flash": box}, cameras={"cam": camera},
+            plan or session.plan,
+            RIG,
+            boxes={"flash": box},
+            cameras={"cam": camera},
             session=session,
-        )  # fmt: skip
+        )
     finally:
         camera.close()
         box.close()
@@ -119,10 +122,7 @@ def test_every_frame_that_is_kept_shows_the_pop_that_it_names(world, session, fa
 
 @pytest.mark.parametrize(
     ("faults", "error"),
-    [
-        ({"reset_after": 20.0}, BoxRebooted),
-        ({"unplug_after": 20.0, "replug_after": 0.5}, LinkLost),
-    ],
+    [({"reset_after": 20.0}, BoxRebooted), ({"unplug_after": 20.0, "replug_after": 0.5}, LinkLost)],
 )
 def test_an_interrupted_capture_goes_on_where_it_was(world, session, faults, error):
     simulated = world(seed=1, **faults)
@@ -160,8 +160,13 @@ def test_the_box_is_armed_only_for_its_pops(world, session):
     simulated = world()
     capture(simulated, session)
     sent = [line.split("FLAS:FIRE")[0] for line in simulated.transcript if " > " in line]
-    words = [w for line in simulated.transcript if " > " in line
-             for w in ("SYST:ARM*", "FLAS:FIRE", "SAFE") if w in line]  # fmt: skip
+    words = [
+        w
+        for line in simulated.transcript
+        if " > " in line
+        for w in ("SYST:ARM*", "FLAS:FIRE", "SAFE")
+        if w in line
+    ]
     assert len(sent) > 0
     assert words.count("FLAS:FIRE") == words.count("SYST:ARM*") == 12
     at = [k for k, word in enumerate(words) if word == "FLAS:FIRE"]

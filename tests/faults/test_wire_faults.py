@@ -145,9 +145,18 @@ def test_every_fault_of_a_flash_box_or_camera_has_its_switch():
 
 @pytest.mark.parametrize(
     "switches",
-    [{"drop": "2"}, {"late_s": "-1"}, {"baud": "inf"}, {"heat": "1"}, {"slow_charge": "0"},
-     {"drift_ppm": "1e9"}, {"reset_on_open": "yes"}, {"drop": "x"}, {"flp": "0.1"}],
-)  # fmt: skip
+    [
+        {"drop": "2"},
+        {"late_s": "-1"},
+        {"baud": "inf"},
+        {"heat": "1"},
+        {"slow_charge": "0"},
+        {"drift_ppm": "1e9"},
+        {"reset_on_open": "yes"},
+        {"drop": "x"},
+        {"flp": "0.1"},
+    ],
+)
 def test_a_switch_that_makes_no_sense_is_named(switches):
     with pytest.raises(ValueError, match=next(iter(switches))):
         Faults.from_text(switches)

@@ -112,8 +112,9 @@ def test_a_capture_killed_while_its_frame_is_awaited_is_resumed_at_once(
         argv += ["--camera", f"cam={served.addresses['cam']}"]
         with subprocess.Popen(
             [sys.executable, "-c", CAPTURE, str(PATIENT_S), *argv],
-            stderr=subprocess.PIPE, text=True,
-        ) as host:  # fmt: skip
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as host:
             while "2/2 S000" not in host.stderr.readline():
                 assert host.poll() is None
             struck_s = served.world.now

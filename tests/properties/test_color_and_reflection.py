@@ -48,8 +48,10 @@ def test_an_angle_knows_no_length_and_no_order(a, b, scale):
 
 
 @CHEAP
-@given(first=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
-       second=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2))  # fmt: skip
+@given(
+    first=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
+    second=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
+)
 def test_a_color_difference_is_none_to_itself_and_alike_both_ways(first, second):
     there = metrics.delta_e_2000(first, second)
     assert np.isfinite(there)
@@ -96,11 +98,14 @@ def test_a_median_lies_in_its_interval_and_among_the_values(values, seed):
 @pytest.mark.parametrize(
     "spectrum",
     [
-        spectra.hemoglobin_extinction, spectra.eumelanin_absorption,
-        spectra.pheomelanin_absorption, spectra.baseline_absorption, spectra.reduced_scattering,
+        spectra.hemoglobin_extinction,
+        spectra.eumelanin_absorption,
+        spectra.pheomelanin_absorption,
+        spectra.baseline_absorption,
+        spectra.reduced_scattering,
         spectra.color_matching_functions,
     ],
-)  # fmt: skip
+)
 def test_a_spectrum_is_not_negative_and_takes_wavelengths_one_by_one(spectrum, wavelength):
     found = np.asarray(spectrum(wavelength))
     assert np.all(np.isfinite(found) & (found >= 0.0))
@@ -110,8 +115,11 @@ def test_a_spectrum_is_not_negative_and_takes_wavelengths_one_by_one(spectrum, w
 
 
 @FEW
-@given(camera=st.sampled_from(spectra.camera_names()),
-       light=st.sampled_from(spectra.illuminant_names()), level=SHARE)  # fmt: skip
+@given(
+    camera=st.sampled_from(spectra.camera_names()),
+    light=st.sampled_from(spectra.illuminant_names()),
+    level=SHARE,
+)
 def test_an_even_reflectance_has_no_color_under_any_light(camera, light, level):
     found = spectra.band_average(np.full(31, level), camera, light)
     np.testing.assert_allclose(found, level, atol=1e-9)
@@ -153,8 +161,9 @@ def test_chromophores_of_a_clean_color_come_back(table, truth):
 
 COLOR = st.lists(
     st.one_of(st.floats(width=32, allow_nan=True, allow_infinity=True), SHARE.map(np.float32)),
-    min_size=3, max_size=3,
-)  # fmt: skip
+    min_size=3,
+    max_size=3,
+)
 
 
 @CHEAP
@@ -243,8 +252,15 @@ def test_facets_cover_the_surface_once(roughness, kind):
 
 
 @CHEAP
-@given(light=SHARE, view=SHARE, half=SHARE, turn=SHARE, roughness=st.floats(1e-3, 1.0),
-       eta=st.floats(1.01, 2.0), kind=KIND)  # fmt: skip
+@given(
+    light=SHARE,
+    view=SHARE,
+    half=SHARE,
+    turn=SHARE,
+    roughness=st.floats(1e-3, 1.0),
+    eta=st.floats(1.01, 2.0),
+    kind=KIND,
+)
 def test_a_lobe_is_the_same_both_ways_and_never_negative(
     light, view, half, turn, roughness, eta, kind
 ):
@@ -333,8 +349,12 @@ RING = lobe_response.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
 
 
 @CHEAP
-@given(view=VECTOR, eta=st.floats(1.01, 3.9),
-       vector=st.tuples(*[st.floats(-1e9, 1e9)] * 3), mirror=st.booleans())  # fmt: skip
+@given(
+    view=VECTOR,
+    eta=st.floats(1.01, 3.9),
+    vector=st.tuples(*[st.floats(-1e9, 1e9)] * 3),
+    mirror=st.booleans(),
+)
 def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, mirror):
     across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
     if abs(unit(view)[1]) > 0.9999995:

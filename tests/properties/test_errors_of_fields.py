@@ -114,10 +114,17 @@ def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_ligh
     def error(off_px, times):
         columns = np.stack(np.indices((24, 24))[::-1], axis=-1).astype(np.float32)
         laid = Alignment(
-            columns, valid, np.full((24, 24), off_px, np.float32),
-            np.zeros((24, 24), np.float32), np.ones((24, 24), bool), 0.0, {}, 0.0, "landmarks",
+            columns,
+            valid,
+            np.full((24, 24), off_px, np.float32),
+            np.zeros((24, 24), np.float32),
+            np.ones((24, 24), bool),
+            0.0,
+            {},
+            0.0,
+            "landmarks",
             (24, 24),
-        )  # fmt: skip
+        )
         return misplacement.own_error(times * skin, np.zeros_like(skin), valid, laid)
 
     one, told = error(1.0, 1.0), error(off, light)
@@ -127,8 +134,12 @@ def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_ligh
 
 
 @CHEAP
-@given(seed=SEEDS, step=st.floats(-0.5, 0.5), noise=st.floats(1e-3, 0.3),
-       bad=st.sampled_from([np.nan, np.inf, 0.0, -1.0]))  # fmt: skip
+@given(
+    seed=SEEDS,
+    step=st.floats(-0.5, 0.5),
+    noise=st.floats(1e-3, 0.3),
+    bad=st.sampled_from([np.nan, np.inf, 0.0, -1.0]),
+)
 def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, step, noise, bad):
     rng = np.random.default_rng(seed)
     side = 32
@@ -150,8 +161,13 @@ def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, 
 
 
 @CHEAP
-@given(seed=SEEDS, count=st.integers(1, 5), unit=st.floats(1e-9, 1e9), noise=st.floats(1e-6, 0.2),
-       bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0]))  # fmt: skip
+@given(
+    seed=SEEDS,
+    count=st.integers(1, 5),
+    unit=st.floats(1e-9, 1e9),
+    noise=st.floats(1e-6, 0.2),
+    bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0]),
+)
 def test_means_of_repeats_follow_their_unit_whatever_is_masked(seed, count, unit, noise, bad):
     rng = np.random.default_rng(seed)
     rgb = 0.4 * np.exp(noise * rng.normal(size=(count, 8, 9, 3)))

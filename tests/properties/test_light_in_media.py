@@ -174,8 +174,14 @@ def test_effective_transport_of_any_medium_is_a_number(sigma_a, sigma_s):
 
 
 @CHEAP
-@given(radius=st.floats(1e-3, 200.0), sigma_a=st.floats(0.0, 50.0), sigma_s=st.floats(0.0, 50.0),
-       eta=ETA, g=TABLE_G, collection=st.sampled_from(["all", "fibre"]))  # fmt: skip
+@given(
+    radius=st.floats(1e-3, 200.0),
+    sigma_a=st.floats(0.0, 50.0),
+    sigma_s=st.floats(0.0, 50.0),
+    eta=ETA,
+    g=TABLE_G,
+    collection=st.sampled_from(["all", "fibre"]),
+)
 def test_the_photon_table_is_finite_and_says_where_it_holds(
     radius, sigma_a, sigma_s, eta, g, collection
 ):
@@ -196,8 +202,12 @@ def test_the_photon_table_is_finite_and_says_where_it_holds(
 
 
 @CHEAP
-@given(radius=st.floats(0.5, 10.0), sigma_a=st.floats(0.0, 0.5), sigma_s=st.floats(0.5, 3.0),
-       scale=st.floats(0.5, 2.0))  # fmt: skip
+@given(
+    radius=st.floats(0.5, 10.0),
+    sigma_a=st.floats(0.0, 0.5),
+    sigma_s=st.floats(0.5, 3.0),
+    scale=st.floats(0.5, 2.0),
+)
 def test_the_photon_table_scales_with_the_length(radius, sigma_a, sigma_s, scale):
     found = photon_table.reflectance(radius, sigma_a, sigma_s)
     scaled = photon_table.reflectance(radius / scale, sigma_a * scale, sigma_s * scale)
@@ -205,8 +215,12 @@ def test_the_photon_table_scales_with_the_length(radius, sigma_a, sigma_s, scale
 
 
 @CHEAP
-@given(radius=st.floats(1e-50, 1e50), sigma_a=st.floats(0.0, 1e50), sigma_s=st.floats(0.0, 1e50),
-       core=st.one_of(st.just(0.0), st.floats(0.0, 1e50)))  # fmt: skip
+@given(
+    radius=st.floats(1e-50, 1e50),
+    sigma_a=st.floats(0.0, 1e50),
+    sigma_s=st.floats(0.0, 1e50),
+    core=st.one_of(st.just(0.0), st.floats(0.0, 1e50)),
+)
 @example(radius=1e50, sigma_a=0.0, sigma_s=1e50, core=0.0)
 @example(radius=1e-50, sigma_a=1e50, sigma_s=1e50, core=0.0)
 @example(radius=1.0, sigma_a=5e-324, sigma_s=5e-324, core=1e50)
@@ -239,11 +253,16 @@ def test_layers_of_numbers_that_no_medium_has_are_an_error(bad, place):
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -500.0, 1e308]))
 @pytest.mark.parametrize(
     "of",
-    [spectra.eumelanin_absorption, spectra.pheomelanin_absorption, spectra.baseline_absorption,
-     spectra.reduced_scattering, spectra.color_matching_functions,
-     lambda nm: spectra.illuminant("D65", nm),
-     lambda nm: spectra.camera_sensitivity("Nikon 5100 (NPL)", nm)],
-)  # fmt: skip
+    [
+        spectra.eumelanin_absorption,
+        spectra.pheomelanin_absorption,
+        spectra.baseline_absorption,
+        spectra.reduced_scattering,
+        spectra.color_matching_functions,
+        lambda nm: spectra.illuminant("D65", nm),
+        lambda nm: spectra.camera_sensitivity("Nikon 5100 (NPL)", nm),
+    ],
+)
 def test_a_wavelength_that_no_light_has_is_an_error(of, bad):
     with pytest.raises(ValueError, match="wavelength_nm"):
         of(np.array([500.0, bad]))
@@ -265,10 +284,16 @@ def test_areas_too_small_for_a_number_send_no_light(tiny):
 @given(eta=st.sampled_from([np.nan, np.inf, -1.0, 0.0, -np.inf]))
 @pytest.mark.parametrize(
     "average",
-    [fresnel.normal_reflectance, fresnel.boundary_factor, fresnel.diffuse_internal,
-     fresnel.diffuse_external, fresnel.diffuse_internal_flux_moment,
-     lambda eta: fresnel.reflectance(0.5, eta), lambda eta: adding_doubling.quadrature(eta, 4)],
-)  # fmt: skip
+    [
+        fresnel.normal_reflectance,
+        fresnel.boundary_factor,
+        fresnel.diffuse_internal,
+        fresnel.diffuse_external,
+        fresnel.diffuse_internal_flux_moment,
+        lambda eta: fresnel.reflectance(0.5, eta),
+        lambda eta: adding_doubling.quadrature(eta, 4),
+    ],
+)
 def test_an_index_that_no_matter_has_is_an_error(average, eta):
     with pytest.raises(ValueError, match="eta"):
         average(eta)
@@ -354,8 +379,13 @@ def test_layers_reflect_between_nothing_and_all(layers, eta, deep):
 
 
 @FEW
-@given(sigma_a=st.floats(1e-3, 10.0), sigma_s=st.floats(1e-2, 50.0), thickness=st.floats(0.01, 5.0),
-       cut=st.floats(0.1, 0.9), scale=st.floats(0.1, 10.0))  # fmt: skip
+@given(
+    sigma_a=st.floats(1e-3, 10.0),
+    sigma_s=st.floats(1e-2, 50.0),
+    thickness=st.floats(0.01, 5.0),
+    cut=st.floats(0.1, 0.9),
+    scale=st.floats(0.1, 10.0),
+)
 def test_a_layer_may_be_cut_in_two_and_scaled_without_a_change(
     sigma_a, sigma_s, thickness, cut, scale
 ):
@@ -385,8 +415,12 @@ def test_directions_of_layers_integrate_half_a_sphere(eta, directions):
 
 
 @FEW
-@given(c_m=st.floats(0.0, 0.5), c_hd=st.floats(0.0, 0.32), oxygenation=SHARE,
-       tier=st.sampled_from(["diffusion", "adding_doubling"]))  # fmt: skip
+@given(
+    c_m=st.floats(0.0, 0.5),
+    c_hd=st.floats(0.0, 0.32),
+    oxygenation=SHARE,
+    tier=st.sampled_from(["diffusion", "adding_doubling"]),
+)
 def test_skin_is_darker_with_more_melanin_at_every_wavelength(c_m, c_hd, oxygenation, tier):
     wavelength = np.array([420.0, 550.0, 700.0])
     reflect = [
@@ -435,8 +469,12 @@ def test_shares_of_spread_light_grow_from_nothing_to_all(medium, radius, reach):
 
 
 @FEW
-@given(r_d=st.floats(0.05, 0.95), length=st.floats(0.2, 5.0),
-       level=st.one_of(st.just(0.0), st.floats(1e-30, 1e6)), seed=st.integers(0, 99))  # fmt: skip
+@given(
+    r_d=st.floats(0.05, 0.95),
+    length=st.floats(0.2, 5.0),
+    level=st.one_of(st.just(0.0), st.floats(1e-30, 1e6)),
+    seed=st.integers(0, 99),
+)
 def test_even_light_comes_back_as_albedo_and_sums_agree(r_d, length, level, seed):
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(0.0, 10.0, (40, 2)), np.zeros(40)])

@@ -11,8 +11,12 @@ FEW = settings(derandomize=True, deadline=None, max_examples=6, database=None)
 
 
 @FEW
-@given(sigma_a=st.floats(0.02, 0.3), sigma_s=st.floats(0.8, 3.0), factor=st.floats(0.3, 1.0),
-       bad=st.sampled_from([None, np.nan, np.inf, 0.0]))  # fmt: skip
+@given(
+    sigma_a=st.floats(0.02, 0.3),
+    sigma_s=st.floats(0.8, 3.0),
+    factor=st.floats(0.3, 1.0),
+    bad=st.sampled_from([None, np.nan, np.inf, 0.0]),
+)
 def test_the_nearest_medium_of_a_medium_is_itself(sigma_a, sigma_s, factor, bad):
     radius = np.linspace(0.3, 7.05, 28)
     profile = factor * photon_table.reflectance(

@@ -211,8 +211,13 @@ def test_the_area_of_a_texture_knows_no_unit_and_is_at_least_a_pixel(seed, sides
 
 
 @CHEAP
-@given(seed=SEED, sides=SIDES, channels=st.integers(0, 4), bad=NO_NUMBER,
-       kind=st.sampled_from(["<f2", "<f4", "<f8", ">f8", "i8"]))  # fmt: skip
+@given(
+    seed=SEED,
+    sides=SIDES,
+    channels=st.integers(0, 4),
+    bad=NO_NUMBER,
+    kind=st.sampled_from(["<f2", "<f4", "<f8", ">f8", "i8"]),
+)
 def test_images_of_textures_are_finite_where_they_are_valid(seed, sides, channels, bad, kind):
     rng = np.random.default_rng(seed)
     shape = (*sides, channels) if channels else sides
@@ -242,8 +247,9 @@ def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(see
     color, by_a, by_b = chromophore_start.evaluate(colors(), a, b)
     assert np.isfinite(color).all()
     for slope, da, db in ((by_a, step, 0.0), (by_b, 0.0, step)):
-        up, down = (chromophore_start.evaluate(colors(), a + s * da, b + s * db)[0]
-                    for s in (1, -1))  # fmt: skip
+        up, down = (
+            chromophore_start.evaluate(colors(), a + s * da, b + s * db)[0] for s in (1, -1)
+        )
         np.testing.assert_allclose((up - down) / (2 * step), slope, rtol=1e-3, atol=1e-5)
 
 

@@ -171,8 +171,12 @@ def test_how_sure_a_trait_is_does_not_hang_on_the_unit(seed, unit):
 
 
 @CHEAP
-@given(seed=SEED, unit=st.sampled_from([1e-300, 1e-20, 1.0, 1e20, 1e70]), lost=st.booleans(),
-       people=st.integers(1, 6))  # fmt: skip
+@given(
+    seed=SEED,
+    unit=st.sampled_from([1e-300, 1e-20, 1.0, 1e20, 1e70]),
+    lost=st.booleans(),
+    people=st.integers(1, 6),
+)
 def test_a_table_of_people_counts_each_once_in_any_unit(seed, unit, lost, people):
     rng = np.random.default_rng(seed)
     value = rng.uniform(0.5, 2.0, (people, 3))
@@ -190,8 +194,13 @@ def test_a_table_of_people_counts_each_once_in_any_unit(seed, unit, lost, people
             )
     found = translucency_population.summarize(made)
     assert found.count.tolist() == [[people, 0 if lost else people, people]]
-    for name in ("mean_per_mm", "deviation_per_mm", "mean_stderr_per_mm",
-                 "deviation_stderr_per_mm", "noise_per_mm"):  # fmt: skip
+    for name in (
+        "mean_per_mm",
+        "deviation_per_mm",
+        "mean_stderr_per_mm",
+        "deviation_stderr_per_mm",
+        "noise_per_mm",
+    ):
         assert np.isfinite(getattr(found, name)).all(), name
     told = [0, 2] if lost else [0, 1, 2]
     np.testing.assert_allclose(found.mean_per_mm[0, told], unit * value.mean(axis=0)[told])

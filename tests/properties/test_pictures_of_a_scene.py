@@ -107,9 +107,10 @@ def test_waves_are_filtered_linearly_and_all_of_them_leave_a_picture_as_it_is(se
     transfer = rng.random([side + 2 * lens_restoration.PAD_PX for side in sides])
     one = lens_restoration.filtered(values, transfer)
     np.testing.assert_allclose(
-        lens_restoration.filtered(factor * values, transfer), factor * one,
+        lens_restoration.filtered(factor * values, transfer),
+        factor * one,
         atol=1e-12 * max(1.0, abs(factor)),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(
         lens_restoration.filtered(values, np.ones_like(transfer)), values, atol=1e-12
     )
@@ -120,9 +121,12 @@ def test_waves_are_filtered_linearly_and_all_of_them_leave_a_picture_as_it_is(se
 
 @FEW
 @given(
-    seed=SEED, lights=st.integers(4, 12), gain=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]),
-    dead=st.integers(0, 1), bad=NO_NUMBER,
-)  # fmt: skip
+    seed=SEED,
+    lights=st.integers(4, 12),
+    gain=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]),
+    dead=st.integers(0, 1),
+    bad=NO_NUMBER,
+)
 def test_a_list_in_its_order_is_found_to_be_so_in_any_unit(seed, lights, gain, dead, bad):
     rng = np.random.default_rng(seed)
     ways = unit_normals(rng, (lights,), 0.5)
@@ -200,9 +204,11 @@ def test_a_picture_is_where_it_is(seed, error):
 
 @CHEAP
 @given(
-    seed=SEED, unit=st.sampled_from([1e-100, 1e-3, 1e3, 1e100]), rings=st.integers(0, 3),
+    seed=SEED,
+    unit=st.sampled_from([1e-100, 1e-3, 1e3, 1e100]),
+    rings=st.integers(0, 3),
     bad=NO_NUMBER,
-)  # fmt: skip
+)
 def test_change_over_a_surface_goes_with_the_values_and_not_with_those_not_valid(
     seed, unit, rings, bad
 ):
@@ -264,8 +270,9 @@ def test_even_derivatives_are_even_texels_and_gathering_is_the_transpose_of_read
     matrix = wrinkle_texels.normal_matrix(by, bx, weight, shape)
     np.testing.assert_allclose(
         (matrix @ texels.ravel()).reshape(shape),
-        wrinkle_texels.gathered(by, bx, weight * read), atol=1e-9,
-    )  # fmt: skip
+        wrinkle_texels.gathered(by, bx, weight * read),
+        atol=1e-9,
+    )
 
 
 @FEW
@@ -291,8 +298,18 @@ def test_a_plane_has_no_jump_and_what_is_not_valid_is_not_read(seed, sides, slop
 @given(seed=SEED, faces=st.integers(1, 4), size=st.floats(0.5, 2.0))
 def test_landmarks_that_all_faces_have_are_placed_about_the_nose(seed, faces, size):
     rng = np.random.default_rng(seed)
-    names = ["nose tip", "left eye", "right eye", "chin", "left mouth", "right mouth", "brow",
-             "left ear", "right ear", "lip"]  # fmt: skip
+    names = [
+        "nose tip",
+        "left eye",
+        "right eye",
+        "chin",
+        "left mouth",
+        "right mouth",
+        "brow",
+        "left ear",
+        "right ear",
+        "lip",
+    ]
     places = rng.normal(size=(10, 3)) * [30, 30, 5]
     places[0] = 0.0
     given_faces = [dict(zip(names, map(tuple, places), strict=True)) for _ in range(faces)]

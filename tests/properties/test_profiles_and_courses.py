@@ -45,8 +45,10 @@ def test_coefficients_of_a_clean_profile_come_back(sigma_a, sigma_s, gain):
 
 
 @FEW
-@given(values=st.lists(ANY, min_size=18, max_size=18),
-       method=st.sampled_from(["photon_table", "diffusion", "dipole"]))  # fmt: skip
+@given(
+    values=st.lists(ANY, min_size=18, max_size=18),
+    method=st.sampled_from(["photon_table", "diffusion", "dipole"]),
+)
 def test_a_fit_of_any_readings_is_a_number_or_not_valid(values, method):
     readings = np.array(values)
     # beyond these sizes no unit of length makes a reflectance per area
@@ -64,8 +66,12 @@ ANGLES = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
 
 
 @CHEAP
-@given(ratio=st.floats(1.0, 2.0), axis=st.floats(0.0, 3.1), level=st.floats(1e-6, 1e6),
-       turn=st.floats(0.0, 3.0))  # fmt: skip
+@given(
+    ratio=st.floats(1.0, 2.0),
+    axis=st.floats(0.0, 3.1),
+    level=st.floats(1e-6, 1e6),
+    turn=st.floats(0.0, 3.0),
+)
 def test_anisotropy_knows_no_unit_and_turns_with_the_skin(ratio, axis, level, turn):
     uv = 0.5 * np.log(ratio) * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
     values, slopes = diffusion_ellipse.relative_sigma_tr(ANGLES, uv)
@@ -203,13 +209,18 @@ def test_repeats_are_judged_the_same_in_any_unit(seed, scale):
     maps = level + 0.1 * rng.standard_normal((4, 12, 12))
     states = ["neutral", "smile"] * 2
     for judge in (
-        lambda k: repeatability.compare(
-            k * maps, states, stderr=np.full(maps.shape, 0.1 * k)
-        ).region("whole face").correlation,
-        lambda k: repeatability.drift(
-            k * maps, states, [0.0, 10.0, 20.0, 30.0], stderr=np.full(maps.shape, 0.1 * k)
-        )[-1].slope_per_minute / k,
-    ):  # fmt: skip
+        lambda k: (
+            repeatability.compare(k * maps, states, stderr=np.full(maps.shape, 0.1 * k))
+            .region("whole face")
+            .correlation
+        ),
+        lambda k: (
+            repeatability.drift(
+                k * maps, states, [0.0, 10.0, 20.0, 30.0], stderr=np.full(maps.shape, 0.1 * k)
+            )[-1].slope_per_minute
+            / k
+        ),
+    ):
         assert judge(scale) == pytest.approx(judge(1.0), rel=1e-6, abs=1e-9)
 
 
@@ -268,8 +279,13 @@ TURNS = np.arange(12) * (np.pi / 6)
 
 
 @FEW
-@given(seed=SEED, ratio=st.floats(1.0, 1.3), axis=st.floats(0.0, np.pi),
-       unit=st.sampled_from([1e-20, 1.0, 1e20]), lost=st.integers(0, 3))  # fmt: skip
+@given(
+    seed=SEED,
+    ratio=st.floats(1.0, 1.3),
+    axis=st.floats(0.0, np.pi),
+    unit=st.sampled_from([1e-20, 1.0, 1e20]),
+    lost=st.integers(0, 3),
+)
 def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
     seed, ratio, axis, unit, lost
 ):
@@ -306,8 +322,7 @@ def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
 
 
 @CHEAP
-@given(h=st.floats(0.0, 3.0), axis=st.floats(0.0, np.pi), level=st.floats(-0.5, 0.5),
-       drawn=SEED)  # fmt: skip
+@given(h=st.floats(0.0, 3.0), axis=st.floats(0.0, np.pi), level=st.floats(-0.5, 0.5), drawn=SEED)
 def test_an_ellipse_fitted_to_its_own_values_is_itself(h, axis, level, drawn):
     uv = h * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
     shape, _ = diffusion_ellipse.relative_sigma_tr(TURNS, uv)
@@ -368,8 +383,13 @@ def test_what_is_straight_in_the_root_of_the_distance_is_kept_whatever_fibres_ar
 
 
 @CHEAP
-@given(seed=st.integers(0, 99), fibres=st.integers(3, 30), least=st.floats(1e-6, 1e6),
-       level=st.floats(-10.0, 10.0), slope=st.floats(-10.0, 10.0))  # fmt: skip
+@given(
+    seed=st.integers(0, 99),
+    fibres=st.integers(3, 30),
+    least=st.floats(1e-6, 1e6),
+    level=st.floats(-10.0, 10.0),
+    slope=st.floats(-10.0, 10.0),
+)
 def test_level_and_slope_tell_nothing_of_how_much_a_misfit_bends(seed, fibres, least, level, slope):
     rng = np.random.default_rng(seed)
     place = np.cumsum(rng.uniform(0.02, 0.3, fibres))

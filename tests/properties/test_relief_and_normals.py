@@ -62,14 +62,19 @@ def test_slopes_know_no_unit_and_no_constant(seed, sides, scale):
     known = relief_slopes.stencil(height, valid) > 0
     np.testing.assert_array_equal(first[2], known)
     assert not known[~valid].any()
-    down = relief_slopes.slopes(height, pixel=relief_slopes.pixel_sides(2.0), valid=valid,
-                                   y_up=False)  # fmt: skip
+    down = relief_slopes.slopes(
+        height, pixel=relief_slopes.pixel_sides(2.0), valid=valid, y_up=False
+    )
     np.testing.assert_allclose(down[1], -first[1], atol=1e-12)
 
 
 @CHEAP
-@given(slope=st.lists(st.tuples(*[st.floats(-1e150, 1e150)] * 2), min_size=1, max_size=20),
-       bins=st.integers(1, 40), limit=st.floats(0.01, 1.0), turn=st.floats(-4.0, 4.0))  # fmt: skip
+@given(
+    slope=st.lists(st.tuples(*[st.floats(-1e150, 1e150)] * 2), min_size=1, max_size=20),
+    bins=st.integers(1, 40),
+    limit=st.floats(0.01, 1.0),
+    turn=st.floats(-4.0, 4.0),
+)
 def test_every_normal_is_in_a_bucket_or_outside(slope, bins, limit, turn):
     x, y = np.array(slope).T
     normal_histogram.check_buckets(bins, limit)
@@ -198,8 +203,12 @@ def test_parts_are_connected_and_cover_what_is_valid(seed, sides):
 
 
 @FEW
-@given(tilt=st.tuples(*[st.floats(-2.0, 2.0)] * 2), pixel=st.sampled_from([1e-20, 1.0, 1e20]),
-       seed=SEED, kind=st.sampled_from([np.float32, np.float64]))  # fmt: skip
+@given(
+    tilt=st.tuples(*[st.floats(-2.0, 2.0)] * 2),
+    pixel=st.sampled_from([1e-20, 1.0, 1e20]),
+    seed=SEED,
+    kind=st.sampled_from([np.float32, np.float64]),
+)
 def test_a_plane_is_integrated_exactly_whatever_the_mask_and_unit(tilt, pixel, seed, kind):
     valid = masked(np.random.default_rng(seed), (12, 9), 0.9)
     normals = np.broadcast_to(np.array([-tilt[0], -tilt[1], 1.0], kind), (12, 9, 3))
@@ -283,10 +292,11 @@ def test_the_expected_error_of_a_height_grows_with_the_noise(sides, slope):
 def test_sampled_errors_of_a_height_scale_with_those_of_normals(seed, error):
     normals = unit_normals(np.random.default_rng(seed), (10, 9))
     first, twice = (
-        height_errors.sampled_stderr(normals, rng=np.random.default_rng(1), stderr_rad=k * error,
-                                     samples=4)
+        height_errors.sampled_stderr(
+            normals, rng=np.random.default_rng(1), stderr_rad=k * error, samples=4
+        )
         for k in (1.0, 2.0)
-    )  # fmt: skip
+    )
     assert np.isfinite(first).all()
     np.testing.assert_allclose(twice, 2.0 * first, rtol=1e-3, atol=1e-9)
 
@@ -309,8 +319,10 @@ def test_normals_of_matte_points_are_exact_and_know_no_exposure(seed, scale, rob
 
 
 @CHEAP
-@given(pixel=st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
-       robust=st.booleans())  # fmt: skip
+@given(
+    pixel=st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
+    robust=st.booleans(),
+)
 def test_normals_of_any_samples_are_numbers_or_masked(pixel, robust):
     image = np.array(pixel)[:, None]
     usable = np.isfinite(image) & (np.abs(image) < 1e100)
@@ -427,9 +439,13 @@ def test_a_stretch_that_is_none_is_an_error(bad):
 
 
 @CHEAP
-@given(heights=st.lists(st.floats(-1e3, 1e3), min_size=12, max_size=40),
-       spacing=st.floats(0.1, 1e3), alpha=st.floats(-2.0, 1.0), sigma=st.floats(0.1, 100.0),
-       stretch=st.floats(0.5, 2.0))  # fmt: skip
+@given(
+    heights=st.lists(st.floats(-1e3, 1e3), min_size=12, max_size=40),
+    spacing=st.floats(0.1, 1e3),
+    alpha=st.floats(-2.0, 1.0),
+    sigma=st.floats(0.1, 100.0),
+    stretch=st.floats(0.5, 2.0),
+)
 def test_a_surface_is_never_shorter_than_its_ground(heights, spacing, alpha, sigma, stretch):
     height = np.array(heights)
     ground = (height.size - 1) * spacing
@@ -500,9 +516,10 @@ def test_axes_of_a_texture_are_orthonormal_and_turn_with_it(seed, turn):
     place = np.stack([x, -y, 0.5 * np.sin(0.4 * x + rng.uniform(0, 6))], axis=-1)
     axes, known = tangent_space.frames(place, np.ones((14, 12), bool))
     np.testing.assert_allclose(
-        (axes @ np.swapaxes(axes, -1, -2))[known], np.broadcast_to(np.eye(3), (known.sum(), 3, 3)),
+        (axes @ np.swapaxes(axes, -1, -2))[known],
+        np.broadcast_to(np.eye(3), (known.sum(), 3, 3)),
         atol=1e-6,
-    )  # fmt: skip
+    )
     c, s = np.cos(turn), np.sin(turn)
     spin = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
     normals = unit_normals(rng, (14, 12))

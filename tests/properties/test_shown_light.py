@@ -51,8 +51,12 @@ def test_a_facet_reflects_at_least_what_it_does_head_on_and_at_most_all(cosine, 
 
 
 @CHEAP
-@given(polar=st.tuples(HALF, HALF), turn=st.tuples(TURN, TURN), f0=SHARE,
-       roughness=st.floats(1e-6, 1e6))  # fmt: skip
+@given(
+    polar=st.tuples(HALF, HALF),
+    turn=st.tuples(TURN, TURN),
+    f0=SHARE,
+    roughness=st.floats(1e-6, 1e6),
+)
 def test_gloss_is_the_same_for_light_and_eye_exchanged(polar, turn, f0, roughness):
     z = [0.0, 0.0, 1.0]
     to_light, to_eye = (direction(p, t) for p, t in zip(polar, turn, strict=True))
@@ -88,9 +92,14 @@ def test_a_wider_blur_asks_for_wider_taps_and_for_no_more_than_itself(wide):
 
 
 @FEW
-@given(seed=SEED, sides=st.tuples(st.integers(1, 9), st.integers(1, 9)),
-       depth=st.floats(1e-6, 1e6), width=st.floats(1e-100, 1e100), level=st.floats(1e-300, 1e100),
-       focal=st.floats(1e-3, 1e6))  # fmt: skip
+@given(
+    seed=SEED,
+    sides=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    depth=st.floats(1e-6, 1e6),
+    width=st.floats(1e-100, 1e100),
+    level=st.floats(1e-300, 1e100),
+    focal=st.floats(1e-3, 1e6),
+)
 def test_light_that_spreads_stays_between_the_darkest_and_the_brightest(
     seed, sides, depth, width, level, focal
 ):
@@ -117,13 +126,18 @@ def test_light_that_spreads_stays_between_the_darkest_and_the_brightest(
 
 
 @CHEAP
-@given(what=st.sampled_from(["light", "depth", "width", "weights", "focal_px"]),
-       bad=st.sampled_from([np.nan, np.inf, -1.0, 0.0]))  # fmt: skip
+@given(
+    what=st.sampled_from(["light", "depth", "width", "weights", "focal_px"]),
+    bad=st.sampled_from([np.nan, np.inf, -1.0, 0.0]),
+)
 def test_what_no_light_spreads_in_is_refused_by_name(what, bad):
     told = {
-        "light": np.ones((2, 3, 3)), "depth": np.full((2, 3), 400.0), "width": np.ones((2, 3)),
-        "weights": np.full((1, 3), 1.0), "focal_px": 1000.0,
-    }  # fmt: skip
+        "light": np.ones((2, 3, 3)),
+        "depth": np.full((2, 3), 400.0),
+        "width": np.ones((2, 3)),
+        "weights": np.full((1, 3), 1.0),
+        "focal_px": 1000.0,
+    }
     if what == "focal_px":
         told[what] = bad
     else:
@@ -139,8 +153,9 @@ def test_what_no_light_spreads_in_is_refused_by_name(what, bad):
 
 
 @FEW
-@given(fractions=st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.32)), min_size=1,
-                          max_size=4))  # fmt: skip
+@given(
+    fractions=st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.32)), min_size=1, max_size=4)
+)
 def test_a_spectrum_of_skin_is_a_share_and_falls_with_pigment(fractions):
     c_m, c_hd = np.array(fractions).T
     found = color_table.spectral_reflectance(c_m, c_hd)

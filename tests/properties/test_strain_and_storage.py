@@ -35,8 +35,12 @@ def stretched(stretch, scale=1.0):
 
 
 @CHEAP
-@given(stretch=st.floats(0.01, 100.0), scale=st.floats(1e-3, 1e6), size=SIDES,
-       window=st.tuples(SIDES, SIDES))  # fmt: skip
+@given(
+    stretch=st.floats(0.01, 100.0),
+    scale=st.floats(1e-3, 1e6),
+    size=SIDES,
+    window=st.tuples(SIDES, SIDES),
+)
 def test_a_texture_of_strain_is_the_same_in_every_window(stretch, scale, size, window):
     strain, faces, uv = stretched(stretch, scale)
     whole = strain_fields.rasterize(strain, faces, uv, size)
@@ -47,8 +51,9 @@ def test_a_texture_of_strain_is_the_same_in_every_window(stretch, scale, size, w
     np.testing.assert_allclose(lengths, 1.0, rtol=1e-5)
     assert (whole.px_per_mm > 0.0).all()
     top, left = (min(a, b) - 1 for a, b in zip(window[0], size, strict=True))
-    bottom, right = (min(a + b + 1, c) for a, b, c in zip((top, left), window[1], size,
-                                                          strict=True))  # fmt: skip
+    bottom, right = (
+        min(a + b + 1, c) for a, b, c in zip((top, left), window[1], size, strict=True)
+    )
     part = strain_fields.rasterize(strain, faces, uv, size, window=Window(top, bottom, left, right))
     for name in ("stretch", "axes", "px_per_mm", "covered", "padded"):
         inside = getattr(whole, name)[top:bottom, left:right]
@@ -60,8 +65,12 @@ def test_a_texture_of_strain_is_the_same_in_every_window(stretch, scale, size, w
 
 
 @CHEAP
-@given(stretch=st.floats(0.01, 100.0), extrapolate=st.sampled_from(["hold", "formula"]),
-       size=SIDES, share=st.floats(0.0, 1.0))  # fmt: skip
+@given(
+    stretch=st.floats(0.01, 100.0),
+    extrapolate=st.sampled_from(["hold", "formula"]),
+    size=SIDES,
+    share=st.floats(0.0, 1.0),
+)
 def test_kernels_of_a_strain_are_those_of_its_table(stretch, extrapolate, size, share):
     strain, faces, uv = stretched(stretch, 40.0)
     field = strain_fields.rasterize(strain, faces, uv, size)
@@ -87,9 +96,13 @@ def test_kernels_of_a_strain_are_those_of_its_table(stretch, extrapolate, size, 
 
 
 @CHEAP
-@given(seed=SEED, sides=st.lists(st.tuples(*[st.integers(2, 14)] * 2), min_size=1, max_size=3),
-       zooms=st.lists(st.floats(0.2, 3.0), min_size=1, max_size=3), window=st.integers(1, 6),
-       holes=st.booleans())  # fmt: skip
+@given(
+    seed=SEED,
+    sides=st.lists(st.tuples(*[st.integers(2, 14)] * 2), min_size=1, max_size=3),
+    zooms=st.lists(st.floats(0.2, 3.0), min_size=1, max_size=3),
+    window=st.integers(1, 6),
+    holes=st.booleans(),
+)
 def test_sources_hold_each_patch_at_each_scale_that_is_large_enough(
     seed, sides, zooms, window, holes
 ):
@@ -99,9 +112,7 @@ def test_sources_hold_each_patch_at_each_scale_that_is_large_enough(
         for patch in patches:
             patch[rng.uniform(size=patch.shape) < 0.3] = np.nan
             patch[0, 0] = 1.0
-    scaled = [
-        [tuple(max(1, int(n * z + 1e-9)) for n in side) for side in sides] for z in zooms
-    ]  # fmt: skip
+    scaled = [[tuple(max(1, int(n * z + 1e-9)) for n in side) for side in sides] for z in zooms]
     large = [[shape for shape in level if min(shape) >= window] for level in scaled]
     if not all(large):
         with pytest.raises(ValueError, match="patches"):
@@ -123,9 +134,14 @@ def test_sources_hold_each_patch_at_each_scale_that_is_large_enough(
 
 
 @CHEAP
-@given(wrinkle=SIDES, mask=SIDES, zones=st.integers(1, 12), mips=st.booleans(),
-       maps=st.sampled_from(["float32", "float16", "unit8", "bc5"]),
-       masks=st.sampled_from(["float32", "float16", "unit8", "bc3"]))  # fmt: skip
+@given(
+    wrinkle=SIDES,
+    mask=SIDES,
+    zones=st.integers(1, 12),
+    mips=st.booleans(),
+    maps=st.sampled_from(["float32", "float16", "unit8", "bc5"]),
+    masks=st.sampled_from(["float32", "float16", "unit8", "bc3"]),
+)
 def test_a_footprint_is_that_of_its_textures(wrinkle, mask, zones, mips, maps, masks):
     told = {"maps": maps, "masks": masks, "zones": zones, "mip_maps": mips}
     found = wrinkle_storage.footprint(wrinkle, mask, **told)
@@ -141,8 +157,14 @@ def test_a_footprint_is_that_of_its_textures(wrinkle, mask, zones, mips, maps, m
 
 
 @CHEAP
-@given(seed=SEED, sides=SIDES, zones=st.integers(1, 9), huge=st.sampled_from([2.0, 1e5, 1e39]),
-       encoding=st.sampled_from(["float32", "float16", "unit8", "bc3"]), bad=NO_NUMBER)  # fmt: skip
+@given(
+    seed=SEED,
+    sides=SIDES,
+    zones=st.integers(1, 9),
+    huge=st.sampled_from([2.0, 1e5, 1e39]),
+    encoding=st.sampled_from(["float32", "float16", "unit8", "bc3"]),
+    bad=NO_NUMBER,
+)
 def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encoding, bad):
     masks = np.random.default_rng(seed).uniform(size=(zones, *sides))
     found = wrinkle_storage.stored_masks(masks, encoding)
@@ -183,8 +205,13 @@ def test_a_finer_store_is_no_farther_off_and_takes_no_fewer_bytes(seed, side, we
 
 
 @CHEAP
-@given(seed=SEED, texels=SIDES, pixels=SIDES, kind=st.sampled_from([np.float32, np.float64]),
-       level=st.floats(-1e30, 1e30))  # fmt: skip
+@given(
+    seed=SEED,
+    texels=SIDES,
+    pixels=SIDES,
+    kind=st.sampled_from([np.float32, np.float64]),
+    level=st.floats(-1e30, 1e30),
+)
 def test_widened_planes_read_back_what_they_hold(seed, texels, pixels, kind, level):
     planes = np.random.default_rng(seed).standard_normal((2, *texels))
     *wide, first, part = wrinkles.widened(planes, pixels, kind)
@@ -203,8 +230,13 @@ def test_widened_planes_read_back_what_they_hold(seed, texels, pixels, kind, lev
 
 
 @CHEAP
-@given(seed=SEED, sides=SIDES, bad=NO_NUMBER, kind=st.sampled_from([np.uint16, np.float32]),
-       level=st.sampled_from([None, 0.5]))  # fmt: skip
+@given(
+    seed=SEED,
+    sides=SIDES,
+    bad=NO_NUMBER,
+    kind=st.sampled_from([np.uint16, np.float32]),
+    level=st.sampled_from([None, 0.5]),
+)
 def test_collected_pictures_keep_their_samples_and_mask_what_is_none(seed, sides, bad, kind, level):
     rng = np.random.default_rng(seed)
     keys = [(name, "parallel") for name in ("full", "x", "y", "z")]
@@ -213,9 +245,9 @@ def test_collected_pictures_keep_their_samples_and_mask_what_is_none(seed, sides
     variance[keys[1]][0, 0] = bad
     variance[keys[2]][0, 0] = -1.0
     top = None if level is None else 500.0
-    stack = gradient_patterns.collect(
-        pictures, variance=variance, valid=None, saturation=top
-    )["parallel"]  # fmt: skip
+    stack = gradient_patterns.collect(pictures, variance=variance, valid=None, saturation=top)[
+        "parallel"
+    ]
     samples = stack.samples(slice(None), np.float64)
     spread = stack.variances(slice(None), np.float64)
     assert (np.isfinite(spread) & (spread > 0.0)).all()
@@ -256,9 +288,12 @@ def test_whether_kernels_hang_on_the_direction_does_not_hang_on_the_unit(seed, u
         assert large.p_alpha == pytest.approx(plain.p_alpha, rel=1e-6)
         assert np.isfinite(large.alpha_offset).all()
     turned = kernel_table.direction_dependence(
-        table, stretch, alpha + np.select([angle == 0.0, angle == 0.8], [0.0, 3.0], -3.0),
-        sigma, angle,
-    )  # fmt: skip
+        table,
+        stretch,
+        alpha + np.select([angle == 0.0, angle == 0.8], [0.0, 3.0], -3.0),
+        sigma,
+        angle,
+    )
     assert turned.p_alpha < 1e-6
     exact = kernel_table.direction_dependence(table, stretch, alpha, sigma, angle)
     assert np.isfinite([exact.p_alpha, exact.p_sigma]).all()

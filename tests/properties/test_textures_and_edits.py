@@ -87,8 +87,13 @@ def test_values_that_blocks_do_not_hold_are_an_error(encode, bad):
 
 
 @CHEAP
-@given(seed=SEED, sides=SIDES, radius=st.floats(0.0, 20.0),
-       scale=st.sampled_from([1e-12, 1.0, 1e12]), hole=ANY)  # fmt: skip
+@given(
+    seed=SEED,
+    sides=SIDES,
+    radius=st.floats(0.0, 20.0),
+    scale=st.sampled_from([1e-12, 1.0, 1e12]),
+    hole=ANY,
+)
 def test_statistics_of_discs_scale_and_leave_out_what_is_missing(seed, sides, radius, scale, hole):
     rng = np.random.default_rng(seed)
     h, valid = rng.uniform(1.0, 2.0, sides), rng.uniform(size=sides) > 0.2
@@ -107,8 +112,13 @@ def test_statistics_of_discs_scale_and_leave_out_what_is_missing(seed, sides, ra
 
 
 @CHEAP
-@given(seed=SEED, levels=st.integers(1, 4), orientations=st.integers(1, 5), kind=KIND,
-       sides=st.tuples(st.integers(1, 20), st.integers(1, 20)))  # fmt: skip
+@given(
+    seed=SEED,
+    levels=st.integers(1, 4),
+    orientations=st.integers(1, 5),
+    kind=KIND,
+    sides=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+)
 def test_a_pyramid_gives_its_image_back(seed, levels, orientations, kind, sides):
     image = np.random.default_rng(seed).standard_normal(sides).astype(kind)
     kept = image.copy()
@@ -285,8 +295,14 @@ def test_a_texture_that_has_the_statistics_already_comes_back(seed):
 
 
 @CHEAP
-@given(seed=SEED, sides=SIDES, alpha=st.floats(-2.0, 1.0), sigma=st.floats(0.0, 6.0),
-       level=st.floats(-100.0, 100.0), turn=st.floats(-3.0, 3.0))  # fmt: skip
+@given(
+    seed=SEED,
+    sides=SIDES,
+    alpha=st.floats(-2.0, 1.0),
+    sigma=st.floats(0.0, 6.0),
+    level=st.floats(-100.0, 100.0),
+    turn=st.floats(-3.0, 3.0),
+)
 def test_a_kernel_leaves_an_even_height_and_scales_any_other(
     seed, sides, alpha, sigma, level, turn
 ):
@@ -347,8 +363,11 @@ def test_any_normal_is_encoded_within_the_limit_or_masked(normal, limit):
 
 
 @CHEAP
-@given(seed=SEED, weights=st.lists(st.floats(-3.0, 3.0), min_size=8, max_size=8),
-       clamp=st.sampled_from(["unit", "signed"]))  # fmt: skip
+@given(
+    seed=SEED,
+    weights=st.lists(st.floats(-3.0, 3.0), min_size=8, max_size=8),
+    clamp=st.sampled_from(["unit", "signed"]),
+)
 def test_wrinkles_by_any_weights_are_unit_normals_and_none_at_rest(seed, weights, clamp):
     rng = np.random.default_rng(seed)
     base, wrinkle = rng.normal(size=(6, 5, 2)), rng.uniform(-1.0, 1.0, (3, 4, 2))
@@ -582,8 +601,11 @@ def test_bins_and_axes_of_nothing_or_of_no_numbers_are_refused(bad, count):
 
 
 @CHEAP
-@given(seed=st.integers(0, 99), sides=st.tuples(*[st.integers(1, 9)] * 2),
-       onto=st.tuples(*[st.integers(1, 9)] * 2))  # fmt: skip
+@given(
+    seed=st.integers(0, 99),
+    sides=st.tuples(*[st.integers(1, 9)] * 2),
+    onto=st.tuples(*[st.integers(1, 9)] * 2),
+)
 def test_halves_are_resampled_as_singles_are(seed, sides, onto):
     texture = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, *sides)).astype(np.float16)
     found = texture_resampling.resampled(texture, onto)

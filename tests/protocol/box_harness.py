@@ -23,9 +23,13 @@ with atheris.instrument_imports(include=["rigsim.boxes", "capture.devices.wire"]
 
 def one_input(data):
     unit = FlashUnit(
-        on_pop=lambda pop: None, on_trigger=lambda t_s: None, recycle_s=0.1, pops_per_min=20,
-        move_s=0.1, rng=np.random.default_rng(0),
-    )  # fmt: skip
+        on_pop=lambda pop: None,
+        on_trigger=lambda t_s: None,
+        recycle_s=0.1,
+        pops_per_min=20,
+        move_s=0.1,
+        rng=np.random.default_rng(0),
+    )
     box = Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
     now_s = 0.0
     for seq, act in enumerate(data.split(b"\n")[:200]):

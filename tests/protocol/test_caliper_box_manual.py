@@ -16,9 +16,14 @@ from rigsim.world.taped_skin import TapedSkin, TapeMechanics
 
 RIG = load_rig("gradient").cropped(16)
 SKIN = TapeMechanics(
-    stiffness_n=0.7, stiffening=5.0, buckles_at=0.73, detaches_at=1.30, tape_n_per_mm=6.0,
-    slips_at_n=0.09, hardening_n_per_mm=2.0,
-)  # fmt: skip
+    stiffness_n=0.7,
+    stiffening=5.0,
+    buckles_at=0.73,
+    detaches_at=1.30,
+    tape_n_per_mm=6.0,
+    slips_at_n=0.09,
+    hardening_n_per_mm=2.0,
+)
 
 ANY = object()
 READY = ("CAL:FORC:LIM 5", "SYST:ARM")
@@ -38,9 +43,23 @@ MANUAL = {
     "CAL:FORC:LIM?": ("CAL:FORC:LIM?", (), "NONE"),
 }
 SHARED = {
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?", "SYST:CAP:PART?",
-    "SYST:WDOG", "SYST:WDOG?", "SYST:ARM", "SYST:ARM?", "SYST:PING?", "SAFE", "ABOR", "STAT?",
-}  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART?",
+    "SYST:WDOG",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:ARM?",
+    "SYST:PING?",
+    "SAFE",
+    "ABOR",
+    "STAT?",
+}
 
 
 @pytest.fixture

@@ -254,9 +254,17 @@ def test_of_two_hundred_exposures_no_bad_frame_is_accepted(faulty):
 
 @pytest.mark.parametrize(
     "url",
-    ["sim://nowhere/cam", "sim://nowhere", "sim:///cam", "tcp://127.0.0.1/cam", "tcp://:1/cam",
-     "tcp://127.0.0.1:0/cam", "tcp://127.0.0.1:99999/cam", "tcp://127.0.0.1:80"],
-)  # fmt: skip
+    [
+        "sim://nowhere/cam",
+        "sim://nowhere",
+        "sim:///cam",
+        "tcp://127.0.0.1/cam",
+        "tcp://:1/cam",
+        "tcp://127.0.0.1:0/cam",
+        "tcp://127.0.0.1:99999/cam",
+        "tcp://127.0.0.1:80",
+    ],
+)
 def test_an_address_of_no_camera_is_named(url):
     with pytest.raises(CameraUrlError, match="expected"):
         open_camera(url)
@@ -326,10 +334,15 @@ def test_garbage_ends_one_connection_and_leaves_the_service(rig, garbage):
 
 @pytest.mark.parametrize(
     "request_",
-    [{"do": "frame"}, {"do": "dance"}, {}, {"do": "arm", "count": "x", "trigger": "edge"},
-     {"do": "arm", "count": 1, "trigger": "sneeze"},
-     {"do": "configure", "exposure_s": -1, "iso": 1}],
-)  # fmt: skip
+    [
+        {"do": "frame"},
+        {"do": "dance"},
+        {},
+        {"do": "arm", "count": "x", "trigger": "edge"},
+        {"do": "arm", "count": 1, "trigger": "sneeze"},
+        {"do": "configure", "exposure_s": -1, "iso": 1},
+    ],
+)
 def test_a_request_that_makes_no_sense_is_answered_with_an_error(rig, request_):
     with serve(rig) as served:
         camera = open_camera(served.addresses["cam"])
@@ -340,9 +353,15 @@ def test_a_request_that_makes_no_sense_is_answered_with_an_error(rig, request_):
 
 
 FRAME = {
-    "serial": "S", "seq": 0, "t_start_s": 1.0, "t_end_s": 1.1, "exposure_s": 0.1, "iso": 100,
-    "light": {}, "shape": [2, 4],
-}  # fmt: skip
+    "serial": "S",
+    "seq": 0,
+    "t_start_s": 1.0,
+    "t_end_s": 1.1,
+    "exposure_s": 0.1,
+    "iso": 100,
+    "light": {},
+    "shape": [2, 4],
+}
 
 
 class Impostor:
@@ -350,9 +369,15 @@ class Impostor:
 
     def __init__(self, answer):
         info = {
-            "serial": "S", "model": "M", "width_px": 4, "height_px": 2, "pattern": "MONO",
-            "black": [0], "white": 255, "triggers": ["edge"],
-        }  # fmt: skip
+            "serial": "S",
+            "model": "M",
+            "width_px": 4,
+            "height_px": 2,
+            "pattern": "MONO",
+            "black": [0],
+            "white": 255,
+            "triggers": ["edge"],
+        }
         self.server = socket.create_server(("127.0.0.1", 0))
         self.replies = [camera_wire.encode_message({"id": 1, "ok": True, "info": info}), answer]
         self.thread = threading.Thread(target=self.run)
@@ -424,9 +449,14 @@ def test_a_frame_that_contradicts_itself_is_refused(impostor, changes):
 
 @pytest.mark.parametrize(
     "answer",
-    [b"hello\n", b"x" * 70_000, b"", b'{"id":2,"ok":true}*0000\n',
-     camera_wire.encode_message({"id": 2, "ok": True, "blob_bytes": -1})],
-)  # fmt: skip
+    [
+        b"hello\n",
+        b"x" * 70_000,
+        b"",
+        b'{"id":2,"ok":true}*0000\n',
+        camera_wire.encode_message({"id": 2, "ok": True, "blob_bytes": -1}),
+    ],
+)
 def test_an_answer_that_is_no_message_is_a_lost_link(impostor, answer):
     camera = impostor(answer)
     with pytest.raises(LinkLost):

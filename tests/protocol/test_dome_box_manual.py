@@ -43,9 +43,23 @@ MANUAL = {
     "DOSE:NEW": ("DOSE:NEW P042", (), ""),
 }
 SHARED = {
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?", "SYST:CAP:PART?",
-    "SYST:WDOG", "SYST:WDOG?", "SYST:ARM", "SYST:ARM?", "SYST:PING?", "SAFE", "ABOR", "STAT?",
-}  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART?",
+    "SYST:WDOG",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:ARM?",
+    "SYST:PING?",
+    "SAFE",
+    "ABOR",
+    "STAT?",
+}
 
 
 class Bench:
@@ -150,9 +164,7 @@ def test_a_bare_command_is_refused_and_changes_nothing(bench, header):
     before = bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit
     assert bench.raw(MANUAL[header][0].encode() + b"\n") == b""
     assert bench.raw(b"SYST:ERR?\n") == b'203,"Unframed command"\n'
-    assert before == (
-        bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit
-    )  # fmt: skip
+    assert before == (bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit)
     assert bench.edges == []
 
 
@@ -302,9 +314,18 @@ def test_a_sequence_runs_once_for_each_arming(bench):
 
 
 @pytest.mark.parametrize(
-    "text", ["SEQ:CLE", "SEQ:DEF 0,3:1:80000:7", "SEQ:ARM 2", "LED:ON 3,80", "CAM:MASK 1",
-             "CAM:TRIG x", "LED:OFF ALL", "DOSE:NEW p"],
-)  # fmt: skip
+    "text",
+    [
+        "SEQ:CLE",
+        "SEQ:DEF 0,3:1:80000:7",
+        "SEQ:ARM 2",
+        "LED:ON 3,80",
+        "CAM:MASK 1",
+        "CAM:TRIG x",
+        "LED:OFF ALL",
+        "DOSE:NEW p",
+    ],
+)
 def test_a_running_sequence_is_not_meddled_with(bench, text):
     bench.run(rows_of(behind(2)))
     assert bench.code(text) == Code.IGNORED

@@ -155,11 +155,20 @@ def test_what_is_no_plain_number_is_a_syntax_error(bench, header, text):
 @pytest.mark.parametrize(
     "text",
     [
-        "SYST:WDOG 299", "SYST:WDOG 5001", "FLAS:POL:ANG -0.1", "FLAS:POL:ANG 180.1",
-        "FLAS:SYNC -1", "FLAS:SYNC 50001", "SYST:CAP:PART? -1", "SYST:CAP:PART? 99",
-        "FLAS:POW 0", "FLAS:POW 1.000001", "FLAS:LAMP ON,0", "FLAS:LAMP ON,501",
+        "SYST:WDOG 299",
+        "SYST:WDOG 5001",
+        "FLAS:POL:ANG -0.1",
+        "FLAS:POL:ANG 180.1",
+        "FLAS:SYNC -1",
+        "FLAS:SYNC 50001",
+        "SYST:CAP:PART? -1",
+        "SYST:CAP:PART? 99",
+        "FLAS:POW 0",
+        "FLAS:POW 1.000001",
+        "FLAS:LAMP ON,0",
+        "FLAS:LAMP ON,501",
     ],
-)  # fmt: skip
+)
 def test_what_is_out_of_range_is_refused_and_nothing_changes(bench, text):
     bench.ask("SYST:ARM")
     before = bench.unit.power, bench.unit.angle_deg, bench.ask("SYST:WDOG?"), bench.unit.lit
@@ -184,12 +193,17 @@ def test_an_unknown_header_is_undefined_framed_or_bare(bench):
 
 def test_settings_are_read_back(bench):
     for text, query, payload in [
-        ("FLAS:POL CROS", "FLAS:POL?", "CROS"), ("FLAS:POL CROS", "FLAS:POL:ANG?", "90.000"),
-        ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"), ("FLAS:POW 0.5", "FLAS:POW?", "0.50000000"),
-        ("FLAS:SYNC 12500", "FLAS:SYNC?", "12500"), ("*RST", "FLAS:SYNC?", "0"),
-        ("SYST:WDOG 500", "SYST:WDOG?", "500"), ("SYST:ARM", "SYST:ARM?", "1"),
-        ("SYST:ARM", "STAT?", "49"), ("*RST", "FLAS:POW?", "1.00000000"),
-    ]:  # fmt: skip
+        ("FLAS:POL CROS", "FLAS:POL?", "CROS"),
+        ("FLAS:POL CROS", "FLAS:POL:ANG?", "90.000"),
+        ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"),
+        ("FLAS:POW 0.5", "FLAS:POW?", "0.50000000"),
+        ("FLAS:SYNC 12500", "FLAS:SYNC?", "12500"),
+        ("*RST", "FLAS:SYNC?", "0"),
+        ("SYST:WDOG 500", "SYST:WDOG?", "500"),
+        ("SYST:ARM", "SYST:ARM?", "1"),
+        ("SYST:ARM", "STAT?", "49"),
+        ("*RST", "FLAS:POW?", "1.00000000"),
+    ]:
         bench.ask(text)
         assert bench.ask(query) == payload, text
 
@@ -595,8 +609,11 @@ def test_a_reset_draws_another_epoch_forgets_settings_and_keeps_the_count(bench)
     bench.now += 0.8
     assert bench.box.boot not in (before, 0)
     assert [bench.ask(q) for q in ("FLAS:POW?", "SYST:ARM?", "FLAS:COUN?", "FLAS:LAST?")] == [
-        "1.00000000", "0", "1", "NONE",
-    ]  # fmt: skip
+        "1.00000000",
+        "0",
+        "1",
+        "NONE",
+    ]
     assert bench.ask("SYST:PING?") == "800000"
 
 

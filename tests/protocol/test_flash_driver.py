@@ -233,15 +233,25 @@ def liar(rig):
 @pytest.mark.parametrize(
     ("method", "arguments", "payload"),
     [
-        ("charge_state", (), "0.5,1"), ("charge_state", (), "x,1,2"), ("power", (), "nan"),
-        ("power", (), "full"), ("polarizer", (), "LEFT"), ("settled", (), "2"),
-        ("count", (), ""), ("ping", (), "inf"), ("last_pop", (), "a,1,0.5,PAR,0"),
-        ("last_pop", (), "a,1,0.5,UP,0,1"), ("last_pop", (), "a,1,much,PAR,0,1"),
-        ("trigger_cameras", ("d",), "e,5"), ("trigger_cameras", ("d",), "d,x"),
-        ("errors", (), "none"), ("status", (), "armed"), ("hello", (), "{}*0000"),
+        ("charge_state", (), "0.5,1"),
+        ("charge_state", (), "x,1,2"),
+        ("power", (), "nan"),
+        ("power", (), "full"),
+        ("polarizer", (), "LEFT"),
+        ("settled", (), "2"),
+        ("count", (), ""),
+        ("ping", (), "inf"),
+        ("last_pop", (), "a,1,0.5,PAR,0"),
+        ("last_pop", (), "a,1,0.5,UP,0,1"),
+        ("last_pop", (), "a,1,much,PAR,0,1"),
+        ("trigger_cameras", ("d",), "e,5"),
+        ("trigger_cameras", ("d",), "d,x"),
+        ("errors", (), "none"),
+        ("status", (), "armed"),
+        ("hello", (), "{}*0000"),
         ("hello", (), "[]*0A50"),
     ],
-)  # fmt: skip
+)
 def test_an_answer_that_makes_no_sense_is_named(liar, method, arguments, payload):
     with pytest.raises(BadAnswer, match="expected"):
         getattr(liar(payload), method)(*arguments)

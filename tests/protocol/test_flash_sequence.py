@@ -30,9 +30,14 @@ def run(path, plan, *, faults=None, stop_after=None, resume=False, host_s=1e9):
         session = Session.resume(path)
     else:
         session = Session.create(
-            path, plan=plan, rig=RIG, devices={}, subject=Subject("nobody", ("research",)),
-            source="simulated", seed=0,
-        )  # fmt: skip
+            path,
+            plan=plan,
+            rig=RIG,
+            devices={},
+            subject=Subject("nobody", ("research",)),
+            source="simulated",
+            seed=0,
+        )
     world = World(RIG, seed=1, faults=faults)
     name = world.register(session.id)
     heard, lines = [], []
@@ -46,10 +51,17 @@ def run(path, plan, *, faults=None, stop_after=None, resume=False, host_s=1e9):
     camera = open_camera(f"sim://{name}/cam")
     try:
         run_plan(
-            session.plan, RIG, boxes={"flash": box}, cameras={"cam": camera}, session=session,
-            progress=progress, signal=lambda state: heard.append((world.now, state)),
-            timer=world.clock, clock=lambda: host_s + world.now, run_id="run",
-        )  # fmt: skip
+            session.plan,
+            RIG,
+            boxes={"flash": box},
+            cameras={"cam": camera},
+            session=session,
+            progress=progress,
+            signal=lambda state: heard.append((world.now, state)),
+            timer=world.clock,
+            clock=lambda: host_s + world.now,
+            run_id="run",
+        )
         session.close()
     except Stop:
         pass
@@ -80,8 +92,9 @@ def test_shots_and_prompts_keep_their_periods_at_the_papers_rate(tmp_path):
     assert np.diff(popped) == pytest.approx(np.diff(noted(session, "time_s")), abs=2e-3)
     assert np.diff([t for t, _ in heard]) == pytest.approx(5.0, abs=1e-3)
     assert {(a, b) for (_, a), (_, b) in pairwise(heard)} == {
-        ("smile", "neutral"), ("neutral", "smile"),
-    }  # fmt: skip
+        ("smile", "neutral"),
+        ("neutral", "smile"),
+    }
     phases = noted(session, "phase_s")
     assert phases == pytest.approx(planned(session) % 10.0, abs=0.03)
     # before the first shot the subject has had a cycle to find the rhythm

@@ -42,12 +42,34 @@ def mutated(text, rng):
 
 
 COMMANDS = [
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?",
-    "SYST:CAP:PART? 1", "FLAS:SYNC 20000", "FLAS:SYNC?", "SYST:WDOG 300",
-    "SYST:WDOG ", "SYST:WDOG?", "SYST:ARM", "SYST:PING?", "SAFE", "STAT?", "FLAS:POL CROS",
-    "FLAS:POL:ANG 90.5", "FLAS:POW 0.25", "FLAS:CHAR?", "FLAS:FIRE token", "FLAS:LAMP ON,200",
-    "FLAS:LAMP OFF", "FLAS:LAMP ON,", "CAM:TRIG x", "FLAS:LAST?",
-]  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART? 1",
+    "FLAS:SYNC 20000",
+    "FLAS:SYNC?",
+    "SYST:WDOG 300",
+    "SYST:WDOG ",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:PING?",
+    "SAFE",
+    "STAT?",
+    "FLAS:POL CROS",
+    "FLAS:POL:ANG 90.5",
+    "FLAS:POW 0.25",
+    "FLAS:CHAR?",
+    "FLAS:FIRE token",
+    "FLAS:LAMP ON,200",
+    "FLAS:LAMP OFF",
+    "FLAS:LAMP ON,",
+    "CAM:TRIG x",
+    "FLAS:LAST?",
+]
 
 
 def test_raw_bytes_light_nothing(box, rng):
@@ -68,11 +90,29 @@ def test_nearly_right_lines_without_a_frame_light_nothing(box, rng):
 
 
 IN_ANY_STATE = [
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?",
-    "SYST:CAP:PART? 1", "FLAS:SYNC 20000", "FLAS:SYNC?", "SYST:WDOG 300",
-    "SYST:WDOG?", "SYST:ARM", "SYST:PING?", "SAFE", "STAT?", "FLAS:POL CROS",
-    "FLAS:POL:ANG 90.5", "FLAS:POW 0.25", "FLAS:CHAR?", "CAM:TRIG x", "FLAS:LAST?",
-]  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART? 1",
+    "FLAS:SYNC 20000",
+    "FLAS:SYNC?",
+    "SYST:WDOG 300",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:PING?",
+    "SAFE",
+    "STAT?",
+    "FLAS:POL CROS",
+    "FLAS:POL:ANG 90.5",
+    "FLAS:POW 0.25",
+    "FLAS:CHAR?",
+    "CAM:TRIG x",
+    "FLAS:LAST?",
+]
 
 
 def test_framed_nonsense_is_answered_once_and_lights_only_an_armed_box(box, rng):
@@ -121,10 +161,22 @@ def test_fuzzing_guided_by_coverage_breaks_nothing(tmp_path):
     (tmp_path / "armed").write_bytes(arm + b"\n" + fire)
     harness = Path(__file__).with_name("box_harness.py")
     run = subprocess.run(
-        [sys.executable, str(harness), "-max_total_time=10", "-timeout=10", "-seed=1",
-         "-rss_limit_mb=0", f"-artifact_prefix={tmp_path}/crash-", str(tmp_path)],
-        capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path,
-    )  # fmt: skip
+        [
+            sys.executable,
+            str(harness),
+            "-max_total_time=10",
+            "-timeout=10",
+            "-seed=1",
+            "-rss_limit_mb=0",
+            f"-artifact_prefix={tmp_path}/crash-",
+            str(tmp_path),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+        cwd=tmp_path,
+    )
     assert run.returncode == 0, run.stderr[-3000:]
     runs = int(re.findall(r"Done (\d+) runs", run.stderr)[-1])
     print(f"{runs} inputs in 10 s")
@@ -191,8 +243,11 @@ def test_a_camera_header_is_decoded_or_refused_whatever_arrives(rng):
 
 def undetected(rng, rounds):
     """Return how many of `rounds` damaged frames were taken for good ones."""
-    lines = [np.frombuffer(wire.encode(Request(k, 77, c))[:-1], np.uint8)
-             for k, c in enumerate(COMMANDS) if not c.endswith(" ")]  # fmt: skip
+    lines = [
+        np.frombuffer(wire.encode(Request(k, 77, c))[:-1], np.uint8)
+        for k, c in enumerate(COMMANDS)
+        if not c.endswith(" ")
+    ]
     missed = 0
     for _ in range(rounds):
         line = lines[int(rng.integers(len(lines)))]

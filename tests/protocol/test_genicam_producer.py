@@ -93,8 +93,9 @@ def test_features_are_read_set_and_refused_as_the_library_says(connection):
     assert features.choices("PixelFormat") == ["RGBa8", "Mono8"]
     features.set("PixelFormat", "Mono8")
     assert (features.read("PixelFormat"), features.number_of("PixelFormat")) == (
-        "Mono8", 0x01080001,
-    )  # fmt: skip
+        "Mono8",
+        0x01080001,
+    )
     with pytest.raises(CameraError, match="got 'BayerRG8', expected one of RGBa8, Mono8"):
         features.set("PixelFormat", "BayerRG8")
     assert features.set_nearest("Width", 1e6) == 800
@@ -179,9 +180,10 @@ def camera(connection):
                 return None
             fetched.append(buffer.frame_id)
             return WithMore(
-                buffer, timestamp_ns=time.monotonic_ns(),
+                buffer,
+                timestamp_ns=time.monotonic_ns(),
                 parent=SimpleNamespace(queue_buffer=lambda _: buffer.parent.queue_buffer(buffer)),
-            )  # fmt: skip
+            )
 
     connection.acquirer = Acquirer()
     library, address = connection.library, parse_address("1?black=0")

@@ -15,10 +15,7 @@ from skinrig.capturing.addresses import addresses, require_addresses
 from skinrig.errors import UsageError
 
 RIG = load_rig("gradient").cropped(16)
-IDN = {
-    "gradient_sphere": "RIGSIM,SPHERE1,GS-0001,1.0",
-    "caliper": "RIGSIM,CALIPER1,CA-0001,1.0",
-}
+IDN = {"gradient_sphere": "RIGSIM,SPHERE1,GS-0001,1.0", "caliper": "RIGSIM,CALIPER1,CA-0001,1.0"}
 ACT = {"gradient_sphere": "PATT FULL,100", "caliper": "CAL:HOME"}
 QUERY = {"gradient_sphere": ("PATT?", "DARK"), "caliper": ("CAL:FORC:LIM?", "NONE")}
 

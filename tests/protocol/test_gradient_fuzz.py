@@ -10,21 +10,66 @@ from capture.rig import load_rig
 from rigsim.world import World
 
 RIG = load_rig("gradient").cropped(16)
-SHARED = ["*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:WDOG 5000", "SYST:ARM", "SYST:ARM",
-          "SYST:PING?", "SAFE", "STAT?", "SYST:CAP:PART? 1"]  # fmt: skip
+SHARED = [
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:WDOG 5000",
+    "SYST:ARM",
+    "SYST:ARM",
+    "SYST:PING?",
+    "SAFE",
+    "STAT?",
+    "SYST:CAP:PART? 1",
+]
 COMMANDS = {
     "gradient_sphere": [
-        *SHARED, "SEQ:CLE", "SEQ:DEF 0,X:0:500:30000:1;-Y:90:400:30000:1", "SEQ:CRC?", "SEQ:ARM 2",
-        "TRIG t1", "SEQ:POS?", "SEQ:STEP? 0", "PATT X,80,500", "PATT DARK", "PATT?", "POL 90",
-        "POL 0", "POL:ANG 45.5", "POL?", "GAIN:CLE", "GAIN:DEF 0,1000+990", "GAIN:CRC?",
-        "CAM:MASK 1", "CAM:TRIG d1", "SAFE:EYES CLOSED", "DOSE? 3", "DOSE:NEW p",
+        *SHARED,
+        "SEQ:CLE",
+        "SEQ:DEF 0,X:0:500:30000:1;-Y:90:400:30000:1",
+        "SEQ:CRC?",
+        "SEQ:ARM 2",
+        "TRIG t1",
+        "SEQ:POS?",
+        "SEQ:STEP? 0",
+        "PATT X,80,500",
+        "PATT DARK",
+        "PATT?",
+        "POL 90",
+        "POL 0",
+        "POL:ANG 45.5",
+        "POL?",
+        "GAIN:CLE",
+        "GAIN:DEF 0,1000+990",
+        "GAIN:CRC?",
+        "CAM:MASK 1",
+        "CAM:TRIG d1",
+        "SAFE:EYES CLOSED",
+        "DOSE? 3",
+        "DOSE:NEW p",
     ],
     "caliper": [
-        *SHARED, "CAL:HOME", "CAL:HOME", "CAL:STEP:ABS 2", "CAL:STEP:ABS -2", "CAL:STEP:ABS 7",
-        "CAL:POS?", "CAL:LAST?", "CAL:ANG 45", "CAL:ANG?", "CAL:ATT", "CAL:ATT?", "CAL:REL",
-        "CAL:FORC?", "CAL:FORC:LIM 1.5", "CAL:FORC:LIM 9", "CAL:FORC:LIM?",
+        *SHARED,
+        "CAL:HOME",
+        "CAL:HOME",
+        "CAL:STEP:ABS 2",
+        "CAL:STEP:ABS -2",
+        "CAL:STEP:ABS 7",
+        "CAL:POS?",
+        "CAL:LAST?",
+        "CAL:ANG 45",
+        "CAL:ANG?",
+        "CAL:ATT",
+        "CAL:ATT?",
+        "CAL:REL",
+        "CAL:FORC?",
+        "CAL:FORC:LIM 1.5",
+        "CAL:FORC:LIM 9",
+        "CAL:FORC:LIM?",
     ],
-}  # fmt: skip
+}
 
 
 def mutated(text, rng):

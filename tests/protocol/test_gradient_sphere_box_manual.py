@@ -49,9 +49,23 @@ MANUAL = {
     "DOSE:NEW": ("DOSE:NEW P042", (), ""),
 }
 SHARED = {
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?", "SYST:CAP:PART?",
-    "SYST:WDOG", "SYST:WDOG?", "SYST:ARM", "SYST:ARM?", "SYST:PING?", "SAFE", "ABOR", "STAT?",
-}  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART?",
+    "SYST:WDOG",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:ARM?",
+    "SYST:PING?",
+    "SAFE",
+    "ABOR",
+    "STAT?",
+}
 
 
 @pytest.fixture
@@ -171,7 +185,7 @@ def test_what_makes_light_is_refused_unless_armed(bench, header):
         (f"DOSE? {LEDS}", Code.OUT_OF_RANGE),
         ("TRIG a b", Code.SYNTAX),
     ],
-)  # fmt: skip
+)
 def test_what_makes_no_sense_is_refused_and_does_nothing(bench, text, code):
     bench.ask("SYST:ARM")
     before = bench.ask("SEQ:CRC?"), list(bench.unit.gains), bench.unit.analyser_deg
@@ -364,9 +378,22 @@ def test_a_scan_runs_once_for_each_arming_also_when_the_trigger_is_repeated(benc
 
 
 @pytest.mark.parametrize(
-    "text", ["SEQ:CLE", "SEQ:DEF 0,X:0:1:30000:1", "SEQ:ARM 2", "PATT X,80", "PATT DARK", "POL 90",
-             "POL:ANG 5", "GAIN:CLE", "GAIN:DEF 0,5", "CAM:MASK 1", "CAM:TRIG x", "DOSE:NEW p"],
-)  # fmt: skip
+    "text",
+    [
+        "SEQ:CLE",
+        "SEQ:DEF 0,X:0:1:30000:1",
+        "SEQ:ARM 2",
+        "PATT X,80",
+        "PATT DARK",
+        "POL 90",
+        "POL:ANG 5",
+        "GAIN:CLE",
+        "GAIN:DEF 0,5",
+        "CAM:MASK 1",
+        "CAM:TRIG x",
+        "DOSE:NEW p",
+    ],
+)
 def test_a_running_scan_is_not_meddled_with(bench, text):
     run(bench, rows_of(["x", "y"], ms=100))
     assert bench.code(text) == Code.IGNORED

@@ -42,9 +42,23 @@ MANUAL = {
     "DOSE:NEW": ("DOSE:NEW S1", (), ""),
 }
 SHARED = {
-    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?", "SYST:CAP:PART?",
-    "SYST:WDOG", "SYST:WDOG?", "SYST:ARM", "SYST:ARM?", "SYST:PING?", "SAFE", "ABOR", "STAT?",
-}  # fmt: skip
+    "*IDN?",
+    "*RST",
+    "*CLS",
+    "*OPC?",
+    "SYST:ERR?",
+    "SYST:HELLO?",
+    "SYST:CAP?",
+    "SYST:CAP:PART?",
+    "SYST:WDOG",
+    "SYST:WDOG?",
+    "SYST:ARM",
+    "SYST:ARM?",
+    "SYST:PING?",
+    "SAFE",
+    "ABOR",
+    "STAT?",
+}
 HARMLESS = ("PUMP VENT", "SHUT CLOSE", "LED 0", "HEAD:FREE")
 ACTS = ("HEAD:SITE cheek,0", "PUMP ON,5000,60", "LED 500", "SHUT OPEN,100")
 

@@ -155,9 +155,11 @@ def test_a_dark_frame_needs_no_head_and_no_light(bench):
 def test_nothing_shines_or_sucks_unarmed_or_unplaced(bench):
     box = bench.box
     calls = [
-        (box.place, "cheek", 0.0), (box.suck, 60.0, 5.0), (box.set_level, 0.5),
+        (box.place, "cheek", 0.0),
+        (box.suck, 60.0, 5.0),
+        (box.set_level, 0.5),
         (box.open_shutter, 0.1),
-    ]  # fmt: skip
+    ]
     assert [refused(*call) for call in calls] == [Code.NOT_ARMED] * 4
     box.set_level(0.0)
     box.vent()
@@ -256,9 +258,11 @@ def test_what_lets_go_ends_light_and_suction(bench, end):
 def test_numbers_that_are_none_are_refused_before_anything_is_sent(bench):
     box = bench.box
     for call in (
-        lambda: box.place("cheek", math.nan), lambda: box.suck(math.inf, 1.0),
-        lambda: box.suck(60.0, math.nan), lambda: box.open_shutter(math.inf),
-    ):  # fmt: skip
+        lambda: box.place("cheek", math.nan),
+        lambda: box.suck(math.inf, 1.0),
+        lambda: box.suck(60.0, math.nan),
+        lambda: box.open_shutter(math.inf),
+    ):
         with pytest.raises(ValueError, match="finite"):
             call()
     for level in (-0.1, 1.1, math.nan):

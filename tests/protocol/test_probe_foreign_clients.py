@@ -28,8 +28,16 @@ def test_bash_asks_and_is_refused_a_bare_command(served):
         pytest.skip("no bash")
     path = served.addresses["probe"].replace("socket://", "/dev/tcp/").replace(":", "/")
     script = f"exec 3<>{path}\n"
-    asked = (("*IDN?", 1), ("SHUT OPEN,100", 0), ("SYST:ERR?", 1), ("PUMP ON,5000,60", 0),
-             ("SYST:ERR?", 1), ("PUMP VENT", 0), ("SYST:ERR?", 1), ("HEAD:SITE?", 1))  # fmt: skip
+    asked = (
+        ("*IDN?", 1),
+        ("SHUT OPEN,100", 0),
+        ("SYST:ERR?", 1),
+        ("PUMP ON,5000,60", 0),
+        ("SYST:ERR?", 1),
+        ("PUMP VENT", 0),
+        ("SYST:ERR?", 1),
+        ("HEAD:SITE?", 1),
+    )
     for text, answers in asked:
         script += f"printf '{text}\\n' >&3\n"
         script += 'read -r -t 5 -u 3 line; echo "$line"\n' * answers

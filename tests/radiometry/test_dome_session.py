@@ -51,8 +51,12 @@ def peaks_gb(kind, cameras):
     """Return the largest memory up to each exposure, GB, the first light's of all cameras first."""
     run = subprocess.run(
         [sys.executable, "-c", SESSION, kind, str(cameras)],
-        capture_output=True, text=True, check=False, env=os.environ, timeout=880,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ,
+        timeout=880,
+    )
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout.splitlines()[-1])["peaks"]
 

@@ -69,9 +69,13 @@ def test_walls_at_all_angles_alike_would_get_far_too_much(skin):
     patch = plain_scene(skin, width_px=WIDTH).surface(NEUTRAL, subpixels=1, border_px=40)
     shares = [
         hidden_share(
-            np.ascontiguousarray(1e3 * patch.height_mm), patch.normals, margin=0, pixel_um=6.0,
-            sectors=16, boundaries=on,
+            np.ascontiguousarray(1e3 * patch.height_mm),
+            patch.normals,
+            margin=0,
+            pixel_um=6.0,
+            sectors=16,
+            boundaries=on,
         ).mean()
         for on in (False, True)
-    ]  # fmt: skip
+    ]
     assert shading.average_transmittance(ETA) ** 2 * shares[0] > 1.5 * shares[1] > 0.0

@@ -75,8 +75,11 @@ def test_an_uneven_density_is_flattened_as_mitsuba_does(mi, rng, tmp_path):
         np.repeat(rng.uniform(0.5, 2.0, (1, 9)), 2, 0).astype(np.float32),
         np.repeat(rng.uniform(0.5, 1.0, (1, 9)), 2, 0).astype(np.float32),
         rng.uniform(0.1, 3.0, (4, 8, 5)).astype(np.float32),
-        np.ones((4, 6, 6), np.float32), values, np.zeros(0, np.float32), "uneven",
-    )  # fmt: skip
+        np.ones((4, 6, 6), np.float32),
+        values,
+        np.zeros(0, np.float32),
+        "uneven",
+    )
     rgl.write(tmp_path / "a.bsdf", made)
     material = mi.load_dict({"type": "measured", "filename": str(tmp_path / "a.bsdf")})
     light, view = half_sphere(rng, 300), half_sphere(rng, 300)

@@ -133,10 +133,17 @@ def test_fibres_that_take_all_angles_match_the_rings_of_mcmls_sample(test_data):
 
     def p_value(stack):
         run = fibre_profile(
-            stack, radii_mm=radii, core_mm=0.1, source_core_mm=0.0, numerical_aperture=1.0,
-            source_numerical_aperture=0.0, photons=80_000, rng=np.random.default_rng(1),
-            batches=BATCHES, threads=2,
-        )  # fmt: skip
+            stack,
+            radii_mm=radii,
+            core_mm=0.1,
+            source_core_mm=0.0,
+            numerical_aperture=1.0,
+            source_numerical_aperture=0.0,
+            photons=80_000,
+            rng=np.random.default_rng(1),
+            batches=BATCHES,
+            threads=2,
+        )
         error = np.sqrt(run.stderr**2 + mcml / area / 1e6 + (0.002 * mcml) ** 2)
         worst = (np.abs(run.reflectance_per_mm2 - mcml) / error).max()
         return 1.0 - (1.0 - 2.0 * stats.t.sf(worst, BATCHES - 1)) ** len(mcml)
@@ -149,10 +156,17 @@ def all_light_in_a_cone(stack, photons, seed=1):
     """pi times the radiance along the normal, of all the surface: a fibre that covers it."""
     core = 400.0 / stack.layers[0].sigma_s_per_mm
     run = fibre_profile(
-        stack, radii_mm=(0.0,), core_mm=core, source_core_mm=0.0, numerical_aperture=0.05,
-        source_numerical_aperture=0.0, photons=photons, rng=np.random.default_rng(seed),
-        batches=BATCHES, threads=2,
-    )  # fmt: skip
+        stack,
+        radii_mm=(0.0,),
+        core_mm=core,
+        source_core_mm=0.0,
+        numerical_aperture=0.05,
+        source_numerical_aperture=0.0,
+        photons=photons,
+        rng=np.random.default_rng(seed),
+        batches=BATCHES,
+        threads=2,
+    )
     area = pi * (core / 2.0) ** 2
     return run.reflectance_per_mm2[0] * area, run.stderr[0] * area
 

@@ -83,15 +83,24 @@ def test_directed_scattering_is_told_by_fits_and_by_profiles_alike(rng):
     settings = {"eta": 1.0, "g": 0.0}
     profiles, variance = measured(0.6, 1_500_000, rng)
     whole = subsurface.invert(
-        RADIUS_MM, profiles.mean(axis=0), variance=variance.mean(axis=0) / DIRECTIONS, g_error=0.0,
+        RADIUS_MM,
+        profiles.mean(axis=0),
+        variance=variance.mean(axis=0) / DIRECTIONS,
+        g_error=0.0,
         **settings,
-    )  # fmt: skip
+    )
     each = subsurface.invert(RADIUS_MM, profiles, variance=variance, g_error=0.0, **settings)
     fits = anisotropy.estimate(ANGLE, each.sigma_tr_per_mm, each.sigma_tr_stderr, valid=each.valid)
     compared = profile_anisotropy.estimate_from_profiles(
-        ANGLE, RADIUS_MM, profiles, variance, sigma_a_per_mm=whole.sigma_a_per_mm,
-        sigma_s_prime_per_mm=whole.sigma_s_prime_per_mm, floor=0.0, **settings,
-    )  # fmt: skip
+        ANGLE,
+        RADIUS_MM,
+        profiles,
+        variance,
+        sigma_a_per_mm=whole.sigma_a_per_mm,
+        sigma_s_prime_per_mm=whole.sigma_s_prime_per_mm,
+        floor=0.0,
+        **settings,
+    )
     for found in (fits, compared):
         assert found.p_value < 1e-3
         # light goes farther along x, where it scatters less

@@ -256,9 +256,15 @@ def mirrored_light(count, light_extinction):
         angle = np.deg2rad(14.0) * side
         light = np.array([np.sin(angle), 0, np.cos(angle)])
         stokes += shading.specular_stokes(
-            n, np.broadcast_to(light, n.shape), n, 0.45, eta=1.5, light_absorbs=RIGHT,
-            image_right=RIGHT, extinction=light_extinction,
-        )  # fmt: skip
+            n,
+            np.broadcast_to(light, n.shape),
+            n,
+            0.45,
+            eta=1.5,
+            light_absorbs=RIGHT,
+            image_right=RIGHT,
+            extinction=light_extinction,
+        )
     return n, stokes
 
 
@@ -270,9 +276,13 @@ def metal_frames(rng, *, zero_deg, light_extinction, analyser_extinction, jitter
     frames, angles = [], []
     for degrees in np.repeat(MALUS_ANGLES_DEG, 2):
         seen = shading.analyse(
-            stokes, n, passes_deg=90.0 + degrees - zero_deg, image_right=RIGHT, image_up=UP,
+            stokes,
+            n,
+            passes_deg=90.0 + degrees - zero_deg,
+            image_right=RIGHT,
+            image_up=UP,
             extinction=analyser_extinction,
-        )  # fmt: skip
+        )
         light = 0.85 / top * (1 + jitter * rng.normal()) * seen.reshape(*shape, 1) * white_rgb()
         frames.append(raw.linear_rgb(as_frame(expose(light, sensor=sensor, rng=rng), sensor)))
         angles.append(np.deg2rad(degrees))
@@ -335,9 +345,15 @@ def ball(size=96, *, extinction, alpha=0.3, eta=1.4):
         ) * np.maximum(n @ light, 0)
         diffuse += 0.5 / np.pi * entered[:, None] * exit_part
         specular += shading.specular_stokes(
-            n, to_light, camera, alpha, eta=eta, light_absorbs=RIGHT, image_right=RIGHT,
+            n,
+            to_light,
+            camera,
+            alpha,
+            eta=eta,
+            light_absorbs=RIGHT,
+            image_right=RIGHT,
             extinction=extinction,
-        )  # fmt: skip
+        )
     return n, lights, diffuse, specular
 
 

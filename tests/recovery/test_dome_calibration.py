@@ -44,9 +44,12 @@ def shot(scene, view_name, lights, *, exposure_s, level=1.0, seed=0):
     pops = [Pulse(k, level, 0.0, exposure_s) for k in lights]
     cfa = scene.exposure(view_name, pops=pops, exposure_s=exposure_s, seed=seed)
     return RawFrame(
-        cfa=cfa, pattern=view.cfa, black=(float(view.black_level),) * 4, white=view.white_level,
+        cfa=cfa,
+        pattern=view.cfa,
+        black=(float(view.black_level),) * 4,
+        white=view.white_level,
         noise_profile=sensor_of(view).noise_profile(exposure_s),
-    )  # fmt: skip
+    )
 
 
 def true_camera(dome, name):
@@ -258,9 +261,15 @@ def plates_seen(dome, rig, poses, *, exposure_s=0.03):
                 frame = shot(scene, name, [k], exposure_s=exposure_s, seed=100 * pose + k)
                 image = linear_rgb(frame, demosaic="centered")
                 samples.append(
-                    window.sample(image.rgb, image.variance, image.valid, view=name,
-                                  light=light.name, on_s=exposure_s)
-                )  # fmt: skip
+                    window.sample(
+                        image.rgb,
+                        image.variance,
+                        image.valid,
+                        view=name,
+                        light=light.name,
+                        on_s=exposure_s,
+                    )
+                )
     return scene, cameras, samples
 
 
@@ -302,9 +311,12 @@ def test_intensities_gains_and_lobes_are_found_within_their_errors(plates):
         assert half == pytest.approx(float(truth_there), abs=0.01)
     points = np.random.default_rng(1).uniform(-80, 80, (100, 3))
     exact = LightTable(
-        truth["position_mm"], truth["intensity"] * common, truth["exponent"], fit.table.names,
+        truth["position_mm"],
+        truth["intensity"] * common,
+        truth["exponent"],
+        fit.table.names,
         truth["axis"],
-    )  # fmt: skip
+    )
     ratio = fit.table.irradiance(points)[1][kept] / exact.irradiance(points)[1][kept]
     assert np.sqrt(np.mean((ratio - 1) ** 2)) < 0.005
     # it could have failed: without the lights' own powers, irradiance is percents off

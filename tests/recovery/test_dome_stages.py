@@ -165,20 +165,30 @@ def capture(folder, shoot):
     rng = np.random.default_rng(23)
     names = tuple(view.name for view in rig.views)
     steps = tuple(
-        Step(f"O{k}", "olat", {"light": light.name, "exposure": 0, "pass": 0},
-             {"light": light.name, "exposure_s": shoot.exposure_s, "level": 1.0}, names)
+        Step(
+            f"O{k}",
+            "olat",
+            {"light": light.name, "exposure": 0, "pass": 0},
+            {"light": light.name, "exposure_s": shoot.exposure_s, "level": 1.0},
+            names,
+        )
         for k, light in enumerate(rig.lights)
-    )  # fmt: skip
+    )
     answering = list(range(len(rig.lights)))
     if shoot.swapped is not None:
         a, b = shoot.swapped
         answering[a], answering[b] = b, a
     path = folder / "session-ellipsoid"
     with Session.create(
-        path, plan=Plan("dome", steps), rig=rig, devices={},
-        subject=Subject("ellipsoid", ("research",)), source="simulated", seed=0,
+        path,
+        plan=Plan("dome", steps),
+        rig=rig,
+        devices={},
+        subject=Subject("ellipsoid", ("research",)),
+        source="simulated",
+        seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),
-    ) as session:  # fmt: skip
+    ) as session:
         if shoot.scan:
             session.attach("scan.ply", scanned(), about={"kind": "scanned mesh", "unit": "mm"})
         for k, step in enumerate(steps):
@@ -188,17 +198,31 @@ def capture(folder, shoot):
             for view in rig.views:
                 signal = photograph(view, rig.lights[at], (not gone) * intensity[at], shoot, center)
                 profile = raw.noise_profile(
-                    view.gain_e_per_dn, view.read_noise_e, black=view.black_level,
+                    view.gain_e_per_dn,
+                    view.read_noise_e,
+                    black=view.black_level,
                     white=view.white_level,
-                )  # fmt: skip
+                )
                 blob = raw.encode_dng(
-                    develop(signal, view, shoot.exposure_s, rng), pattern=view.cfa,
-                    black=view.black_level, white=view.white_level, exposure_s=shoot.exposure_s,
-                    noise_profile=profile, camera_serial=view.serial, step_id=step.id,
+                    develop(signal, view, shoot.exposure_s, rng),
+                    pattern=view.cfa,
+                    black=view.black_level,
+                    white=view.white_level,
+                    exposure_s=shoot.exposure_s,
+                    noise_profile=profile,
+                    camera_serial=view.serial,
+                    step_id=step.id,
                     session_id=session.id,
-                )  # fmt: skip
-                session.commit(step.id, view.name, blob, settings=step.settings, actual={},
-                               t_box_s=0.1 * k, t_host_s=0.1 * k)  # fmt: skip
+                )
+                session.commit(
+                    step.id,
+                    view.name,
+                    blob,
+                    settings=step.settings,
+                    actual={},
+                    t_box_s=0.1 * k,
+                    t_host_s=0.1 * k,
+                )
         session.close()
     calibration = folder / "calibration"
     calibration.mkdir()
@@ -209,12 +233,14 @@ def capture(folder, shoot):
             first, translation_mm=-first.rotation @ (CENTER_MM + np.array([5.0, 0.0, 10.0]))
         )
     table = LightTable(
-        np.array([light.position_mm for light in rig.lights]), intensity,
-        np.zeros(len(rig.lights)), tuple(light.name for light in rig.lights),
+        np.array([light.position_mm for light in rig.lights]),
+        intensity,
+        np.zeros(len(rig.lights)),
+        tuple(light.name for light in rig.lights),
         valid=np.array(
             [not (shoot.dead_known and k in shoot.dead) for k in range(len(rig.lights))]
         ),
-    )  # fmt: skip
+    )
     made = [
         geometry.to_calibration(cameras, rig=rig.name, source="simulated", created=TODAY),
         table.to_calibration(rig=rig.name, source="simulated", created=TODAY),
@@ -240,9 +266,11 @@ class Found:
 def reconstruct(folder, shoot, *, want=WANT, calibrated=True):
     session, calibration = capture(folder, shoot)
     outcome = pipeline.reconstruct(
-        session, want=want, out=folder / "appearance",
+        session,
+        want=want,
+        out=folder / "appearance",
         calibration=calibration if calibrated else None,
-    )  # fmt: skip
+    )
     return judge(store.read(folder / "appearance"), outcome, np.maximum(shoot.reflectance, 1e-9))
 
 
@@ -315,9 +343,11 @@ def test_what_was_made_once_is_not_made_again(found):
     document = folder / "appearance" / store.DOCUMENT
     written = document.stat().st_mtime_ns
     again = pipeline.reconstruct(
-        folder / "session-ellipsoid", want=WANT, out=folder / "appearance",
+        folder / "session-ellipsoid",
+        want=WANT,
+        out=folder / "appearance",
         calibration=folder / "calibration",
-    )  # fmt: skip
+    )
     assert again.ran == ()
     assert document.stat().st_mtime_ns == written
     assert store.read(folder / "appearance").files.keys() == {"mesh.obj"}
@@ -336,9 +366,12 @@ def test_no_frame_of_what_is_held_out_is_read(found, monkeypatch):
     names = {light for light, _ in _frames(folder)}, {view for _, view in _frames(folder)}
     lights, view = sorted(names[0])[:3], sorted(names[1])[-1]
     outcome = pipeline.reconstruct(
-        folder / "session-ellipsoid", want=("normals",), out=folder / "held-out",
-        calibration=folder / "calibration", hold_out=f"lights={','.join(lights)},views={view}",
-    )  # fmt: skip
+        folder / "session-ellipsoid",
+        want=("normals",),
+        out=folder / "held-out",
+        calibration=folder / "calibration",
+        hold_out=f"lights={','.join(lights)},views={view}",
+    )
     assert read
     assert not {light for light, _ in read} & set(lights)
     assert view not in {camera for _, camera in read}
@@ -350,9 +383,11 @@ def test_no_frame_of_what_is_held_out_is_read(found, monkeypatch):
     # without it they are
     read.clear()
     pipeline.reconstruct(
-        folder / "session-ellipsoid", want=("samples",), out=folder / "held-out",
+        folder / "session-ellipsoid",
+        want=("samples",),
+        out=folder / "held-out",
         calibration=folder / "calibration",
-    )  # fmt: skip
+    )
     assert set(lights) <= {light for light, _ in read}
     assert store.read(folder / "held-out").parameters["held_out"] == {"lights": [], "views": []}
 
@@ -364,16 +399,18 @@ def _frames(folder):
 
 @pytest.mark.parametrize(
     ("hold_out", "named"),
-    [("lights=" + ",".join(map(str, range(31))), "leaves 9 of 40 lights"),
-     ("views=0,1,2", "leaves 1 of 4 views"), ("lights=L999", "L999")],
-)  # fmt: skip
+    [
+        ("lights=" + ",".join(map(str, range(31))), "leaves 9 of 40 lights"),
+        ("views=0,1,2", "leaves 1 of 4 views"),
+        ("lights=L999", "L999"),
+    ],
+)
 def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_out, named):
     folder, _ = found
     with pytest.raises(HoldOutError, match=named):
         pipeline.reconstruct(
-            folder / "session-ellipsoid", want=("normals",), out=folder / "never",
-            hold_out=hold_out,
-        )  # fmt: skip
+            folder / "session-ellipsoid", want=("normals",), out=folder / "never", hold_out=hold_out
+        )
     assert not (folder / "never").exists()
 
 
@@ -381,13 +418,17 @@ def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_ou
 def test_as_many_lobes_are_made_as_are_asked_for(found):
     folder, _ = found
     pipeline.reconstruct(
-        folder / "session-ellipsoid", want=("basis_weight_1",), out=folder / "two-lobes",
-        calibration=folder / "calibration", rank=2,
-    )  # fmt: skip
+        folder / "session-ellipsoid",
+        want=("basis_weight_1",),
+        out=folder / "two-lobes",
+        calibration=folder / "calibration",
+        rank=2,
+    )
     maps = store.read(folder / "two-lobes")
     assert {name for name in maps.maps if name.startswith("basis_weight")} == {
-        "basis_weight_0", "basis_weight_1",
-    }  # fmt: skip
+        "basis_weight_0",
+        "basis_weight_1",
+    }
     with np.load(io.BytesIO(maps.files["brdf_basis.npz"])) as stored:
         assert stored["table"].shape[-1] == 2
         assert stored["mix_by_rank"].shape == (stored["ranks"].sum(), len(stored["materials"]))
@@ -439,9 +480,17 @@ FEW = Shoot(lights=10, views=2, width_px=60)
             r"not found in the images.* 0\.0 % are brighter than their noise",
         ),
     ],
-    ids=["no scan", "one light", "one dead of the least", "one view", "lights in a plane",
-         "lights behind", "all saturated", "black"],
-)  # fmt: skip
+    ids=[
+        "no scan",
+        "one light",
+        "one dead of the least",
+        "one view",
+        "lights in a plane",
+        "lights behind",
+        "all saturated",
+        "black",
+    ],
+)
 def test_what_cannot_be_reconstructed_is_refused_with_its_reason(shoot, says, tmp_path):
     with pytest.raises(ValueError, match=says):
         reconstruct(tmp_path, shoot, want=["normals"])
@@ -474,9 +523,16 @@ class Limits:
         # bright parts of the images are lost, not all
         (Shoot(exposure_s=0.06), Limits(0.5, 0.03, 0.3)),
     ],
-    ids=["dead light left out", "dead light unnoticed", "two lights swapped",
-         "camera inside the subject", "white", "nearly black", "partly saturated"],
-)  # fmt: skip
+    ids=[
+        "dead light left out",
+        "dead light unnoticed",
+        "two lights swapped",
+        "camera inside the subject",
+        "white",
+        "nearly black",
+        "partly saturated",
+    ],
+)
 def test_spoiled_captures_give_maps_that_hold_or_are_masked(shoot, limits, tmp_path):
     result = reconstruct(tmp_path, shoot, want=["normals", "r_d"])
     assert np.median(result.normals_deg) < limits.normals_deg

@@ -38,10 +38,14 @@ def smiling(face):
 
 def laid_over(seen, **options):
     return expression_alignment.align(
-        seen.moving, seen.neutral,
-        landmarks_moving=seen.landmarks_moving, landmarks_neutral=seen.landmarks,
-        valid_moving=seen.valid_moving, valid_neutral=seen.valid, **options,
-    )  # fmt: skip
+        seen.moving,
+        seen.neutral,
+        landmarks_moving=seen.landmarks_moving,
+        landmarks_neutral=seen.landmarks,
+        valid_moving=seen.valid_moving,
+        valid_neutral=seen.valid,
+        **options,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +93,11 @@ def test_blood_that_comes_and_goes_is_not_read_as_motion(face, state):
 @pytest.mark.long
 def test_features_alone_find_the_motion_too(smiling):
     found = expression_alignment.align(
-        smiling.moving, smiling.neutral,
-        valid_moving=smiling.valid_moving, valid_neutral=smiling.valid,
-    )  # fmt: skip
+        smiling.moving,
+        smiling.neutral,
+        valid_moving=smiling.valid_moving,
+        valid_neutral=smiling.valid,
+    )
     assert found.by == "features"
     assert np.sqrt(np.mean(off(found, smiling) ** 2)) < 0.5
 
@@ -115,9 +121,13 @@ def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(
     truth = smiling.hemoglobin_at_rest - smiling.hemoglobin
     part = (slice(96, 160), slice(80, 176))  # cheeks, to be quick
     joint = shared_melanin.weigh(
-        both[:, *part], colors, prior=prior, variance=noise[:, *part], valid=valid[:, *part],
+        both[:, *part],
+        colors,
+        prior=prior,
+        variance=noise[:, *part],
+        valid=valid[:, *part],
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-    )  # fmt: skip
+    )
     each = [
         chromophore_posterior.weigh(
             both[k][part], colors, prior=prior, variance=noise[k][part], valid=valid[k][part]

@@ -85,16 +85,19 @@ def test_the_mean_change_of_blood_is_found(fitted, folder, truths):
 def test_melanin_that_all_states_share_has_less_noise_than_that_of_one(fitted, folder, tmp_path):
     """Four pictures of one melanin: about half the noise."""
     pipeline.reconstruct(
-        folder / "session-face", want=("diffuse",), out=tmp_path / "one",
+        folder / "session-face",
+        want=("diffuse",),
+        out=tmp_path / "one",
         calibration=folder / "calibration",
-    )  # fmt: skip
+    )
     one = store.read(tmp_path / "one")
     seen, built = one.maps["diffuse"], one.parameters["color_table"]
     alone = chromophore_posterior.weigh(
         np.where(seen.valid[..., None], seen.values, np.nan),
         color_table.build(built["camera"], built["illuminant"], anisotropy=ANISOTROPY_SKIN),
-        prior=shading_prior.of_faces(), variance=np.square(seen.stderr),
-    )  # fmt: skip
+        prior=shading_prior.of_faces(),
+        variance=np.square(seen.stderr),
+    )
     both = alone.valid & fitted.shared.valid
     ratio = np.median(fitted.shared.noise_stderr_melanin[both] / alone.stderr_melanin[both])
     assert 0.35 < ratio < 0.7
@@ -110,9 +113,13 @@ def test_a_face_without_any_expression_is_refused(folder, tmp_path):
 def test_skin_whose_blood_no_color_tells_is_refused_with_what_can_be_had(folder, tmp_path):
     """Such a face states no interval of blood either: the trial of intervals goes on."""
     done = simulate_session(
-        "flash", tmp_path / "session-dark", subject="darkest", width_px=WIDTH_PX, seed=4,
+        "flash",
+        tmp_path / "session-dark",
+        subject="darkest",
+        width_px=WIDTH_PX,
+        seed=4,
         states=("neutral", "smile"),
-    )  # fmt: skip
+    )
     with pytest.raises(UnknownBloodError, match="melanin alone"):
         fit_facial_color(
             [done.session], out=tmp_path / "moving", calibration=folder / "calibration"

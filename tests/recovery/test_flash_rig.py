@@ -93,8 +93,8 @@ def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, 
     calibration_store.save(tinted, tmp_path / "tinted")
     done = captured("III", 302)
     pipeline.reconstruct(
-        done.session, want=WANT, out=tmp_path / "maps", calibration=tmp_path / "tinted",
-    )  # fmt: skip
+        done.session, want=WANT, out=tmp_path / "maps", calibration=tmp_path / "tinted"
+    )
     rows = compare(store.read(tmp_path / "maps"), store.read(done.truth), rng=rng)
     broken = [r for r in rows if r.band is None and not r.median_relative <= limit(r)]
     assert broken
@@ -165,9 +165,12 @@ def test_a_calibration_of_another_day_is_refused_by_name(tmp_path, narrow):
     calibrate("white", [tmp_path / "session-white"], calibration, created=TODAY)
     with pytest.raises(CalibrationError, match="valid"):
         pipeline.reconstruct(
-            narrow.session, want=["melanin"], out=tmp_path / "maps", calibration=calibration,
+            narrow.session,
+            want=["melanin"],
+            out=tmp_path / "maps",
+            calibration=calibration,
             on_date=date(TODAY.year + 2, 1, 1),
-        )  # fmt: skip
+        )
     assert not (tmp_path / "maps").exists()
 
 
@@ -187,7 +190,9 @@ def test_an_interrupted_simulation_resumes_to_the_same_frames(tmp_path, narrow):
     sessions = Session.open(narrow.session), Session.open(again)
     records = [session.frames() for session in sessions]
     assert [r.index for r in records[0]] == [r.index for r in records[1]]
-    pairs = zip(*([s.read(r).cfa for r in own] for s, own in zip(sessions, records, strict=True)),
-                strict=True)  # fmt: skip
+    pairs = zip(
+        *([s.read(r).cfa for r in own] for s, own in zip(sessions, records, strict=True)),
+        strict=True,
+    )
     for whole, parts in pairs:
         np.testing.assert_array_equal(parts, whole)

@@ -41,9 +41,12 @@ def shots_of(scene, *, series=BALL_SERIES, flat=True, seed=0, turned_deg=0.0):
             light = PatternLight("full", level, 0.0, EXPOSURE_S, reading + turned_deg)
             cfa = scene.exposure("cam", pops=[light], exposure_s=EXPOSURE_S, seed=seed + len(out))
             frame = RawFrame(
-                cfa=cfa, pattern="MONO", black=(float(sensor.black),), white=sensor.white,
+                cfa=cfa,
+                pattern="MONO",
+                black=(float(sensor.black),),
+                white=sensor.white,
                 noise_profile=sensor.noise_profile(EXPOSURE_S),
-            )  # fmt: skip
+            )
             out.append(shot(frame, amount_s=EXPOSURE_S * level, reading_deg=reading, flat=response))
     return out
 
@@ -74,18 +77,26 @@ def true_leakage(scene, zero_deg=FILMS.analyser_zero_deg):
     for k, way in enumerate(to_light):
         facet = way[None] + to_camera
         stokes = shading.specular_stokes(
-            facet / np.linalg.norm(facet), way[None], to_camera, 0.5, eta=1.4,
-            light_absorbs=scene.sphere.absorbs[k], image_right=[1.0, 0.0, 0.0],
+            facet / np.linalg.norm(facet),
+            way[None],
+            to_camera,
+            0.5,
+            eta=1.4,
+            light_absorbs=scene.sphere.absorbs[k],
+            image_right=[1.0, 0.0, 0.0],
             extinction=scene.films.light_extinction,
-        )  # fmt: skip
+        )
         both = [
             shading.analyse(
-                stokes, to_camera, passes_deg=90.0 + reading + zero_deg,
-                image_right=[1.0, 0.0, 0.0], image_up=[0.0, 1.0, 0.0],
+                stokes,
+                to_camera,
+                passes_deg=90.0 + reading + zero_deg,
+                image_right=[1.0, 0.0, 0.0],
+                image_up=[0.0, 1.0, 0.0],
                 extinction=scene.films.analyser_extinction,
             )[0]
             for reading in (0.0, 90.0)
-        ]  # fmt: skip
+        ]
         out.append(both[1] / both[0])
     return np.array(out)
 

@@ -40,9 +40,12 @@ def lights_of(sphere):
     ways = sphere.position_mm / far[:, None]
     fields = np.cross(sphere.absorbs, ways)
     return SphereLights(
-        ways, sphere.intensity * (600.0 / far) ** 2, programmed=sphere.weights[:, 1:],
-        polarizers=fields / np.linalg.norm(fields, axis=1)[:, None], distance_mm=600.0,
-    )  # fmt: skip
+        ways,
+        sphere.intensity * (600.0 / far) ** 2,
+        programmed=sphere.weights[:, 1:],
+        polarizers=fields / np.linalg.norm(fields, axis=1)[:, None],
+        distance_mm=600.0,
+    )
 
 
 def geometry(side):

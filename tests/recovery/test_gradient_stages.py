@@ -161,9 +161,15 @@ def test_a_kernel_halves_the_distance_of_the_true_histograms_at_every_step():
         found = measure(strained, pixel=(pixel_um * state.stretch_t, pixel_um * state.stretch_s))
         variance[r] = found.variance_x
         fit = fit_kernel(
-            neutral, found.histogram, stretch=r, axis="x", pixel_um=pixel_um,
-            stretch_across=state.stretch_t, alphas=ALPHAS[::5], sigmas_um=SIGMAS_UM[::5],
-        )  # fmt: skip
+            neutral,
+            found.histogram,
+            stretch=r,
+            axis="x",
+            pixel_um=pixel_um,
+            stretch_across=state.stretch_t,
+            alphas=ALPHAS[::5],
+            sigmas_um=SIGMAS_UM[::5],
+        )
         assert fit.distance <= 0.5 * fit.distance_before, (r, fit.distance, fit.distance_before)
         assert (fit.alpha > 0) == (r > 1)
     assert sorted(variance, key=variance.get, reverse=True) == sorted(variance)

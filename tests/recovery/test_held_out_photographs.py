@@ -76,9 +76,12 @@ def fitted(tmp_path_factory):
         )
         simulate_session("dome", out / "session-face", subject=SUBJECT, width_px=WIDTH_PX, **DOME)
     pipeline.reconstruct(
-        out / "session-face", want=WANT, out=out / "appearance",
-        calibration=out / "calibration", hold_out=f"lights={','.join(lights)},views={view}",
-    )  # fmt: skip
+        out / "session-face",
+        want=WANT,
+        out=out / "appearance",
+        calibration=out / "calibration",
+        hold_out=f"lights={','.join(lights)},views={view}",
+    )
     return out, lights, view
 
 
@@ -92,9 +95,14 @@ def test_photographs_that_no_fit_has_seen_are_predicted(fitted):
 
     def judge(model, *, ablation=False):
         return evaluation.evaluate(
-            appearance, photographs, model=model, subsurface="local", count=6,
-            ablation=ablation, rng=np.random.default_rng(0),
-        )  # fmt: skip
+            appearance,
+            photographs,
+            model=model,
+            subsurface="local",
+            count=6,
+            ablation=ablation,
+            rng=np.random.default_rng(0),
+        )
 
     whole = assemble(appearance)
     found, pictures = judge(whole, ablation=True)
@@ -135,9 +143,13 @@ def test_a_head_that_sits_elsewhere_in_another_session_is_found(fitted):
     assert len(photographs.shots) == DOME["lights"] * DOME["views"]
     assert "the head sits" in photographs.assumed[0]
     found, _ = evaluation.evaluate(
-        elsewhere, photographs, subsurface="local", count=4, ablation=False,
+        elsewhere,
+        photographs,
+        subsurface="local",
+        count=4,
+        ablation=False,
         rng=np.random.default_rng(0),
-    )  # fmt: skip
+    )
     assert found.passed
 
 

@@ -67,9 +67,12 @@ def test_kernels_of_small_patches_hold_those_of_the_skin_they_are_of():
                 target = measure(other, pixel=PIXEL_UM)
                 about = {"target_samples": target.effective_samples}
                 fit = fit_kernel(
-                    one, target.histogram, target_blocks=blocks_of(one, other, sides),
-                    **told, **about,
-                )  # fmt: skip
+                    one,
+                    target.histogram,
+                    target_blocks=blocks_of(one, other, sides),
+                    **told,
+                    **about,
+                )
                 error = np.abs([fit.alpha - true.alpha, fit.sigma_um - true.sigma_um])
                 held.append(error <= [fit.alpha_stderr, fit.sigma_stderr_um])
                 held_95.append(error <= [fit.alpha_95, fit.sigma_95_um])

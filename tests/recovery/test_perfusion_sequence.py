@@ -28,9 +28,12 @@ def calibration(tmp_path_factory):
 def curves(session, calibration, out):
     truth = session.with_name(f"truth-{session.name}")
     pipeline.reconstruct(
-        session, want=["perfusion_curves"], out=out, calibration=calibration,
+        session,
+        want=["perfusion_curves"],
+        out=out,
+        calibration=calibration,
         landmarks=truth / "landmarks.csv",
-    )  # fmt: skip
+    )
     found = json.loads((out / "perfusion_curves.json").read_text())
     known = json.loads((truth / "perfusion_course.json").read_text())
     return found, {frame["step"]: frame for frame in known["frames"]}

@@ -31,10 +31,12 @@ def bench(tmp_path_factory):
 
 def test_sigma_tr_comes_back_through_the_whole_session_and_the_dipole_misses_it(bench):
     pipeline.reconstruct(
-        bench / "session", want=("profiles", "subsurface", "translucency", "anisotropy"),
-        out=bench / "appearance", calibration=bench / "calibration",
+        bench / "session",
+        want=("profiles", "subsurface", "translucency", "anisotropy"),
+        out=bench / "appearance",
+        calibration=bench / "calibration",
         truth=truth_folder(bench / "session").name,
-    )  # fmt: skip
+    )
     found, truth = store.read(bench / "appearance"), store.read(truth_folder(bench / "session"))
     errors = {
         row.method: row for row in evaluation.by_method(evaluation.compare_fits(found, truth))
@@ -68,9 +70,12 @@ def test_sites_are_placed_by_a_table_of_landmarks(bench, tmp_path):
     made = []
     for name, landmarks in (("known", None), ("moved", table)):
         pipeline.reconstruct(
-            bench / "session", want=("translucency",), out=tmp_path / name,
-            calibration=bench / "calibration", landmarks=landmarks,
-        )  # fmt: skip
+            bench / "session",
+            want=("translucency",),
+            out=tmp_path / name,
+            calibration=bench / "calibration",
+            landmarks=landmarks,
+        )
         made.append(store.read(tmp_path / name).maps["translucency"].stderr[..., 1])
     assert made[1][128, 200] < 0.5 * made[0][128, 200]
     assert json.loads((tmp_path / "moved" / store.DOCUMENT).read_text())["inputs"]["landmarks"]

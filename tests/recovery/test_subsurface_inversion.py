@@ -40,9 +40,13 @@ def readings(profile, rng, draws):
 
 def fit(profiles, variance, method="photon_table", **settings):
     return subsurface.invert(
-        RADIUS, profiles, variance=variance, method=method, common_error=COMMON_ERROR,
+        RADIUS,
+        profiles,
+        variance=variance,
+        method=method,
+        common_error=COMMON_ERROR,
         **(FIBRES | settings),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,9 +95,10 @@ def test_scattering_almost_straight_on_is_told_all_the_same(rng):
     run = transport(stack, photons=20_000, rng=np.random.default_rng(3), ring_edges_mm=edges)
     expected = effective_transport(0.1, 0.7)
     found = subsurface.invert(
-        0.5 * (edges[1:] + edges[:-1]), run.reflectance_per_mm2,
+        0.5 * (edges[1:] + edges[:-1]),
+        run.reflectance_per_mm2,
         variance=run.reflectance_per_mm2_stderr**2 + 1e-5**2,
-    )  # fmt: skip
+    )
     assert found.valid
     assert abs(found.sigma_tr_per_mm - expected) < 4.0 * found.sigma_tr_stderr
     assert abs(found.sigma_tr_per_mm / expected - 1.0) < 0.08

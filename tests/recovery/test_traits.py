@@ -54,12 +54,14 @@ def test_lotion_is_learned_from_fitted_lobes():
     dressed = shifted(people, "lotion", apply={"lotion": 0.9}, rng=np.random.default_rng(1))
     label = np.array(["lotion" in person.marks for person in dressed])
     rng = np.random.default_rng(3)
-    means = np.array([
-        trait_truth.mean_mixture(
-            trait_truth.surface_points(p, 8, rng=rng), basis, pairs=160, rng=rng
-        )
-        for p in dressed
-    ])  # fmt: skip
+    means = np.array(
+        [
+            trait_truth.mean_mixture(
+                trait_truth.surface_points(p, 8, rng=rng), basis, pairs=160, rng=rng
+            )
+            for p in dressed
+        ]
+    )
     worn = [dataclasses.replace(p, applied=(("lotion", 0.9),)) for p in people[:3]]
     truth = trait_truth.lobe_change(
         people[:3], worn, points=8, pairs=1000, rng=np.random.default_rng(2)

@@ -131,11 +131,22 @@ def journal_is_noise(session):
 
 
 BREAKS = [
-    truncate_frame, empty_frame, remove_frame, swap_frames, other_filter_array, text_frame,
-    link_frame, flip_bit, edit_manifest(schema_of_the_future), edit_manifest(unknown_key),
-    manifest_is_no_json, manifest_is_missing, journal_line_lost, journal_names_a_file_outside,
+    truncate_frame,
+    empty_frame,
+    remove_frame,
+    swap_frames,
+    other_filter_array,
+    text_frame,
+    link_frame,
+    flip_bit,
+    edit_manifest(schema_of_the_future),
+    edit_manifest(unknown_key),
+    manifest_is_no_json,
+    manifest_is_missing,
+    journal_line_lost,
+    journal_names_a_file_outside,
     journal_is_noise,
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
@@ -166,10 +177,12 @@ def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, ca
         (["fit", "facial-color", "SESSION", "--stored-size", "0"], "stored size: got 0 cells"),
         (["reconstruct", "SESSION", "--want", "melanin", "--scan", "x.ply"], "scan: "),
         (["reconstruct", "SESSION", "--want", "melanin", "--rank", "3"], "is no session of the"),
-        (["reconstruct", "SESSION", "--want", "melanin", "--landmarks", "x.csv"],
-         "landmarks: x.csv is no file"),
+        (
+            ["reconstruct", "SESSION", "--want", "melanin", "--landmarks", "x.csv"],
+            "landmarks: x.csv is no file",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_an_option_cannot_mean_is_refused_before_images_are_made(
     words, says, sound, tmp_path, capsys
 ):

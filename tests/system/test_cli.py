@@ -50,9 +50,18 @@ def test_commands_stand_under_the_heading_of_what_they_are_for(capsys):
 
 def test_the_promised_commands_are_there():
     promised = {
-        "simulate", "capture", "serve", "calibrate", "reconstruct", "import", "report", "bench",
-        "verify", "doctor", "demo",
-    }  # fmt: skip
+        "simulate",
+        "capture",
+        "serve",
+        "calibrate",
+        "reconstruct",
+        "import",
+        "report",
+        "bench",
+        "verify",
+        "doctor",
+        "demo",
+    }
     assert promised <= set(COMMANDS)
 
 
@@ -131,10 +140,22 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(capsys):
         (["verify", "nothing"], 3, "is not a session"),
         (["capture", "flash", "--out", "x"], 2, "--port flash=URL"),
         (["plan", "flash", "--width", "many"], 2, "--width"),
-        (["capture", "flash", "--out", "x", "--port", "flash=/dev/no-such-port", "--camera",
-          "cam=hotfolder:none"], 4, "no-such-port"),
+        (
+            [
+                "capture",
+                "flash",
+                "--out",
+                "x",
+                "--port",
+                "flash=/dev/no-such-port",
+                "--camera",
+                "cam=hotfolder:none",
+            ],
+            4,
+            "no-such-port",
+        ),
     ],
-)  # fmt: skip
+)
 def test_with_json_an_error_too_is_one_document(argv, code, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([*argv, "--json"]) == code
@@ -173,9 +194,13 @@ def test_an_interrupted_command_is_told_of_resuming_where_it_can():
 
 @pytest.mark.parametrize(
     ("argv", "kept"),
-    [(["--out", "b"], True), (["--out=b", "--toy"], True), ([], False),
-     (["--extremes", "--out", "b"], False)],
-)  # fmt: skip
+    [
+        (["--out", "b"], True),
+        (["--out=b", "--toy"], True),
+        ([], False),
+        (["--extremes", "--out", "b"], False),
+    ],
+)
 def test_an_interrupted_benchmark_is_told_where_its_measurements_are(
     argv, kept, capsys, tmp_path, monkeypatch
 ):

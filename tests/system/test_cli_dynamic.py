@@ -32,9 +32,17 @@ def moving(tmp_path):
 def test_an_expression_is_evaluated_and_told_in_one_document(moving, tmp_path, capsys):
     out = tmp_path / "out"
     code = main(
-        ["apply", "expression", str(moving), "--weights", "smile=0.5,neutral=0.5", "--out",
-         str(out), "--json"]
-    )  # fmt: skip
+        [
+            "apply",
+            "expression",
+            str(moving),
+            "--weights",
+            "smile=0.5,neutral=0.5",
+            "--out",
+            str(out),
+            "--json",
+        ]
+    )
     assert code == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "skinrig.apply/1"
@@ -89,10 +97,24 @@ def test_repeats_of_states_are_captured_in_turn(tmp_path, capsys):
     """Each expression several times, with the others in between (Jimenez2010, section 3)."""
     plan = tmp_path / "plan.json"
     code = main(
-        ["capture", "flash", "--dry-run", "--state", "neutral", "--state", "smile", "--repeats",
-         "2", "--port", "flash=sim://x/flash", "--camera", "cam=sim://x/cam", "--plan-out",
-         str(plan)]
-    )  # fmt: skip
+        [
+            "capture",
+            "flash",
+            "--dry-run",
+            "--state",
+            "neutral",
+            "--state",
+            "smile",
+            "--repeats",
+            "2",
+            "--port",
+            "flash=sim://x/flash",
+            "--camera",
+            "cam=sim://x/cam",
+            "--plan-out",
+            str(plan),
+        ]
+    )
     assert code == 0
     steps = json.loads(plan.read_text("utf-8"))["steps"]
     shown = [(s["index"]["state"], s["index"]["repeat"]) for s in steps if s["kind"] == "subject"]

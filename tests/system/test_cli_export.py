@@ -43,13 +43,15 @@ def dome(tmp_path):
     return store.write(
         tmp_path / "dome",
         SkinAppearance(
-            maps, "measured", {"consent": [agreed]},
+            maps,
+            "measured",
+            {"consent": [agreed]},
             files={
                 BASIS_FILE: _basis_bytes(lobes, 1, {1: (np.eye(1), 0.0)}),
                 "mesh.obj": obj.text(FramedMesh.of(mesh), 1.0, "mm").encode(),
             },
         ),
-    )  # fmt: skip
+    )
 
 
 def run(capsys, *argv):

@@ -44,8 +44,11 @@ def test_each_rig_that_is_named_runs_and_no_other(tmp_path, monkeypatch, without
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
     monkeypatch.setattr("skinrig.report.build", lambda *_, **__: "<html></html>")
-    for asked, expected in ((["dome"], ["dome"]), (["flash"], ["flash"]),
-                            (["dome", "flash"], ["flash", "dome"])):  # fmt: skip
+    for asked, expected in (
+        (["dome"], ["dome"]),
+        (["flash"], ["flash"]),
+        (["dome", "flash"], ["flash", "dome"]),
+    ):
         ran.clear()
         run_demo(tmp_path / "demo", asked, console=Console(False), jobs=1)
         assert ran == expected

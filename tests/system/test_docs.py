@@ -50,9 +50,13 @@ def rows(page, heading):
 
 def flash_box():
     unit = FlashUnit(
-        on_pop=lambda pop: None, on_trigger=lambda t_s: None, recycle_s=1.5, pops_per_min=20,
-        move_s=0.5, rng=np.random.default_rng(0),
-    )  # fmt: skip
+        on_pop=lambda pop: None,
+        on_trigger=lambda t_s: None,
+        recycle_s=1.5,
+        pops_per_min=20,
+        move_s=0.5,
+        rng=np.random.default_rng(0),
+    )
     return Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
 
 

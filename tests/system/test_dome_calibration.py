@@ -26,8 +26,9 @@ def document(capsys):
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("dome")
     for target in ("charuco", "mirror", "white"):
-        simulate_session("dome", out / target, target=target, seed=SEED, lights=16, views=4,
-                         width_px=324)  # fmt: skip
+        simulate_session(
+            "dome", out / target, target=target, seed=SEED, lights=16, views=4, width_px=324
+        )
     return out
 
 

@@ -17,15 +17,24 @@ UNREADABLE = {
     "doctor": ["extra"],
     "plan": ["dome --want normals<=soon", "probe --width 100", "flash --most-lights 3"],
     "simulate": [
-        "flash", "flash --out x --width wide", "dome --out x --condition cold=very",
-        "flash --out x --lights 4", "flash --out x --condition cold", "gradient --out x --steps 3",
-        "gradient --out x --angles a", "flash --out x --relaxation 3",
-        "flash --out x --target white --nearer 3", "probe --out x --sequence smile",
-        "flash --out x --consent-expires 2020", "flash --out x --captures 3",
+        "flash",
+        "flash --out x --width wide",
+        "dome --out x --condition cold=very",
+        "flash --out x --lights 4",
+        "flash --out x --condition cold",
+        "gradient --out x --steps 3",
+        "gradient --out x --angles a",
+        "flash --out x --relaxation 3",
+        "flash --out x --target white --nearer 3",
+        "probe --out x --sequence smile",
+        "flash --out x --consent-expires 2020",
+        "flash --out x --captures 3",
         "flash --out x --sequence exercise --duration long",
     ],
     "capture": [
-        "flash --out x", "flash --out x --port a", "gradient --dry-run --steps 1",
+        "flash --out x",
+        "flash --out x --port a",
+        "gradient --dry-run --steps 1",
         "flash --dry-run --sites cheek",
     ],
     "serve": ["flash --tcp here", "flash --site cheek"],
@@ -34,7 +43,8 @@ UNREADABLE = {
     "reconstruct": ["s --out a", "s --want melanin --out a --rank some"],
     "bench": ["--budget long", "--extremes --toy"],
     "render": [
-        "maps --out r", "maps --light 1,1,1 --target 0,0 --view 0,0,9 --out r",
+        "maps --out r",
+        "maps --light 1,1,1 --target 0,0 --view 0,0,9 --out r",
         "maps --light L017*bright --out r",
     ],
     "edit": ["maps --out e", "maps --out e --trait tan", "maps --out e --spots moles=lots"],
@@ -53,32 +63,54 @@ UNREADABLE = {
     "apply microstructure": ["a --out b"],
     "analyse albedo": ["maps --out a", "--labels l.csv --out a"],
     "analyse brdf": ["--out a --labels l.csv"],
-}  # fmt: skip
+}
 """What no file could make right."""
 
 UNUSABLE = {
     "demo": ["--rigs submarine", "--out file.txt", "--seed -1"],
     "plan": [
-        "teapot", "probe --subject none.toml", "dome --want gloss<=1", "dome --want normals<=-1",
+        "teapot",
+        "probe --subject none.toml",
+        "dome --want gloss<=1",
+        "dome --want normals<=-1",
         "dome --subject XX",
-        "dome --seed -1", "dome --most-lights 0", "dome --valid-share 2", "dome --width 3",
-        "dome --forecast none.json", "dome --out folder",
+        "dome --seed -1",
+        "dome --most-lights 0",
+        "dome --valid-share 2",
+        "dome --width 3",
+        "dome --forecast none.json",
+        "dome --out folder",
     ],
     "simulate": [
-        "teapot --out x", "flash --out x --size huge", "flash --out x --subject XX",
-        "flash --out x --seed -1", "flash --out x --width 3", "flash --out x --target moon",
-        "flash --out x --state happy", "flash --out x --mesh none.obj", "dome --out x --lights 0",
-        "flash --out x --leave-out gold", "flash --out x --nearer inf", "dome --out x --views 400",
+        "teapot --out x",
+        "flash --out x --size huge",
+        "flash --out x --subject XX",
+        "flash --out x --seed -1",
+        "flash --out x --width 3",
+        "flash --out x --target moon",
+        "flash --out x --state happy",
+        "flash --out x --mesh none.obj",
+        "dome --out x --lights 0",
+        "flash --out x --leave-out gold",
+        "flash --out x --nearer inf",
+        "dome --out x --views 400",
         "flash --out x --sequence tea",
-        "flash --out x --sequence exercise --duration -3", "dome --out x --condition mud",
-        "dome --out x --condition cold=2", "gradient --out x --site nose",
-        "gradient --out x --angles 3", "gradient --out x --steps 3..1",
+        "flash --out x --sequence exercise --duration -3",
+        "dome --out x --condition mud",
+        "dome --out x --condition cold=2",
+        "gradient --out x --site nose",
+        "gradient --out x --angles 3",
+        "gradient --out x --steps 3..1",
         "probe --out x --subject homogeneous:1",
-        "flash --out x --subject none.toml", "dome --out x --subject none.toml",
+        "flash --out x --subject none.toml",
+        "dome --out x --subject none.toml",
     ],
     "capture": [
-        "teapot --dry-run", "flash --dry-run --plan none", "flash --dry-run --repeats 0",
-        "dome --dry-run --eyes shut", "gradient --out x --force-limit -1",
+        "teapot --dry-run",
+        "flash --dry-run --plan none",
+        "flash --dry-run --repeats 0",
+        "dome --dry-run --eyes shut",
+        "gradient --out x --force-limit -1",
     ],
     "serve": ["teapot", "flash --subject XX", "flash --size huge"],
     "verify": ["none", "file.txt", "folder"],
@@ -86,8 +118,10 @@ UNUSABLE = {
     "reconstruct": ["none --want melanin --out a", "none --want normals --out a --rank 1000"],
     "bench": ["--stage coffee", "--budget 0", "--out file.txt"],
     "render": [
-        "folder --light 1,1,1 --out r", "folder --light 1,1,1 --exposure 0 --out r",
-        "folder --light 1,1,1 --samples 3 --out r", "folder --light 1,1,1 --subsurface wax --out r",
+        "folder --light 1,1,1 --out r",
+        "folder --light 1,1,1 --exposure 0 --out r",
+        "folder --light 1,1,1 --samples 3 --out r",
+        "folder --light 1,1,1 --subsurface wax --out r",
         "folder --light 1,1,1 --calibration none --out r",
     ],
     "edit": ["none --out e --trait tan=1", "folder --out e --trait tan=1 --seed -1"],
@@ -106,7 +140,7 @@ UNUSABLE = {
     "apply microstructure": ["none --weights smile=1 --mesh none.obj --out a"],
     "analyse albedo": ["none folder --out a"],
     "analyse brdf": ["none folder --out a"],
-}  # fmt: skip
+}
 """What another name, number or file would make right."""
 
 
@@ -121,8 +155,11 @@ COMMANDS = leaves(typer.main.get_command(app))
 
 
 def cases(table):
-    return [pytest.param([*name.split(), *tail.split()], id=f"{name} {tail}")
-            for name, tails in table.items() for tail in tails]  # fmt: skip
+    return [
+        pytest.param([*name.split(), *tail.split()], id=f"{name} {tail}")
+        for name, tails in table.items()
+        for tail in tails
+    ]
 
 
 @pytest.fixture

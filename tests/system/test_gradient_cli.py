@@ -89,14 +89,33 @@ def test_a_served_rig_is_captured_by_the_command_that_it_names(tmp_path):
             out = tmp_path / "session"
             run = subprocess.run(
                 [
-                    sys.executable, "-m", "skinrig.cli", "capture", "gradient",
-                    "--port", f"gradient_sphere={found['gradient_sphere']}",
-                    "--port", f"caliper={found['caliper']}", "--camera", f"cam={found['cam']}",
-                    "--force-limit", "2", "--eyes", "closed", "--angles", "0", "--steps", "-1..1",
-                    "--out", str(out),
+                    sys.executable,
+                    "-m",
+                    "skinrig.cli",
+                    "capture",
+                    "gradient",
+                    "--port",
+                    f"gradient_sphere={found['gradient_sphere']}",
+                    "--port",
+                    f"caliper={found['caliper']}",
+                    "--camera",
+                    f"cam={found['cam']}",
+                    "--force-limit",
+                    "2",
+                    "--eyes",
+                    "closed",
+                    "--angles",
+                    "0",
+                    "--steps",
+                    "-1..1",
+                    "--out",
+                    str(out),
                 ],
-                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=100,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=100,
+            )
             assert run.returncode == errors.DONE, run.stderr
             assert "tape the skin at 0 degrees" in run.stderr
             session = Session.open(out)

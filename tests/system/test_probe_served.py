@@ -22,20 +22,34 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
     (tmp_path / "plan.json").write_text(json.dumps(plan.to_json()), encoding="utf-8")
     with subprocess.Popen(
         [*CLI, "serve", "probe", "--subject", "homogeneous:0.04,1.5", "--seed", "2"],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    ) as server:  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as server:
         try:
             found = dict(server.stdout.readline().split() for _ in range(2))
             assert list(found) == ["probe", "cam"]
             out = tmp_path / "session"
             run = subprocess.run(
                 [
-                    *CLI, "capture", "probe", "--plan", str(tmp_path / "plan.json"),
-                    "--port", f"probe={found['probe']}", "--camera", f"cam={found['cam']}",
-                    "--all-brackets", "--out", str(out),
+                    *CLI,
+                    "capture",
+                    "probe",
+                    "--plan",
+                    str(tmp_path / "plan.json"),
+                    "--port",
+                    f"probe={found['probe']}",
+                    "--camera",
+                    f"cam={found['cam']}",
+                    "--all-brackets",
+                    "--out",
+                    str(out),
                 ],
-                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=120,
+            )
             assert run.returncode == errors.DONE, run.stderr
             assert "place the head on the cheek at 0 degrees" in run.stderr
             session = Session.open(out)

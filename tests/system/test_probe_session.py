@@ -239,10 +239,19 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
             found = dict(served.stdout.readline().split() for _ in range(2))
             plan = tmp_path / "plan.json"
             run = subprocess.run(
-                [*command, "capture", "probe", "--dry-run", "--sites", "cheek", "--plan-out",
-                 str(plan)],
-                capture_output=True, text=True,
-            )  # fmt: skip
+                [
+                    *command,
+                    "capture",
+                    "probe",
+                    "--dry-run",
+                    "--sites",
+                    "cheek",
+                    "--plan-out",
+                    str(plan),
+                ],
+                capture_output=True,
+                text=True,
+            )
             assert run.returncode == errors.DONE, run.stderr
             # on the rig's own clock a whole series would take its minute and a half
             document = json.loads(plan.read_text())
@@ -252,10 +261,24 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
             plan.write_text(json.dumps(document))
             out = tmp_path / "session"
             run = subprocess.run(
-                [*command, "capture", "probe", "--port", f"probe={found['probe']}",
-                 "--camera", f"cam={found['cam']}", "--plan", str(plan), "--out", str(out)],
-                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=100,
-            )  # fmt: skip
+                [
+                    *command,
+                    "capture",
+                    "probe",
+                    "--port",
+                    f"probe={found['probe']}",
+                    "--camera",
+                    f"cam={found['cam']}",
+                    "--plan",
+                    str(plan),
+                    "--out",
+                    str(out),
+                ],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=100,
+            )
             assert run.returncode == errors.DONE, run.stderr
             assert "place the head on the cheek at 0 degrees" in run.stderr
             session = Session.open(out)

@@ -111,9 +111,26 @@ def test_a_picture_its_components_and_one_document_are_written(folder, monkeypat
 def test_a_view_of_the_rig_an_environment_and_two_lights_shine_together(
     folder, monkeypatch, capsys
 ):
-    words = ("face", "--view", "C03", "--light", "L017*0.2", "--light", "at:200,0,500*0.3,0.2,0.1",
-             "--environment", "sky.exr", "--environment-lights", "6", "--subsurface", "local",
-             "--samples", "1", "--out", "lit", "--json")  # fmt: skip
+    words = (
+        "face",
+        "--view",
+        "C03",
+        "--light",
+        "L017*0.2",
+        "--light",
+        "at:200,0,500*0.3,0.2,0.1",
+        "--environment",
+        "sky.exr",
+        "--environment-lights",
+        "6",
+        "--subsurface",
+        "local",
+        "--samples",
+        "1",
+        "--out",
+        "lit",
+        "--json",
+    )
     assert run(folder, monkeypatch, *words) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["lights"]["environment"] == 6
@@ -122,8 +139,18 @@ def test_a_view_of_the_rig_an_environment_and_two_lights_shine_together(
 
 
 def test_another_mesh_of_the_same_layout_carries_the_normals_along(folder, monkeypatch, capsys):
-    words = ("face", "--mesh", "smile.obj", "--light", "1,0,1", "--subsurface", "local", "--out",
-             "smile", "--json")  # fmt: skip
+    words = (
+        "face",
+        "--mesh",
+        "smile.obj",
+        "--light",
+        "1,0,1",
+        "--subsurface",
+        "local",
+        "--out",
+        "smile",
+        "--json",
+    )
     assert run(folder, monkeypatch, *words) == 0
     assert json.loads(capsys.readouterr().out)["normals_carried_along"] is True
 
@@ -143,8 +170,9 @@ def test_fewer_lobes_and_a_shadow_boundary_are_drawn(folder, monkeypatch, capsys
     document = json.loads(capsys.readouterr().out)
     assert "labelled by sigma_tr" in document["labels"]
     assert [row["sigma_tr_per_mm"] for row in document["boundaries"][:2]] == [
-        [0.3558, 0.7932, 1.5173], [0.9171, 1.5682, 1.6569],
-    ]  # fmt: skip
+        [0.3558, 0.7932, 1.5173],
+        [0.9171, 1.5682, 1.6569],
+    ]
     assert (folder / "shadow" / "shadow_boundary.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -189,7 +217,7 @@ def test_translucency_that_is_asked_for_is_used(folder, monkeypatch, capsys):
         (["face", "--environment", "bare.obj"], 3, "expected an OpenEXR image"),
         (["face", "--light", "1,1,1", "--rig", "tent"], 3, "tent"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_rendered_is_refused_with_one_clear_message(
     words, code, says, folder, monkeypatch, capfd
 ):

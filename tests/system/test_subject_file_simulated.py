@@ -35,8 +35,11 @@ def test_a_files_melanin_is_that_of_the_truth_which_tells_of_the_file(here, caps
     assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2], rel=0.1)
     assert dark.parameters["subject"] == "ann"
     assert dark.parameters["subject_file"] == {
-        "file": "ann.toml", "preset": "II", "melanin": 0.08, "freckles": 0.0,
-    }  # fmt: skip
+        "file": "ann.toml",
+        "preset": "II",
+        "melanin": 0.08,
+        "freckles": 0.0,
+    }
     manifest = json.loads((here / "session-0.08" / "session.json").read_text(encoding="utf-8"))
     assert manifest["subject"]["pseudonym"] == "simulated-ann-0"
     assert str(here) not in json.dumps(manifest)
@@ -65,9 +68,10 @@ def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, kil
     assert "resume with the same settings" in said
     told = [line.strip() for line in said.splitlines() if "begun" in line]
     assert told == [
-        "subject ann.toml melanin: begun with 0.02, got 0.03", "seed: begun with 0, got 1",
+        "subject ann.toml melanin: begun with 0.02, got 0.03",
+        "seed: begun with 0, got 1",
         "nearer_mm: begun without, got 5.0",
-    ]  # fmt: skip
+    ]
     (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
     assert main([*killed, "--resume"]) == 0
     manifest = json.loads((here / "session" / "session.json").read_text(encoding="utf-8"))

@@ -61,9 +61,16 @@ def run_flash(
             _take(step, rig, box, cameras, session, taken, operator, counts, prefix)
         if timed:
             run_sequence(
-                timed, plan, rig, box=box, cameras=cameras, session=session, operator=operator,
-                taken=taken, counts=counts,
-            )  # fmt: skip
+                timed,
+                plan,
+                rig,
+                box=box,
+                cameras=cameras,
+                session=session,
+                operator=operator,
+                taken=taken,
+                counts=counts,
+            )
     finally:
         tear_down(box, cameras)
     return Acquired(counts["steps"], counts["frames"], counts["stale"], counts["retakes"])
@@ -135,9 +142,16 @@ def _take(
             continue
         counts["stale"] += stale
         keep(
-            step, rig, cameras, session, frames, report=report, tries=attempt, taken=taken,
+            step,
+            rig,
+            cameras,
+            session,
+            frames,
+            report=report,
+            tries=attempt,
+            taken=taken,
             t_host_s=operator.clock(),
-        )  # fmt: skip
+        )
         counts["frames"] += len(frames)
         counts["steps"] += 1
         return

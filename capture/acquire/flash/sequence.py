@@ -84,9 +84,8 @@ def run_sequence(
         token = token_of(f"{operator.run_id}.t{number}", attempt, step)
         try:
             report, frames, stale = expose(
-                step, rig, box, cameras, operator, token,
-                before=moment.wait, meanwhile=moment.look,
-            )  # fmt: skip
+                step, rig, box, cameras, operator, token, before=moment.wait, meanwhile=moment.look
+            )
         except (FrameRefused, FrameTimeout, CommandRefused) as error:
             if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
                 raise
@@ -101,9 +100,17 @@ def run_sequence(
             continue
         counts["stale"] += stale
         keep(
-            step, rig, cameras, session, frames, report=report, tries=attempt, taken=taken,
-            t_host_s=operator.clock(), noted=moment.noted,
-        )  # fmt: skip
+            step,
+            rig,
+            cameras,
+            session,
+            frames,
+            report=report,
+            tries=attempt,
+            taken=taken,
+            t_host_s=operator.clock(),
+            noted=moment.noted,
+        )
         counts["frames"] += len(frames)
         counts["steps"] += 1
 
@@ -168,8 +175,11 @@ class _Prompted(_Rhythm):
     ) -> None:
         super().__init__(operator)
         self._period_s = period_s
-        shown = {float(s.index["phase_s"]) < period_s: str(s.index["state"])
-                 for s in plan.steps if "start_s" in s.settings}  # fmt: skip
+        shown = {
+            float(s.index["phase_s"]) < period_s: str(s.index["state"])
+            for s in plan.steps
+            if "start_s" in s.settings
+        }
         self._states = (shown.get(True, "expression"), shown.get(False, "neutral"))
         first_s = min(float(step.settings["start_s"]) for step in steps)
         cycle_s = 2 * period_s
@@ -178,8 +188,7 @@ class _Prompted(_Rhythm):
         self._lead_s = float(plan.limits.get("lead_s", 0.0))
         self._next = 0
         self._given: list[tuple[float, str]] = []
-        blocks = [int(r.line.actual["block"]) for r in session.frames()
-                  if "block" in r.line.actual]  # fmt: skip
+        blocks = [int(r.line.actual["block"]) for r in session.frames() if "block" in r.line.actual]
         self.block = max(blocks, default=-1) + 1
 
     def begin(self) -> None:

@@ -16,13 +16,7 @@ from itertools import groupby
 from typing import Any, Protocol, cast
 
 from capture.acquire.gradient.travel_limit import End, EndOfSkin, ForceWatch
-from capture.acquire.outcome import (
-    MAX_ATTEMPTS,
-    AcquisitionError,
-    Operator,
-    given_up,
-    steps_to_do,
-)
+from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator, given_up, steps_to_do
 from capture.acquire.pattern_scan import Scanner, Taken
 from capture.devices.caliper import CaliperStatus, MoveReport
 from capture.devices.port import CommandRefused, DeviceError
@@ -292,10 +286,13 @@ class SkinStates:
                 f"{file}{self._attachment}.dng",
                 self._scanner.encoded(one, name),
                 about={
-                    "kind": "neutral skin, taped again", "state": neutral.name,
-                    "step": step.id, "camera": name, **self._actual("reached"),
+                    "kind": "neutral skin, taped again",
+                    "state": neutral.name,
+                    "step": step.id,
+                    "camera": name,
+                    **self._actual("reached"),
                 },
-            )  # fmt: skip
+            )
 
     def _leave_out(self, angle_deg: float, direction: int, end: EndOfSkin) -> None:
         """Note in the session that this way goes no further."""
@@ -313,10 +310,13 @@ class SkinStates:
         self._operator.progress(reason)
         if ids:
             about: dict[str, Value] = {
-                "angle": angle_deg, "caliper": end.end.position, "end": end.end.kind,
-                "aperture_mm": end.end.reading_mm, "force_n": end.end.force_n,
+                "angle": angle_deg,
+                "caliper": end.end.position,
+                "end": end.end.kind,
+                "aperture_mm": end.end.reading_mm,
+                "force_n": end.end.force_n,
                 "attachment": self._attachment,
-            }  # fmt: skip
+            }
             self._session.leave_out(
                 ids, reason=reason, about=about, t_host_s=self._operator.clock()
             )

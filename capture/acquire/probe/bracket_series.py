@@ -15,13 +15,7 @@ import numpy as np
 
 from capture import raw
 from capture.acquire.frames import encode
-from capture.acquire.outcome import (
-    MAX_ATTEMPTS,
-    Operator,
-    attempts_so_far,
-    given_up,
-    steps_to_do,
-)
+from capture.acquire.outcome import MAX_ATTEMPTS, Operator, attempts_so_far, given_up, steps_to_do
 from capture.acquire.probe.driver import ProbeDriver
 from capture.acquire.probe.fiber_signal import FibreSignal, said_of, why_enough
 from capture.acquire.probe.head import Head, HeadLost, NotHeld
@@ -201,12 +195,15 @@ class BracketSeries:
                 continue
             self.stale += exposed.stale
             actual: dict[str, Value] = {
-                "light": "source", "level": level, "open_s": exposed.open_s,
+                "light": "source",
+                "level": level,
+                "open_s": exposed.open_s,
                 "run": self._operator.run_id,
                 "suction_mbar": 0.5 * (before_mbar + after_mbar),
-                "suction_before_mbar": before_mbar, "suction_after_mbar": after_mbar,
+                "suction_before_mbar": before_mbar,
+                "suction_after_mbar": after_mbar,
                 "camera_c": 0.5 * (before_c + after_c),
-            }  # fmt: skip
+            }
             if "fibre" in step.settings:
                 actual["fibre"] = step.settings["fibre"]
             return exposed, actual, attempt
@@ -255,20 +252,27 @@ class BracketSeries:
         for name, frame in exposed.frames.items():
             view, camera = self._rig.view(name), self._cameras[name]
             light: dict[str, str | float] = {
-                "light": str(actual["light"]), "level": float(step.settings["level"]),
-            }  # fmt: skip
+                "light": str(actual["light"]),
+                "level": float(step.settings["level"]),
+            }
             attempt = self._attempts.get((step.id, name), 0) + 1
             self._session.commit(
-                step.id, name, encode(frame, view, camera, step, self._session, light),
+                step.id,
+                name,
+                encode(frame, view, camera, step, self._session, light),
                 settings=dict(step.settings),
                 actual={
-                    "exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso,
-                    "serial": frame.serial, "tries": tries, **actual, **more,
+                    "exposure_s": frame.exposure.exposure_s,
+                    "iso": frame.exposure.iso,
+                    "serial": frame.serial,
+                    "tries": tries,
+                    **actual,
+                    **more,
                 },
                 t_box_s=exposed.t_box_s,
                 t_host_s=self._operator.clock(),
                 attempt=attempt,
-            )  # fmt: skip
+            )
             self._attempts[step.id, name] = attempt
             self.frames += 1
         self.steps += 1

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.plan import Step
 from capture.rig import Probe, View
 
@@ -75,10 +76,12 @@ class FibreSignal:
         self._colors = _color_of(view)
         count = 1 if view.cfa == "MONO" else 3
         self._windows = [
-            [_in_color(self._colors, _window(view, spot, SPOT_SHARE * pitch_px), c)
-             for c in range(count)]
+            [
+                _in_color(self._colors, _window(view, spot, SPOT_SHARE * pitch_px), c)
+                for c in range(count)
+            ]
             for spot in spots
-        ]  # fmt: skip
+        ]
         lit = np.zeros((view.height_px, view.width_px), bool)
         for spot in spots:
             lit[_window(view, spot, AROUND_SHARE * pitch_px)] = True
@@ -92,7 +95,7 @@ class FibreSignal:
         self._always_saturated = np.ones(shape, bool)
         self._looked = 0
 
-    def look(self, image: NDArray[np.uint16], exposure_s: float) -> None:
+    def look(self, image: UInt16Array, exposure_s: float) -> None:
         """Take an exposure into account: sensor values, shape (H, W), and its time, s."""
         view = self._view
         pixels = np.asarray(image).ravel()
@@ -120,7 +123,7 @@ class FibreSignal:
                     self.rate_per_s[fibre, color] = level / exposure_s
 
     @property
-    def signal_to_noise(self) -> NDArray[np.float64]:
+    def signal_to_noise(self) -> Float64Array:
         """Signal to noise of all unsaturated exposures of each fibre and color, shape (F, C)."""
         return self._sum / np.sqrt(np.maximum(self._variance, 1e-12))
 
@@ -202,7 +205,7 @@ def _color_of(view: View) -> NDArray[np.int8]:
     return colors
 
 
-def _window(view: View, spot: NDArray[np.float64], half_px: float) -> tuple[slice, slice]:
+def _window(view: View, spot: Float64Array, half_px: float) -> tuple[slice, slice]:
     x, y = float(spot[0]), float(spot[1])
     rows = slice(max(math.ceil(y - half_px), 0), max(math.floor(y + half_px) + 1, 0))
     columns = slice(max(math.ceil(x - half_px), 0), max(math.floor(x + half_px) + 1, 0))
@@ -218,5 +221,5 @@ def _in_color(
     return np.flatnonzero(inside)
 
 
-def _pairs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+def _pairs(mask: BoolArray) -> tuple[tuple[int, int], ...]:
     return tuple((int(fibre), int(color)) for fibre, color in np.argwhere(mask))

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.acquire.probe.fiber_signal import FibreSignal
+from capture.arrays import Float64Array
 from capture.plan import Step
 from capture.session import Session
 
@@ -22,7 +22,7 @@ OVER = 64.0
 cent of full scale, and what is saturated does not yet spill over."""
 
 
-def serving(steps: Sequence[Step], rate_per_s: NDArray[np.float64]) -> set[str]:
+def serving(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
     """Return the ids of those exposures of covered heads that serve.
 
     Parameters

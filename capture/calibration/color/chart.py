@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.color.colorimetry import chart_reference, xyz_to_linear_srgb
 from capture.calibration.record import CalibrationError
 
@@ -14,7 +15,6 @@ __all__ = ["ChartError", "Patches", "find_chart", "measure_patches"]
 
 logger = logging.getLogger(__name__)
 
-Float = NDArray[np.float64]
 
 ROWS, COLUMNS = 4, 6
 PATCH_SHARE = 0.87  # side of a patch over the distance of neighbours, ColorChecker Classic
@@ -40,12 +40,12 @@ class Patches:
         Patches without saturated or masked pixels, inside the image.
     """
 
-    rgb: Float
-    stderr: Float
-    valid: NDArray[np.bool_]
+    rgb: Float64Array
+    stderr: Float64Array
+    valid: BoolArray
 
 
-def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float:
+def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float64Array:
     """Find a ColorChecker Classic and return the centers of its 24 patches.
 
     Parameters
@@ -81,11 +81,7 @@ def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float:
 
 
 def measure_patches(
-    image: NDArray,
-    centers: Float,
-    *,
-    valid: NDArray[np.bool_] | None = None,
-    share: float = 0.5,
+    image: NDArray, centers: Float64Array, *, valid: BoolArray | None = None, share: float = 0.5
 ) -> Patches:
     """Average the pixels in the middle of every patch.
 
@@ -127,7 +123,7 @@ def measure_patches(
     return Patches(rgb, stderr, ok)
 
 
-def _to_unit(pixels: NDArray) -> Float:
+def _to_unit(pixels: NDArray) -> Float64Array:
     """Scale to about [0, 1] by the bright end of the image; finite and not negative."""
     image = np.nan_to_num(np.asarray(pixels, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     top = float(np.quantile(image, 0.995))
@@ -136,7 +132,7 @@ def _to_unit(pixels: NDArray) -> Float:
     return np.maximum(image / top, 0.0)
 
 
-def _renderings(unit: Float) -> list[tuple[str, Float]]:
+def _renderings(unit: Float64Array) -> list[tuple[str, Float64Array]]:
     """Ways to show the image to the detector, the likeliest first."""
     balanced = unit / np.maximum(unit.mean(axis=(0, 1)), 1e-9) * float(unit.mean())
     return [
@@ -148,7 +144,7 @@ def _renderings(unit: Float) -> list[tuple[str, Float]]:
     ]
 
 
-def _detect(unit: Float) -> Float:
+def _detect(unit: Float64Array) -> Float64Array:
     import cv2
 
     height, width = unit.shape[:2]
@@ -169,7 +165,7 @@ def _detect(unit: Float) -> Float:
             corners = np.asarray(detector.getBestColorChecker().getColorCharts(), dtype=np.float64)
             logger.debug("chart found in the image %s", name)
             # pixel centers: resizing maps x to (x + 1/2) scale - 1/2
-            centers: Float = (corners.reshape(24, 4, 2).mean(axis=1) + 0.5) / scale - 0.5
+            centers: Float64Array = (corners.reshape(24, 4, 2).mean(axis=1) + 0.5) / scale - 0.5
             return centers
     raise ChartError(
         "image: no ColorChecker Classic found; it must be whole in the picture, evenly lit, in"
@@ -177,12 +173,12 @@ def _detect(unit: Float) -> Float:
     )
 
 
-def _grid() -> Float:
+def _grid() -> Float64Array:
     """Model coordinates (column, row) of the 24 patches."""
     return np.array([(c, r) for r in range(ROWS) for c in range(COLUMNS)], dtype=np.float64)
 
 
-def _homography(model: Float, points: Float, weight: Float) -> Float:
+def _homography(model: Float64Array, points: Float64Array, weight: Float64Array) -> Float64Array:
     """Plane projective map by weighted direct linear transform, shape (3, 3)."""
     mean, spread = points.mean(axis=0), max(float(points.std()), 1e-9)
     q = (points - mean) / spread
@@ -194,19 +190,19 @@ def _homography(model: Float, points: Float, weight: Float) -> Float:
     return np.array([[spread, 0, mean[0]], [0, spread, mean[1]], [0, 0, 1]]) @ h
 
 
-def _project(h: Float, model: Float) -> Float:
+def _project(h: Float64Array, model: Float64Array) -> Float64Array:
     p = np.column_stack([model, np.ones(len(model))]) @ h.T
     return p[:, :2] / p[:, 2:]
 
 
-def _grid_from_corners(corners: Float) -> Float:
+def _grid_from_corners(corners: Float64Array) -> Float64Array:
     if corners.shape != (4, 2) or not np.isfinite(corners).all():
         raise ChartError(f"corners: got shape {corners.shape}, expected four points x, y")
     model = np.array([(0, 0), (COLUMNS - 1, 0), (COLUMNS - 1, ROWS - 1), (0, ROWS - 1)], float)
     return _project(_homography(model, corners, np.ones(4)), _grid())
 
 
-def _pitch(centers: Float) -> float:
+def _pitch(centers: Float64Array) -> float:
     """Smallest distance of neighbouring patches, pixels."""
     grid = centers.reshape(ROWS, COLUMNS, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
@@ -222,7 +218,7 @@ def _window(x: float, y: float, half: float, shape: tuple[int, ...]) -> tuple[sl
     return slice(y0, y1 + 1), slice(x0, x1 + 1)
 
 
-def _refine(unit: Float, centers: Float) -> Float:
+def _refine(unit: Float64Array, centers: Float64Array) -> Float64Array:
     """Move centers to the middle of the even areas found around them, tied by one homography.
 
     A patch counts only where its color stands out of the frame around it; dark patches on the
@@ -266,7 +262,7 @@ def _refine(unit: Float, centers: Float) -> Float:
     return fitted
 
 
-def _check_order(unit: Float, centers: Float) -> Float:
+def _check_order(unit: Float64Array, centers: Float64Array) -> Float64Array:
     """Return the centers in the chart's order; refuse a mirrored chart or foreign colors."""
     height, width = unit.shape[:2]
     inside = (centers >= 0).all() and (centers <= [width - 1, height - 1]).all()

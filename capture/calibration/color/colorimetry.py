@@ -4,7 +4,9 @@ import csv
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from capture.arrays import Float64Array
 
 __all__ = [
     "WHITE_XYZ",
@@ -19,7 +21,6 @@ __all__ = [
     "xyz_to_linear_srgb",
 ]
 
-Float = NDArray[np.float64]
 
 WHITE_XYZ: dict[str, tuple[float, float, float]] = {  # 2 degree observer, Y = 1; ASTM E308-01
     "A": (1.09850, 1.0, 0.35585),
@@ -40,7 +41,7 @@ _SRGB_XY = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 _EPSILON = (6.0 / 29.0) ** 3  # CIE 15:2004, where the cube root begins
 
 
-def white_point(illuminant: str) -> Float:
+def white_point(illuminant: str) -> Float64Array:
     """Return XYZ of the perfect diffuser, Y = 1, shape (3,).
 
     Examples
@@ -53,7 +54,7 @@ def white_point(illuminant: str) -> Float:
     return np.array(WHITE_XYZ[illuminant])
 
 
-def lab_from_xyz(xyz: ArrayLike, white: ArrayLike) -> Float:
+def lab_from_xyz(xyz: ArrayLike, white: ArrayLike) -> Float64Array:
     """Return CIE L*a*b* of XYZ, shape (..., 3), for a white of the same scale."""
     t = np.asarray(xyz, dtype=np.float64) / np.asarray(white, dtype=np.float64)
     f = np.where(t > _EPSILON, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
@@ -61,7 +62,7 @@ def lab_from_xyz(xyz: ArrayLike, white: ArrayLike) -> Float:
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
-def xyz_from_lab(lab: ArrayLike, white: ArrayLike) -> Float:
+def xyz_from_lab(lab: ArrayLike, white: ArrayLike) -> Float64Array:
     """Return XYZ of CIE L*a*b*, shape (..., 3), in the scale of the white.
 
     Examples
@@ -76,7 +77,7 @@ def xyz_from_lab(lab: ArrayLike, white: ArrayLike) -> Float:
     return t * np.asarray(white, dtype=np.float64)
 
 
-def lab_jacobian(xyz: ArrayLike, white: ArrayLike) -> Float:
+def lab_jacobian(xyz: ArrayLike, white: ArrayLike) -> Float64Array:
     """Return d(Lab)/d(XYZ), shape (..., 3, 3)."""
     w = np.asarray(white, dtype=np.float64)
     t = np.asarray(xyz, dtype=np.float64) / w
@@ -87,14 +88,14 @@ def lab_jacobian(xyz: ArrayLike, white: ArrayLike) -> Float:
     return mix * (slope / w)[..., None, :]
 
 
-def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float:
+def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
     """Return the color difference CIEDE2000 (CIE 142-2001) of Lab colors, shape (...)."""
     from colour import delta_E  # takes a second to import, so only where it is used
 
     return np.asarray(delta_E(np.asarray(lab_a), np.asarray(lab_b), method="CIE 2000"))
 
 
-def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float:
+def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float64Array:
     """Return XYZ seen under another white, by the Bradford transform, shape (..., 3)."""
     source = _BRADFORD @ np.asarray(source_white, dtype=np.float64)
     target = _BRADFORD @ np.asarray(target_white, dtype=np.float64)
@@ -102,7 +103,7 @@ def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> F
     return np.asarray(xyz, dtype=np.float64) @ matrix.T
 
 
-def xyz_to_linear_srgb(xyz: ArrayLike, *, illuminant: str = "D65") -> Float:
+def xyz_to_linear_srgb(xyz: ArrayLike, *, illuminant: str = "D65") -> Float64Array:
     """Return linear sRGB (D65) of XYZ under an illuminant, shape (..., 3), white = (1, 1, 1).
 
     Examples
@@ -127,7 +128,7 @@ def patch_names() -> tuple[str, ...]:
     return tuple(row["name"] for row in _chart_rows())
 
 
-def chart_reference(illuminant: str = "D50") -> Float:
+def chart_reference(illuminant: str = "D50") -> Float64Array:
     """Return XYZ (Y of the perfect diffuser = 1) of the ColorChecker Classic, shape (24, 3).
 
     Row-major from dark skin to black. The published values are for D50; for another illuminant

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import Float64Array
 from capture.calibration.color.chart import ChartError, Patches, find_chart, measure_patches
 from capture.calibration.color.colorimetry import (
     chart_reference,
@@ -29,7 +30,6 @@ __all__ = [
     "neutral_white",
 ]
 
-Float = NDArray[np.float64]
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
 NEUTRALS = slice(18, 23)  # white to neutral 3.5; the black patch is too glossy to balance by
@@ -57,12 +57,12 @@ class ColorMatrix:
         CIEDE2000 of the patches in the fit itself; smaller, and no measure of quality.
     """
 
-    matrix: Float
-    delta_e: Float
-    stderr: Float
+    matrix: Float64Array
+    delta_e: Float64Array
+    stderr: Float64Array
     method: Method
     illuminant: str
-    fitted_delta_e: Float
+    fitted_delta_e: Float64Array
 
     @property
     def mean_delta_e(self) -> float:
@@ -74,7 +74,7 @@ class ColorMatrix:
         """Largest CIEDE2000 of held-out patches."""
         return float(np.nanmax(self.delta_e))
 
-    def apply(self, rgb: ArrayLike) -> Float:
+    def apply(self, rgb: ArrayLike) -> Float64Array:
         """Return XYZ (Y of the perfect diffuser = 1) of linear camera RGB, shape (..., 3).
 
         The root polynomial takes square roots of products; where noise makes a product negative
@@ -82,11 +82,11 @@ class ColorMatrix:
         """
         return _terms(np.asarray(rgb, dtype=np.float64), self.method) @ self.matrix.T
 
-    def to_linear_srgb(self, rgb: ArrayLike) -> Float:
+    def to_linear_srgb(self, rgb: ArrayLike) -> Float64Array:
         """Return linear sRGB (D65, Bradford adaptation) of linear camera RGB, shape (..., 3)."""
         return xyz_to_linear_srgb(self.apply(rgb), illuminant=self.illuminant)
 
-    def xyz_to_camera(self) -> Float:
+    def xyz_to_camera(self) -> Float64Array:
         """Return the inverse of the linear matrix, as DNG's ColorMatrix wants it, shape (3, 3).
 
         Raises
@@ -221,11 +221,7 @@ def neutral_white(
     return Quantity(ratio.mean(axis=0), ratio.std(axis=0, ddof=1) / np.sqrt(use.sum()))
 
 
-def to_calibration(
-    fit: ColorMatrix,
-    white: Quantity,
-    **about: Unpack[Provenance],
-) -> Calibration:
+def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance]) -> Calibration:
     """Return a fit as a `Calibration` of kind "color" for one camera."""
     return of_one_device(
         "color",
@@ -263,7 +259,7 @@ def from_calibration(calibration: Calibration, serial: str) -> ColorMatrix:
     )
 
 
-def _terms(rgb: Float, method: Method) -> Float:
+def _terms(rgb: Float64Array, method: Method) -> Float64Array:
     if method == "linear":
         return rgb
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
@@ -271,7 +267,12 @@ def _terms(rgb: Float, method: Method) -> Float:
     return np.concatenate([rgb, roots], axis=-1)
 
 
-def _solve(terms: Float, xyz: Float, white_xyz: Float, white_terms: Float | None) -> Float:
+def _solve(
+    terms: Float64Array,
+    xyz: Float64Array,
+    white_xyz: Float64Array,
+    white_terms: Float64Array | None,
+) -> Float64Array:
     """Least squares in linearized Lab for vec(M), with M white_terms = white_xyz if wanted."""
     jacobian = lab_jacobian(xyz, white_xyz)
     unknowns = terms.shape[1]

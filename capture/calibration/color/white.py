@@ -7,13 +7,13 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 from capture.calibration.sensor.flat_field import fit_smooth_field
 from capture.calibration.sensor.transfer_curve import block_sums
 
 __all__ = ["WhiteReference", "white_reference"]
 
-Float32 = NDArray[np.float32]
 
 BLOCKS = 24  # samples along the shorter side for the smooth fit
 
@@ -33,14 +33,14 @@ class WhiteReference:
         Relative scatter of the tile around the smooth fit; 0 where nothing was smoothed.
     """
 
-    signal: Float32
-    stderr: Float32
-    valid: NDArray[np.bool_]
-    residual: NDArray[np.float64]
+    signal: Float32Array
+    stderr: Float32Array
+    valid: BoolArray
+    residual: Float64Array
 
     def balance(
         self, rgb: NDArray, *, light: float = 1.0, variance: NDArray | None = None
-    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
         """Return reflectance per channel, its variance, and where it holds.
 
         A white surface comes out as (1, 1, 1) in every channel and at every pixel.
@@ -78,10 +78,7 @@ class WhiteReference:
             self.valid & np.logical_and.reduce(np.isfinite(reflectance), axis=-1),
         )
 
-    def to_calibration(
-        self,
-        **about: Unpack[Provenance],
-    ) -> Calibration:
+    def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
         """Return this as a `Calibration` of kind "white" for one camera; not valid is 0 there."""
         white = np.nanmean(self.signal[self.valid].astype(np.float64), axis=0)
         return of_one_device(
@@ -113,7 +110,7 @@ def white_reference(
     images: Sequence[NDArray],
     *,
     variances: Sequence[NDArray],
-    valid: Sequence[NDArray[np.bool_]],
+    valid: Sequence[BoolArray],
     lights: ArrayLike | None = None,
     reflectance: float = 1.0,
     degree: int | None = 4,
@@ -187,8 +184,8 @@ def white_reference(
 
 
 def _smooth(
-    signal: NDArray[np.float64], good: NDArray[np.bool_], degree: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    signal: Float64Array, good: BoolArray, degree: int
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Replace a shaded white tile by its polynomial, with the error of the fit."""
     height, width = good.shape
     side = max(min(height, width) // BLOCKS, 1)

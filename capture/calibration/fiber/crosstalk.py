@@ -9,12 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.arrays import Float64Array
 from capture.calibration.fiber.readings import FibreReadings
 from capture.calibration.record import CalibrationError
 
 __all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
 
-FloatArray = NDArray[np.float64]
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
@@ -53,11 +53,11 @@ class CrossTalk:
         What a covered fibre still let through when this was measured, of its own light.
     """
 
-    matrix: FloatArray
-    stderr: FloatArray
-    offset: FloatArray
-    offset_stderr: FloatArray
-    offset_common: FloatArray
+    matrix: Float64Array
+    stderr: Float64Array
+    offset: Float64Array
+    offset_stderr: Float64Array
+    offset_common: Float64Array
     measured: bool = True
     cover_leak: float = 0.0
     cover_leak_stderr: float = 0.0
@@ -66,10 +66,12 @@ class CrossTalk:
         count = len(np.asarray(self.matrix))
         colors = np.shape(self.offset)[-1]
         for name, shape in (
-            ("matrix", (count, count)), ("stderr", (count, count)),
-            ("offset", (count, colors)), ("offset_stderr", (count, colors)),
+            ("matrix", (count, count)),
+            ("stderr", (count, count)),
+            ("offset", (count, colors)),
+            ("offset_stderr", (count, colors)),
             ("offset_common", (count, colors)),
-        ):  # fmt: skip
+        ):
             _freeze(self, name, shape)
         if not (np.diagonal(self.matrix) == 1.0).all():
             raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
@@ -80,7 +82,9 @@ class CrossTalk:
                 " expected less than 0.9: they cannot be told apart; check focus and cover"
             )
 
-    def unmix(self, signal: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def unmix(
+        self, signal: Float64Array, variance: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the light of each fibre by itself, and its variance.
 
         Parameters
@@ -99,8 +103,8 @@ class CrossTalk:
         return light, back**2 @ (variance + self.offset_stderr**2)
 
     def matrix_variance(
-        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
-    ) -> FloatArray:
+        self, light: Float64Array, reference: Float64Array, ratio: Float64Array
+    ) -> Float64Array:
         """Return the variance that the matrix's errors add to light judged by a reference.
 
         Parameters
@@ -123,8 +127,8 @@ class CrossTalk:
         return np.asarray(np.einsum("ji,jic->jc", self.stderr**2, moved**2))
 
     def shared_changes(
-        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
-    ) -> FloatArray:
+        self, light: Float64Array, reference: Float64Array, ratio: Float64Array
+    ) -> Float64Array:
         """Change of `light` for one standard error of each far group of pairs, shape (G, F, C).
 
         Pairs of fibres that are `FAR` places apart or more are fainter than their noise: what is
@@ -219,8 +223,8 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings
 
 
 def _stray(
-    steady: FloatArray, variance: FloatArray, phantom: FibreReadings
-) -> tuple[float, float, FloatArray, FloatArray, FloatArray]:
+    steady: Float64Array, variance: Float64Array, phantom: FibreReadings
+) -> tuple[float, float, Float64Array, Float64Array, Float64Array]:
     """Part light that is the same in all masks into a cover's leak and stray light.
 
     Returns the leak, its standard error, and stray light drawn to the mean of each color's spots,
@@ -260,8 +264,8 @@ def _stray(
 
 
 def _pooled(
-    seen: FloatArray, information: FloatArray, group: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
+    seen: Float64Array, information: Float64Array, group: NDArray[np.intp]
+) -> tuple[Float64Array, Float64Array]:
     """Return each pair drawn to its group's mean, and its variance."""
     matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
     own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
@@ -282,8 +286,8 @@ def _pooled(
 
 
 def shrunk(
-    value: FloatArray, information: FloatArray, least_scatter: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    value: Float64Array, information: Float64Array, least_scatter: float
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return values drawn to their mean as far as their own scatter tells, and standard errors.
 
     The first errors are of each by itself, the second what all share by the error of the mean.

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 from capture.calibration.sensor import SensorCalibration
 from capture.documents import Checks
@@ -16,7 +17,6 @@ from capture.rig import PATTERNS, View
 
 __all__ = ["CameraNoise", "DarkError", "DarkModel", "measure_darks"]
 
-FloatArray = NDArray[np.float64]
 
 HOT_SIGMAS: Final = 6.0
 LEAST_HOT_DN: Final = 1.0
@@ -71,18 +71,25 @@ class CameraNoise:
     def of_view(cls, view: View) -> CameraNoise:
         """Return what the rig's file says of a camera."""
         return cls(
-            view.gain_e_per_dn, view.read_noise_e, float(view.black_level),
-            float(view.white_level), view.cfa, "nominal",
-        )  # fmt: skip
+            view.gain_e_per_dn,
+            view.read_noise_e,
+            float(view.black_level),
+            float(view.white_level),
+            view.cfa,
+            "nominal",
+        )
 
     @classmethod
     def of_sensor(cls, sensor: SensorCalibration) -> CameraNoise:
         """Return what a calibration of the sensor measured, averaged over its colors."""
         return cls(
-            float(sensor.mean_gain_e_per_dn().value), float(sensor.mean_read_noise_e().value),
-            float(sensor.black_dn.value.mean()), float(sensor.white_dn), sensor.pattern,
+            float(sensor.mean_gain_e_per_dn().value),
+            float(sensor.mean_read_noise_e().value),
+            float(sensor.black_dn.value.mean()),
+            float(sensor.white_dn),
+            sensor.pattern,
             "calibrated",
-        )  # fmt: skip
+        )
 
     @property
     def span_dn(self) -> float:
@@ -116,10 +123,10 @@ class DarkModel:
         Of the camera; None: not known.
     """
 
-    bias_dn: FloatArray
-    rate_dn_per_s: FloatArray
-    covariance: FloatArray
-    hot: NDArray[np.bool_]
+    bias_dn: Float64Array
+    rate_dn_per_s: Float64Array
+    covariance: Float64Array
+    hot: BoolArray
     mean_rate_dn_per_s: float
     mean_rate_stderr: float
     times_s: tuple[float, ...]
@@ -281,7 +288,7 @@ def _middle(frame: NDArray[np.integer]) -> float:
     return float(values[np.abs(values - center) <= 5.0 * scale].mean())
 
 
-def _line(times: FloatArray, level: FloatArray, variance: float) -> tuple[float, float, float]:
+def _line(times: Float64Array, level: Float64Array, variance: float) -> tuple[float, float, float]:
     """Return bias, rate, and the rate's standard error with the scatter between frames."""
     centered = times - times.mean()
     square = float(centered @ centered)
@@ -294,7 +301,7 @@ def _line(times: FloatArray, level: FloatArray, variance: float) -> tuple[float,
     return bias, rate, float(np.sqrt(max(scatter, variance) / square))
 
 
-def _outliers(values: FloatArray, least: float) -> NDArray[np.bool_]:
+def _outliers(values: Float64Array, least: float) -> BoolArray:
     center = float(np.median(values))
     away = np.abs(values - center)
     return np.asarray(away > np.maximum(HOT_SIGMAS * 1.4826 * float(np.median(away)), least))

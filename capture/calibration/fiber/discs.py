@@ -5,19 +5,18 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.optimize import least_squares
 from scipy.special import erfc
 
+from capture.arrays import Float64Array
 from capture.calibration.fiber.merge import MergedSeries, color_masks
 
 __all__ = ["DiscFit", "candidates", "distinct", "fit_disc", "gray_image"]
 
-FloatArray = NDArray[np.float64]
-GrayImage = tuple[FloatArray, FloatArray]
+GrayImage = tuple[Float64Array, Float64Array]
 """Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
-DiscFit = tuple[FloatArray, FloatArray, float]
+DiscFit = tuple[Float64Array, Float64Array, float]
 """x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
 brighter than half."""
 
@@ -58,7 +57,7 @@ def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
     return total, variance
 
 
-def candidates(image: GrayImage, pitch: float) -> FloatArray:
+def candidates(image: GrayImage, pitch: float) -> Float64Array:
     """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
     gray, variance = image
     blur = SMOOTH_PITCH * pitch
@@ -82,11 +81,7 @@ def candidates(image: GrayImage, pitch: float) -> FloatArray:
 
 
 def fit_disc(
-    merged: MergedSeries,
-    image: GrayImage,
-    pattern: str,
-    place: FloatArray,
-    pitch: float,
+    merged: MergedSeries, image: GrayImage, pattern: str, place: Float64Array, pitch: float
 ) -> DiscFit | None:
     """Fit a disc with a blurred edge to the raw mosaic about a place; None where none fits."""
     height, width = merged.rate.shape
@@ -125,7 +120,7 @@ def fit_disc(
     # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
     stiff = [np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (UNEVEN * max(v / scale, 1e-3)) for v in levels]
 
-    def split(p: FloatArray) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+    def split(p: Float64Array) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
         """Return residuals of each color's best linear model, and their amplitudes.
 
         A fibre's modes are not filled alike: light over the disc has slopes and a bend.
@@ -147,7 +142,7 @@ def fit_disc(
             amplitude[c] = found[0]
         return residuals, priors, amplitude
 
-    def misfit(p: FloatArray) -> FloatArray:
+    def misfit(p: Float64Array) -> Float64Array:
         residuals, priors, _ = split(p)
         return np.concatenate([*residuals, *priors])
 

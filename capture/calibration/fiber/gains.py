@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array, FloatArray
 from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk, no_crosstalk
 from capture.calibration.fiber.phantom import ExpectedReflectance
 from capture.calibration.fiber.readings import FibreReadings
@@ -29,8 +29,6 @@ from capture.rig import Rig
 
 __all__ = ["FibreCalibration", "FibreError", "FibreReflectance", "calibrate_fibres"]
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 DEAD_SHARE: Final = 0.05
 """Of the usual gain: a fibre that surely gives less is dead."""
@@ -66,21 +64,21 @@ class FibreReflectance:
     """
 
     names: tuple[str, ...]
-    radius_mm: FloatArray
-    reflectance_per_mm2: FloatArray
-    variance: FloatArray
-    common_per_mm2: FloatArray
+    radius_mm: Float64Array
+    reflectance_per_mm2: Float64Array
+    variance: Float64Array
+    common_per_mm2: Float64Array
     valid: BoolArray
     saturated: BoolArray
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def stderr(self) -> FloatArray:
+    def stderr(self) -> Float64Array:
         """Standard error of each fibre, with the common part, 1/mm^2, shape (F, C)."""
         return np.sqrt(self.variance + (self.common_per_mm2**2).sum(axis=0))
 
     @property
-    def covariance(self) -> FloatArray:
+    def covariance(self) -> Float64Array:
         """Covariance of the fibres in each color, 1/mm^4, shape (C, F, F)."""
         count = len(self.names)
         own = self.variance.T[:, :, None] * np.eye(count)
@@ -113,11 +111,11 @@ class FibreCalibration:
     """
 
     spots: FibreSpots
-    radius_mm: FloatArray
-    gain: FloatArray
-    gain_stderr: FloatArray
-    common: FloatArray
-    light: FloatArray
+    radius_mm: Float64Array
+    gain: Float64Array
+    gain_stderr: Float64Array
+    common: Float64Array
+    light: Float64Array
     crosstalk: CrossTalk
     valid: BoolArray
     dead: BoolArray
@@ -294,36 +292,50 @@ class FibreCalibration:
             )
         names = tuple(fibre.name for fibre in rig.probe.fibres)
 
-        def value(name: str) -> FloatArray:
+        def value(name: str) -> Float64Array:
             return np.array([calibration.quantity(n, name).value for n in names])
 
-        def stderr(name: str) -> FloatArray:
+        def stderr(name: str) -> Float64Array:
             rows = [calibration.quantity(n, name) for n in names]
             return np.array(
                 [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
             )
 
-        def camera(name: str) -> FloatArray:
+        def camera(name: str) -> Float64Array:
             return calibration.quantity(serial, name).value
 
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
         return cls(
             FibreSpots(
-                names, value("spot_px"), stderr("spot_px"), value("spot_radius_px"),
-                stderr("spot_radius_px"), value("spot_edge_px"), value("found") > 0,
-                float(camera("aperture_px")), (float(shift[0]), float(shift[1])),
+                names,
+                value("spot_px"),
+                stderr("spot_px"),
+                value("spot_radius_px"),
+                stderr("spot_radius_px"),
+                value("spot_edge_px"),
+                value("found") > 0,
+                float(camera("aperture_px")),
+                (float(shift[0]), float(shift[1])),
                 float(camera("row_rotation_rad")),
             ),
-            value("radius_mm"), value("gain"), stderr("gain"),
-            value("gain_common").transpose(1, 0, 2), value("phantom_light"),
+            value("radius_mm"),
+            value("gain"),
+            stderr("gain"),
+            value("gain_common").transpose(1, 0, 2),
+            value("phantom_light"),
             CrossTalk(
-                value("crosstalk"), stderr("crosstalk"), value("stray"), stderr("stray"),
+                value("crosstalk"),
+                stderr("crosstalk"),
+                value("stray"),
+                stderr("stray"),
                 value("stray_common"),
-                bool(camera("crosstalk_measured")), float(leak.value),
+                bool(camera("crosstalk_measured")),
+                float(leak.value),
                 0.0 if leak.stderr is None else float(leak.stderr),
             ),
-            value("valid") > 0, value("dead") > 0,
-        )  # fmt: skip
+            value("valid") > 0,
+            value("dead") > 0,
+        )
 
     @classmethod
     def load(
@@ -359,7 +371,7 @@ def calibrate_fibres(
     masks: Mapping[int, FibreReadings],
     *,
     spots: FibreSpots,
-    radius_mm: NDArray[np.floating] | tuple[float, ...],
+    radius_mm: FloatArray | tuple[float, ...],
     expected: ExpectedReflectance,
     level: float = 1.0,
 ) -> FibreCalibration:
@@ -424,9 +436,15 @@ def calibrate_fibres(
         np.sqrt(spread) / np.where(valid, light, 1.0), expected.stderr / expected.per_mm2
     )
     mixed = CrossTalk(
-        mixed.matrix, mixed.stderr, mixed.offset / level, mixed.offset_stderr / level,
-        mixed.offset_common / level, mixed.measured, mixed.cover_leak, mixed.cover_leak_stderr,
-    )  # fmt: skip
+        mixed.matrix,
+        mixed.stderr,
+        mixed.offset / level,
+        mixed.offset_stderr / level,
+        mixed.offset_common / level,
+        mixed.measured,
+        mixed.cover_leak,
+        mixed.cover_leak_stderr,
+    )
     return FibreCalibration(
         spots,
         np.asarray(radius_mm, np.float64),
@@ -440,7 +458,7 @@ def calibrate_fibres(
     )
 
 
-def _guessed(readings: FibreReadings) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _guessed(readings: FibreReadings) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return signal and variance, those of fibres that are not valid guessed from the next ones.
 
     And in which colors that can be done, shape (C,): where all are saturated nothing is known of
@@ -468,7 +486,7 @@ def _guessed(readings: FibreReadings) -> tuple[FloatArray, FloatArray, BoolArray
     return signal, variance, possible
 
 
-def _one(value: float | FloatArray, stderr: float | FloatArray | None = None) -> Quantity:
+def _one(value: float | Float64Array, stderr: float | Float64Array | None = None) -> Quantity:
     return Quantity(np.array(value), None if stderr is None else np.array(stderr))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.darks import CameraNoise, DarkModel
 from capture.calibration.sensor.transfer_curve import cfa_planes
 from capture.documents import Checks
@@ -17,7 +18,6 @@ from capture.hdr import BracketError
 
 __all__ = ["MergedSeries", "color_masks", "merge_series"]
 
-FloatArray = NDArray[np.float64]
 
 SMOOTH: Final = 3
 """Side of the square of one color's pixels that the noise of each is told from."""
@@ -54,11 +54,11 @@ class MergedSeries:
         other, and its standard error: a source that is not steady, a shutter that is not exact.
     """
 
-    rate: FloatArray
-    variance: FloatArray
-    smooth: FloatArray
-    valid: NDArray[np.bool_]
-    saturated: NDArray[np.bool_]
+    rate: Float64Array
+    variance: Float64Array
+    smooth: Float64Array
+    valid: BoolArray
+    saturated: BoolArray
     exposures_s: tuple[float, ...]
     scale: tuple[float, ...]
     scale_stderr: tuple[float, ...]
@@ -135,8 +135,13 @@ def merge_series(
                 [f.ravel()[clear] - b.ravel()[clear] for f, b in zip(stack, base, strict=True)]
             ),
             np.stack([use.ravel()[clear] for use in usable]),
-            times, lit, rate.ravel()[clear], light.ravel()[clear], darks, noise,
-        )  # fmt: skip
+            times,
+            lit,
+            rate.ravel()[clear],
+            light.ravel()[clear],
+            darks,
+            noise,
+        )
         if (scale != 1.0).any():
             rate, seen, variance = _weigh(
                 stack, times, lit * scale, base, usable, darks, noise, light
@@ -156,7 +161,7 @@ def merge_series(
     )
 
 
-def color_masks(shape: tuple[int, ...], pattern: str) -> list[NDArray[np.bool_]]:
+def color_masks(shape: tuple[int, ...], pattern: str) -> list[BoolArray]:
     """Return where each color's pixels lie in a raw frame, in the order R, G, B (or one, MONO).
 
     Examples
@@ -177,7 +182,7 @@ def color_masks(shape: tuple[int, ...], pattern: str) -> list[NDArray[np.bool_]]
 
 def _check(
     stack: list[NDArray[np.integer]],
-    times: FloatArray,
+    times: Float64Array,
     darks: DarkModel,
     name: str = "exposures_s",
 ) -> None:
@@ -194,7 +199,7 @@ def _check(
     checks.close()
 
 
-def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[NDArray[np.bool_]]:
+def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[BoolArray]:
     """Return in which pixels each frame is not saturated, nor would be by chance."""
     spread = np.sqrt(noise.span_dn / noise.gain_e_per_dn + noise.floor_dn2)
     highest = noise.white_dn - MARGIN_SIGMAS * spread
@@ -210,14 +215,14 @@ def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[NDArra
 
 def _weigh(
     stack: list[NDArray[np.integer]],
-    times: FloatArray,
-    lit: FloatArray,
-    base: list[FloatArray],
-    usable: list[NDArray[np.bool_]],
+    times: Float64Array,
+    lit: Float64Array,
+    base: list[Float64Array],
+    usable: list[BoolArray],
     darks: DarkModel,
     noise: CameraNoise,
-    light: FloatArray,
-) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
+    light: Float64Array,
+) -> tuple[Float64Array, BoolArray, Float64Array]:
     """Return rate, where any frame counts, and variance, DN/s, weighed for light of some rate."""
     shape, gain = stack[0].shape, noise.gain_e_per_dn
     current = max(darks.mean_rate_dn_per_s, 0.0) / gain
@@ -240,15 +245,15 @@ def _weigh(
 
 
 def _scales(
-    value: FloatArray,
-    usable: NDArray[np.bool_],
-    times: FloatArray,
-    lit: FloatArray,
-    rate: FloatArray,
-    light: FloatArray,
+    value: Float64Array,
+    usable: BoolArray,
+    times: Float64Array,
+    lit: Float64Array,
+    rate: Float64Array,
+    light: Float64Array,
     darks: DarkModel,
     noise: CameraNoise,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Return the light of each frame over the mean, and its standard error.
 
     Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
@@ -280,7 +285,7 @@ def _scales(
     return 1.0 + away, np.sqrt(np.diag(covariance))
 
 
-def _smooth(values: FloatArray, valid: NDArray[np.bool_], pattern: str) -> FloatArray:
+def _smooth(values: Float64Array, valid: BoolArray, pattern: str) -> Float64Array:
     """Return the mean over the neighbors of the same place in the cell; 0 where there is none."""
     result = np.zeros_like(values)
     step = 1 if pattern == "MONO" else 2

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from capture.arrays import Float64Array
 from capture.calibration.record import CalibrationError
 from capture.documents import STRICT, Checks, Fault, parse, read_json, shown
 
@@ -23,8 +23,6 @@ __all__ = [
 ]
 
 SCHEMA: Final = "skinrig.phantom/1"
-
-FloatArray = NDArray[np.float64]
 
 
 class CertificateError(CalibrationError):
@@ -98,7 +96,7 @@ class PhantomCertificate:
             checks.that(field_name, values, good, "numbers > 0, in 1/mm")
         checks.close()
 
-    def at(self, wavelength_nm: Any) -> tuple[FloatArray, FloatArray]:
+    def at(self, wavelength_nm: Any) -> tuple[Float64Array, Float64Array]:
         """Return sigma_a and sigma_s' at wavelengths, 1/mm.
 
         Between those of the certificate both follow a power of the wavelength; a certificate of
@@ -145,9 +143,9 @@ class ExpectedReflectance:
         the certificate leaves uncertain moves all fibres together.
     """
 
-    per_mm2: FloatArray
-    stderr: FloatArray
-    common: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    per_mm2: Float64Array
+    stderr: Float64Array
+    common: Float64Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     def __post_init__(self) -> None:
         value = np.array(self.per_mm2, np.float64)

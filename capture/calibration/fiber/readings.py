@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.darks import CameraNoise, DarkModel
 from capture.calibration.fiber.merge import MergedSeries, color_masks, merge_series
 from capture.calibration.fiber.spots import FibreSpots
 
 __all__ = ["FibreReadings", "read_fibres", "sum_spots"]
 
-FloatArray = NDArray[np.float64]
 
 GUARD_PX: Final = 6.0
 """Between the row's apertures and the pixels that tell the light around them."""
@@ -57,11 +57,11 @@ class FibreReadings:
     """
 
     names: tuple[str, ...]
-    signal: FloatArray
-    variance: FloatArray
-    valid: NDArray[np.bool_]
-    saturated: NDArray[np.bool_]
-    around: FloatArray
+    signal: Float64Array
+    variance: Float64Array
+    valid: BoolArray
+    saturated: BoolArray
+    around: Float64Array
     exposures_s: tuple[float, ...]
     noise_origin: str = "nominal"
 
@@ -82,12 +82,12 @@ class FibreReadings:
             raise ValueError("FibreReadings: got a signal that is not finite or a variance < 0")
 
     @property
-    def stderr(self) -> FloatArray:
+    def stderr(self) -> Float64Array:
         """Standard error of `signal`, shape (F, C)."""
         return np.sqrt(self.variance)
 
     @property
-    def detected(self) -> NDArray[np.bool_]:
+    def detected(self) -> BoolArray:
         """Where a valid signal is more than three standard errors above none, shape (F, C)."""
         return np.asarray(self.valid & (self.signal > 3.0 * self.stderr))
 
@@ -192,7 +192,7 @@ def sum_spots(merged: MergedSeries, spots: FibreSpots, *, noise: CameraNoise) ->
     )
 
 
-def _beside(spots: FibreSpots, fibre: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _beside(spots: FibreSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
     """Return the pixels above and below the row, near one spot."""
     height, width = shape[:2]
     center = spots.center_px[fibre]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.raw import RawFrame
 
 __all__ = [
@@ -21,7 +22,6 @@ __all__ = [
     "shot",
 ]
 
-FloatArray = NDArray[np.float64]
 
 CLIP_SIGMAS = 3.0  # pixels of the background further off than this belong to something else
 LEAST_RING = 8
@@ -48,9 +48,9 @@ class Shot:
         Reading of the analyser, degrees.
     """
 
-    signal: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    signal: Float32Array
+    variance: Float32Array
+    valid: BoolArray
     amount_s: float
     reading_deg: float
 
@@ -81,9 +81,9 @@ class RateImage:
         False where every exposure is saturated.
     """
 
-    rate: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    rate: Float32Array
+    variance: Float32Array
+    valid: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,10 +100,10 @@ class Flux:
         Aperture and background lie in the image.
     """
 
-    value: FloatArray
-    variance: FloatArray
-    saturated: NDArray[np.bool_]
-    whole: NDArray[np.bool_]
+    value: Float64Array
+    variance: Float64Array
+    saturated: BoolArray
+    whole: BoolArray
 
 
 def shot(
@@ -111,7 +111,7 @@ def shot(
     *,
     amount_s: float,
     reading_deg: float,
-    dark: NDArray[np.float32] | float = 0.0,
+    dark: Float32Array | float = 0.0,
     dark_variance: float = 0.0,
     flat: NDArray | float = 1.0,
 ) -> Shot:
@@ -189,8 +189,8 @@ def rate_image(shots: Sequence[Shot]) -> RateImage:
 
 
 def measure_middles(
-    image: RateImage, pixels: FloatArray, *, aperture_px: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    image: RateImage, pixels: Float64Array, *, aperture_px: Float64Array
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the middles of spots, their intensity-weighted mean places.
 
     Parameters
@@ -240,7 +240,7 @@ def measure_middles(
     return middle, stderr, saturated
 
 
-def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: FloatArray) -> Flux:
+def measure_flux(part: Shot, pixels: Float64Array, *, aperture_px: Float64Array) -> Flux:
     """Sum the light of spots over discs, above the median of rings around them.
 
     Parameters
@@ -270,7 +270,7 @@ def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: FloatArray) -> 
     return Flux(value, variance, saturated, whole)
 
 
-def share_within(aperture_px: ArrayLike, airy_px: float) -> FloatArray:
+def share_within(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
     """Return the share of a spot's light that `measure_flux` finds behind a perfect lens.
 
     Parameters
@@ -298,8 +298,8 @@ def share_within(aperture_px: ArrayLike, airy_px: float) -> FloatArray:
 
 
 def _window(
-    at: FloatArray, shape: tuple[int, ...], aperture_px: float, every: FloatArray
-) -> tuple[slice, slice, FloatArray, NDArray[np.bool_], FloatArray, FloatArray] | None:
+    at: Float64Array, shape: tuple[int, ...], aperture_px: float, every: Float64Array
+) -> tuple[slice, slice, Float64Array, BoolArray, Float64Array, Float64Array] | None:
     """Return slices, weights of the disc, the ring, and offsets; None where it is not whole."""
     if not np.isfinite(at).all():
         return None
@@ -322,8 +322,8 @@ def _window(
 
 
 def _background(
-    values: FloatArray, noise: FloatArray, around: NDArray[np.bool_], dx: FloatArray, dy: FloatArray
-) -> tuple[FloatArray, float]:
+    values: Float64Array, noise: Float64Array, around: BoolArray, dx: Float64Array, dy: Float64Array
+) -> tuple[Float64Array, float]:
     """Return a plane through a ring without what sticks out of it, and its middle's variance."""
     basis = np.stack([np.ones(int(around.sum())), dx[around], dy[around]], axis=1)
     ring, sigma = values[around], np.sqrt(noise[around])

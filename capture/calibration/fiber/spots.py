@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
 from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.record import CalibrationError
 
 __all__ = ["FibreSpots", "SpotError", "find_fibre_spots"]
 
-FloatArray = NDArray[np.float64]
 GATE_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
 SHIFT_PITCH: Final = 0.5
@@ -57,12 +56,12 @@ class FibreSpots:
     """
 
     names: tuple[str, ...]
-    center_px: FloatArray
-    center_stderr_px: FloatArray
-    radius_px: FloatArray
-    radius_stderr_px: FloatArray
-    edge_px: FloatArray
-    found: NDArray[np.bool_]
+    center_px: Float64Array
+    center_stderr_px: Float64Array
+    radius_px: Float64Array
+    radius_stderr_px: Float64Array
+    edge_px: Float64Array
+    found: BoolArray
     aperture_px: float
     shift_px: tuple[float, float] = (0.0, 0.0)
     rotation_rad: float = 0.0
@@ -80,17 +79,17 @@ class FibreSpots:
             raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
 
     @property
-    def overlapping(self) -> NDArray[np.bool_]:
+    def overlapping(self) -> BoolArray:
         """Where a fibre's aperture meets that of another, shape (F,)."""
         apart = np.linalg.norm(self.center_px[:, None] - self.center_px[None], axis=-1)
         np.fill_diagonal(apart, np.inf)
         return np.asarray(apart.min(axis=1) < 2.0 * self.aperture_px)
 
-    def mask(self, fibre: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def mask(self, fibre: int, shape: tuple[int, ...]) -> BoolArray:
         """Return the pixels whose centres lie in a fibre's aperture, shape (H, W)."""
         return _within(shape, self.center_px[fibre], self.aperture_px)
 
-    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FibreSpots, FloatArray]:
+    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FibreSpots, Float64Array]:
         """Return the spots where they lie in another series, and how far they went.
 
         Parameters
@@ -124,7 +123,7 @@ class FibreSpots:
 
 def find_fibre_spots(
     merged: MergedSeries,
-    nominal_px: NDArray[np.floating],
+    nominal_px: FloatArray,
     *,
     names: Sequence[str],
     pattern: str,
@@ -204,7 +203,7 @@ def find_fibre_spots(
 def _consult_masks(
     best: list[DiscFit | None],
     masks: Mapping[int, MergedSeries],
-    model: FloatArray,
+    model: Float64Array,
     names: Sequence[str],
     pattern: str,
     pitch: float,
@@ -241,8 +240,8 @@ def _consult_masks(
 
 def _table(
     best: list[DiscFit | None],
-    model: FloatArray,
-    nominal: FloatArray,
+    model: Float64Array,
+    nominal: Float64Array,
     names: Sequence[str],
     findings: list[str],
 ) -> FibreSpots:
@@ -278,9 +277,17 @@ def _table(
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
     table = FibreSpots(
-        tuple(names), value[:, :2], error[:, :2], radius, error[:, 2], value[:, 3], found,
-        float(aperture), (float(shift[0]), float(shift[1])), float(np.arctan(turn)),
-    )  # fmt: skip
+        tuple(names),
+        value[:, :2],
+        error[:, :2],
+        radius,
+        error[:, 2],
+        value[:, 3],
+        found,
+        float(aperture),
+        (float(shift[0]), float(shift[1])),
+        float(np.arctan(turn)),
+    )
     for i in np.flatnonzero(table.overlapping).tolist():
         gaps = np.linalg.norm(table.center_px - table.center_px[i], axis=1)
         gaps[i] = np.inf
@@ -293,8 +300,8 @@ def _table(
 
 
 def _assign(
-    places: FloatArray, nominal: FloatArray, pitch: float
-) -> tuple[NDArray[np.int64], FloatArray]:
+    places: Float64Array, nominal: Float64Array, pitch: float
+) -> tuple[Int64Array, Float64Array]:
     """Return the spot of each fibre (-1: none), and where each fibre should end."""
     offset = (places[:, None] - nominal[None]).reshape(-1, 2)
     offset = offset[(np.abs(offset) <= SHIFT_PITCH * pitch).all(axis=1)]
@@ -320,7 +327,7 @@ def _assign(
 
 
 def _between(
-    places: FloatArray, spot: NDArray[np.int64], model: FloatArray, pitch: float
+    places: Float64Array, spot: Int64Array, model: Float64Array, pitch: float
 ) -> dict[int, tuple[int, int]]:
     """Return the spots that lie between two neighbors of which neither has one of its own."""
     found = {}
@@ -331,7 +338,7 @@ def _between(
     return found
 
 
-def _similar(nominal: FloatArray, seen: NDArray[np.int64], found: FloatArray) -> FloatArray:
+def _similar(nominal: Float64Array, seen: Int64Array, found: Float64Array) -> Float64Array:
     """Return the nominal places turned, scaled and shifted onto those found (least squares)."""
     one, two = nominal[seen] @ np.array([1, 1j]), found @ np.array([1, 1j])
     centered = one - one.mean()
@@ -340,14 +347,14 @@ def _similar(nominal: FloatArray, seen: NDArray[np.int64], found: FloatArray) ->
     return np.stack([every.real, every.imag], axis=1)
 
 
-def _pitch(places: FloatArray) -> float:
+def _pitch(places: Float64Array) -> float:
     """Return the usual distance of neighbors, px."""
     if len(places) < 2:
         return 40.0
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
 
 
-def _within(shape: tuple[int, ...], center: FloatArray, radius: float) -> NDArray[np.bool_]:
+def _within(shape: tuple[int, ...], center: Float64Array, radius: float) -> BoolArray:
     mask = np.zeros(shape[:2], np.bool_)
     low = np.maximum(np.floor(center - radius).astype(int), 0)
     high = np.minimum(np.ceil(center + radius).astype(int) + 1, [shape[1], shape[0]])

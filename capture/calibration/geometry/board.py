@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from capture.arrays import Float64Array, Int64Array, UInt8Array
 from capture.calibration.record import CalibrationError
 
 __all__ = [
@@ -31,7 +32,6 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]
 
 MARKER_SHARE = 0.75  # side of a marker over that of a square, as most boards are printed
@@ -106,7 +106,7 @@ class Board:
         return cls(chosen, int(pattern[1]), int(pattern[2]), square_mm, marker, dictionary)
 
     @cached_property
-    def points_mm(self) -> FloatArray:
+    def points_mm(self) -> Float64Array:
         """Inner corners, shape (N, 3), from the board's top left outer corner, z = 0."""
         if self.kind == "charuco":
             return np.asarray(self._charuco.getChessboardCorners(), np.float64)
@@ -147,8 +147,8 @@ class Sighting:
         Column and row, px; pixel (0, 0)'s centre is (0, 0).
     """
 
-    ids: NDArray[np.int64]
-    pixels: FloatArray
+    ids: Int64Array
+    pixels: Float64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,17 +173,17 @@ class Intrinsics:
         Names of the images in which the board was and was not found.
     """
 
-    matrix: FloatArray
-    distortion: FloatArray
+    matrix: Float64Array
+    distortion: Float64Array
     image_size: tuple[int, int]
     rms_px: float
-    stderr: FloatArray
-    per_image_px: FloatArray
+    stderr: Float64Array
+    per_image_px: Float64Array
     used: tuple[str, ...]
     missing: tuple[str, ...]
 
 
-def gray8(image: NDArray) -> NDArray[np.uint8]:
+def gray8(image: NDArray) -> UInt8Array:
     """Return an image as 8-bit gray, stretched between its 1 % and 99.5 % quantiles.
 
     Parameters
@@ -239,7 +239,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
     return Sighting(number, pixels)
 
 
-def _refined(gray: NDArray[np.uint8], pixels: FloatArray, board: Board) -> FloatArray:
+def _refined(gray: UInt8Array, pixels: Float64Array, board: Board) -> Float64Array:
     grid = pixels.reshape(board.rows, board.columns, 2)
     gaps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1)]
     half = int(np.clip(REFINE_SHARE * min(gaps), 2, 11))
@@ -274,7 +274,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
     gray = gray8(image)
     corners, found, _ = detector.detectMarkers(gray)
     smooth = gray.astype(np.float64)
-    rows: list[tuple[int, FloatArray]] = []
+    rows: list[tuple[int, Float64Array]] = []
     for number, square in zip([] if found is None else np.ravel(found), corners, strict=True):
         if int(number) in wanted:
             places = _square_corners(smooth, np.asarray(square, np.float64).reshape(4, 2))
@@ -285,7 +285,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
     return Sighting(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
 
 
-def _square_corners(gray: FloatArray, corners: FloatArray) -> FloatArray | None:
+def _square_corners(gray: Float64Array, corners: Float64Array) -> Float64Array | None:
     """Return a dark square's corners as the crossings of lines fitted to its four sides.
 
     None where a side shows no clear edge.
@@ -318,7 +318,7 @@ def _square_corners(gray: FloatArray, corners: FloatArray) -> FloatArray | None:
     return places
 
 
-def _line(points: FloatArray) -> FloatArray:
+def _line(points: Float64Array) -> Float64Array:
     """Return a, b, c of the line a x + b y = c through points; the two farthest are dropped."""
     for _ in range(2):
         middle = points.mean(axis=0)
@@ -328,7 +328,7 @@ def _line(points: FloatArray) -> FloatArray:
     return np.array([*normal, normal @ middle])
 
 
-def _crossing(a: FloatArray, b: FloatArray) -> FloatArray:
+def _crossing(a: Float64Array, b: Float64Array) -> Float64Array:
     lines = np.array([a[:2], b[:2]])
     if abs(np.linalg.det(lines)) < 1e-6:
         return np.full(2, np.nan)
@@ -419,7 +419,7 @@ def calibrate_intrinsics(
     )
 
 
-def _read(path: str | Path) -> NDArray[np.uint8]:
+def _read(path: str | Path) -> UInt8Array:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise BoardError(f"{path}: got no image, expected a JPEG, PNG or TIFF that can be read")

@@ -14,11 +14,11 @@ from typing import Literal, Protocol, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
+from capture.arrays import Float64Array
 from capture.calibration.geometry.board import LEAST_CORNERS, Board, Sighting
 from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
@@ -34,7 +34,6 @@ __all__ = [
     "place_board",
 ]
 
-FloatArray = NDArray[np.float64]
 Gauge: TypeAlias = Literal["board", "cameras"]
 Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
 
@@ -50,7 +49,7 @@ class Target(Protocol):
     """A flat target with known points."""
 
     @property
-    def points_mm(self) -> FloatArray:
+    def points_mm(self) -> Float64Array:
         """Points in the target's own axes, shape (N, 3), z = 0."""
 
 
@@ -79,24 +78,33 @@ class LensPrior:
     tangential: float = 0.01
     k3: float = 0.0
 
-    def sigmas(self, camera: CameraPose) -> FloatArray:
+    def sigmas(self, camera: CameraPose) -> Float64Array:
         """Return the deviations of a camera's nine lens numbers."""
         fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
         shift = self.principal * camera.image_size[0]
         return np.array(
-            [self.focal * fx, self.focal * fy, shift, shift,
-             self.k1, self.k2, self.tangential, self.tangential, self.k3]
-        )  # fmt: skip
+            [
+                self.focal * fx,
+                self.focal * fy,
+                shift,
+                shift,
+                self.k1,
+                self.k2,
+                self.tangential,
+                self.tangential,
+                self.k3,
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPlace:
     """Where a board stood: ``x_rig = rotation x_board + translation_mm``."""
 
-    rotation: FloatArray
-    translation_mm: FloatArray
+    rotation: Float64Array
+    translation_mm: Float64Array
 
-    def to_rig(self, points_mm: FloatArray) -> FloatArray:
+    def to_rig(self, points_mm: Float64Array) -> Float64Array:
         """Return points of the board in the rig frame."""
         return points_mm @ self.rotation.T + self.translation_mm
 
@@ -136,7 +144,7 @@ class Bundle:
     sigma_px: float
     corners: dict[str, int]
     outliers: dict[tuple[str, int], int]
-    center_covariance_mm2: dict[str, FloatArray]
+    center_covariance_mm2: dict[str, Float64Array]
 
 
 def adjust(
@@ -225,10 +233,14 @@ def place_board(
                 camera.rotation.T @ local,
                 camera.rotation.T @ (np.ravel(shift) - camera.translation_mm),
             )
-            misfit = np.concatenate([
-                np.minimum(np.nan_to_num(gaps_px(cameras[other], place, board, s), nan=1e3), 100.0)
-                for other, s in seen.items()
-            ])  # fmt: skip
+            misfit = np.concatenate(
+                [
+                    np.minimum(
+                        np.nan_to_num(gaps_px(cameras[other], place, board, s), nan=1e3), 100.0
+                    )
+                    for other, s in seen.items()
+                ]
+            )
             if best is None or misfit.sum() < best[0]:
                 best = float(misfit.sum()), place
     if best is None:
@@ -240,7 +252,9 @@ def place_board(
     return places[pose]
 
 
-def gaps_px(camera: CameraPose, place: BoardPlace, board: Target, sighting: Sighting) -> FloatArray:
+def gaps_px(
+    camera: CameraPose, place: BoardPlace, board: Target, sighting: Sighting
+) -> Float64Array:
     """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
     found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
     return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
@@ -384,7 +398,7 @@ class _Problem:
         outliers = {key: n for key, n in far.items() if n}
         return Bundle(found, places, rms, noise, corners, outliers, centers)
 
-    def _inverse(self, H: FloatArray, cameras: Mapping[str, CameraPose]) -> FloatArray:
+    def _inverse(self, H: Float64Array, cameras: Mapping[str, CameraPose]) -> Float64Array:
         """Return the covariance; with free frame, that of the frame fixed by the centres."""
         if self.gauge == "board" or self.cameras_fixed:
             return np.asarray(np.linalg.inv(H))
@@ -409,7 +423,7 @@ class _Problem:
 
     def _residuals(
         self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPlace]
-    ) -> dict[tuple[str, int], FloatArray]:
+    ) -> dict[tuple[str, int], Float64Array]:
         out = {}
         for (name, pose), s in self.images.items():
             r = cameras[name].project(places[pose].to_rig(self.board.points_mm[s.ids])) - s.pixels
@@ -417,14 +431,14 @@ class _Problem:
         return out
 
     @staticmethod
-    def _sigma(residuals: Mapping[tuple[str, int], FloatArray]) -> float:
+    def _sigma(residuals: Mapping[tuple[str, int], Float64Array]) -> float:
         """Return the noise by the median of the absolute residuals."""
         every = np.abs(np.concatenate(list(residuals.values()))).ravel()
         return max(1.4826 * float(np.median(every)), LEAST_SIGMA_PX)
 
     def _cost(
         self,
-        residuals: Mapping[tuple[str, int], FloatArray],
+        residuals: Mapping[tuple[str, int], Float64Array],
         cameras: Mapping[str, CameraPose],
         sigma: float,
     ) -> float:
@@ -436,7 +450,7 @@ class _Problem:
             total += float((self._lens_pull(name, cameras[name]) ** 2).sum())
         return total
 
-    def _lens_pull(self, name: str, camera: CameraPose) -> FloatArray:
+    def _lens_pull(self, name: str, camera: CameraPose) -> Float64Array:
         """Return how far a lens is from its prior, in standard deviations; 0 where fixed."""
         sigmas = self.sigmas[name]
         gap = _lens(camera) - _lens(self.start[name])
@@ -446,9 +460,9 @@ class _Problem:
         self,
         cameras: Mapping[str, CameraPose],
         places: Mapping[int, BoardPlace],
-        residuals: Mapping[tuple[str, int], FloatArray],
+        residuals: Mapping[tuple[str, int], Float64Array],
         sigma: float,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the normal matrix and the gradient of half the cost, free numbers only."""
         first = len(self.names) * CAMERA
         total = first + len(self.poses) * PLACE
@@ -481,7 +495,7 @@ class _Problem:
         self,
         cameras: Mapping[str, CameraPose],
         places: Mapping[int, BoardPlace],
-        step: FloatArray,
+        step: Float64Array,
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPlace]]:
         new_cameras, new_places = dict(cameras), dict(places)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
@@ -509,8 +523,8 @@ class _Problem:
 
 
 def _derivatives(
-    camera: CameraPose, place: BoardPlace, points_mm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    camera: CameraPose, place: BoardPlace, points_mm: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d place, shape (n, 2, 6)."""
     on_board = points_mm @ place.rotation.T
     turned = (on_board + place.translation_mm) @ camera.rotation.T
@@ -550,53 +564,53 @@ def _derivatives(
     return of_camera, np.concatenate([-from_rig @ _cross_matrix(on_board), from_rig], axis=-1)
 
 
-def _center_derivative(camera: CameraPose) -> tuple[FloatArray, FloatArray]:
+def _center_derivative(camera: CameraPose) -> tuple[Float64Array, Float64Array]:
     """Return how a camera's centre follows its turn and its shift."""
     back = -camera.rotation.T
     # C = -R' t and R becomes exp([w]) R: dC = -R' [t] w - R' dt
     return back @ _cross_matrix(camera.translation_mm), back
 
 
-def _cross_matrix(v: FloatArray) -> FloatArray:
+def _cross_matrix(v: Float64Array) -> Float64Array:
     """Return the matrices of the cross product with v, shape (..., 3, 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return np.asarray(out - np.swapaxes(out, -1, -2))
 
 
-def _turned(rotation: FloatArray, turn: FloatArray) -> FloatArray:
+def _turned(rotation: Float64Array, turn: Float64Array) -> Float64Array:
     """Return a rotation after a small turn, orthonormal again."""
     product = Rotation.from_rotvec(turn).as_matrix() @ rotation
     u, _, v = np.linalg.svd(product)
     return np.asarray(u @ v)
 
 
-def _lens(camera: CameraPose) -> FloatArray:
+def _lens(camera: CameraPose) -> Float64Array:
     K = camera.matrix
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.distortion])
 
 
-def _huber(residual: FloatArray, sigma: float) -> FloatArray:
+def _huber(residual: Float64Array, sigma: float) -> Float64Array:
     z = np.linalg.norm(residual, axis=1) / sigma
     return np.asarray(np.where(z > HUBER, HUBER / np.maximum(z, HUBER), 1.0))
 
 
-def _between(a: BoardPlace, b: BoardPlace) -> tuple[FloatArray, FloatArray]:
+def _between(a: BoardPlace, b: BoardPlace) -> tuple[Float64Array, Float64Array]:
     """Return the rigid motion that takes place a to place b."""
     rotation = b.rotation @ a.rotation.T
     return rotation, b.translation_mm - rotation @ a.translation_mm
 
 
-def _moved_place(place: BoardPlace, rotation: FloatArray, shift: FloatArray) -> BoardPlace:
+def _moved_place(place: BoardPlace, rotation: Float64Array, shift: Float64Array) -> BoardPlace:
     return BoardPlace(rotation @ place.rotation, rotation @ place.translation_mm + shift)
 
 
-def _moved_camera(camera: CameraPose, rotation: FloatArray, shift: FloatArray) -> CameraPose:
+def _moved_camera(camera: CameraPose, rotation: Float64Array, shift: Float64Array) -> CameraPose:
     turned = camera.rotation @ rotation.T
     return replace(camera, rotation=turned, translation_mm=camera.translation_mm - turned @ shift)
 
 
-def _procrustes(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _procrustes(points: Float64Array, wanted: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the rigid motion that takes points onto wanted ones, least squares."""
     a, b = points.mean(axis=0), wanted.mean(axis=0)
     rotation, _ = Rotation.align_vectors(wanted - b, points - a)

@@ -8,8 +8,9 @@ from datetime import date
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import Float64Array
 from capture.calibration.geometry.board import Intrinsics, calibrate_intrinsics
 from capture.calibration.record import Calibration, Quantity, Source, default_validity
 from capture.rig import Rig, View
@@ -24,7 +25,6 @@ __all__ = [
     "to_calibration",
 ]
 
-FloatArray = NDArray[np.float64]
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
@@ -60,15 +60,15 @@ class CameraPose:
     """
 
     serial: str
-    matrix: FloatArray
-    distortion: FloatArray
-    rotation: FloatArray
-    translation_mm: FloatArray
+    matrix: Float64Array
+    distortion: Float64Array
+    rotation: Float64Array
+    translation_mm: Float64Array
     image_size: tuple[int, int]
-    matrix_stderr: FloatArray = _LEFT_OUT
-    distortion_stderr: FloatArray = _LEFT_OUT
-    rotation_stderr_rad: FloatArray = _LEFT_OUT
-    translation_stderr_mm: FloatArray = _LEFT_OUT
+    matrix_stderr: Float64Array = _LEFT_OUT
+    distortion_stderr: Float64Array = _LEFT_OUT
+    rotation_stderr_rad: Float64Array = _LEFT_OUT
+    translation_stderr_mm: Float64Array = _LEFT_OUT
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no camera."""
@@ -138,11 +138,11 @@ class CameraPose:
         )
 
     @property
-    def center_mm(self) -> FloatArray:
+    def center_mm(self) -> Float64Array:
         """Centre of projection, mm, rig frame, shape (3,)."""
         return -self.rotation.T @ self.translation_mm
 
-    def project(self, points_mm: ArrayLike) -> FloatArray:
+    def project(self, points_mm: ArrayLike) -> Float64Array:
         """Return where points appear.
 
         Parameters
@@ -163,7 +163,7 @@ class CameraPose:
         )
         return xy @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
-    def rays(self, pixels: ArrayLike) -> FloatArray:
+    def rays(self, pixels: ArrayLike) -> Float64Array:
         """Return the directions in which pixels look; the inverse of `project`.
 
         Parameters
@@ -201,7 +201,7 @@ class CameraPose:
         return local @ self.rotation
 
 
-def distort(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
+def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     """Return where Brown's lens moves normalized image coordinates.
 
     Parameters
@@ -305,9 +305,15 @@ def poses_from(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
     for view in rig.views:
         got = {
             name: calibration.quantity(view.serial, name)
-            for name in ("matrix", "distortion", "rotation", "rotation_stderr_rad",
-                         "translation_mm", "image_size")
-        }  # fmt: skip
+            for name in (
+                "matrix",
+                "distortion",
+                "rotation",
+                "rotation_stderr_rad",
+                "translation_mm",
+                "image_size",
+            )
+        }
         errors = {
             name: np.zeros_like(q.value) if q.stderr is None else q.stderr
             for name, q in got.items()

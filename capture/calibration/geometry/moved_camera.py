@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from capture.calibration.geometry.board import Board
@@ -22,7 +21,6 @@ from capture.calibration.geometry.intrinsics import CameraPose
 
 __all__ = ["Moved", "find_moved"]
 
-FloatArray = NDArray[np.float64]
 
 RMS_OF_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2) ** 0.5
 
@@ -153,8 +151,14 @@ def _resection(
     pixels = np.concatenate([s.pixels for s in images.values()])
     turn = Rotation.from_matrix(camera.rotation).as_rotvec()
     _, turn, shift = cv2.solvePnP(
-        points, pixels, camera.matrix, camera.distortion, turn, camera.translation_mm.copy(),
-        useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
-    )  # fmt: skip
+        points,
+        pixels,
+        camera.matrix,
+        camera.distortion,
+        turn,
+        camera.translation_mm.copy(),
+        useExtrinsicGuess=True,
+        flags=cv2.SOLVEPNP_ITERATIVE,
+    )
     rotation = Rotation.from_rotvec(np.ravel(turn)).as_matrix()
     return replace(camera, rotation=rotation, translation_mm=np.ravel(shift))

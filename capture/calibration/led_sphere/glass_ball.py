@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 
+from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.mirror_sphere import reflect, reflection_pixels, reflection_points
 from capture.calibration.record import CalibrationError
@@ -31,7 +32,6 @@ __all__ = [
     "mirrored",
 ]
 
-FloatArray = NDArray[np.float64]
 
 NOISE_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
 SMOOTH_MM = 0.012
@@ -65,9 +65,9 @@ class Ball:
         Of centre and radius.
     """
 
-    center_mm: FloatArray
+    center_mm: Float64Array
     radius_mm: float
-    covariance_mm2: FloatArray
+    covariance_mm2: Float64Array
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no ball."""
@@ -99,15 +99,15 @@ class Mirrored:
         These directions, unit vectors.
     """
 
-    pixels: FloatArray
-    to_light: FloatArray
-    to_camera: FloatArray
-    normal: FloatArray
-    px_per_mm: FloatArray
-    across: FloatArray
+    pixels: Float64Array
+    to_light: Float64Array
+    to_camera: Float64Array
+    normal: Float64Array
+    px_per_mm: Float64Array
+    across: Float64Array
 
     @property
-    def magnification_px2(self) -> FloatArray:
+    def magnification_px2(self) -> Float64Array:
         """Area of the image of 1 mm^2 of a light that faces the ball, px^2, shape (L,)."""
         return np.abs(np.linalg.det(self.px_per_mm))
 
@@ -130,9 +130,9 @@ class BallFit:
     """
 
     ball: Ball
-    spot: NDArray[np.int64]
-    in_field: NDArray[np.bool_]
-    stray: NDArray[np.int64]
+    spot: Int64Array
+    in_field: BoolArray
+    stray: Int64Array
     light_scatter_mm: float
 
 
@@ -148,16 +148,16 @@ class LightDirections:
         Of each, with what all have in common: the error of the ball's place.
     """
 
-    direction: FloatArray
-    covariance: FloatArray
+    direction: Float64Array
+    covariance: Float64Array
 
     @property
-    def stderr(self) -> FloatArray:
+    def stderr(self) -> Float64Array:
         """Standard errors of the components, shape (L, 3)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
-def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -> FloatArray:
+def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -> Float64Array:
     """Find small bright spots.
 
     Parameters
@@ -195,7 +195,7 @@ def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -
 
 
 def mirrored(
-    camera: CameraPose, center_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
+    camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
 ) -> Mirrored:
     """Return where and how a ball mirrors lights into a camera.
 
@@ -231,9 +231,9 @@ def mirrored(
 
 
 def locate_ball(
-    spots: FloatArray,
+    spots: Float64Array,
     camera: CameraPose,
-    lights_mm: FloatArray,
+    lights_mm: Float64Array,
     *,
     center_mm: ArrayLike = (0.0, 0.0, 0.0),
     radius_mm: float = 6.0,
@@ -241,7 +241,7 @@ def locate_ball(
     depth_stderr_mm: float = 1.0,
     margin_mm: float = 0.1,
     noise_px: float = 0.5,
-    lit: NDArray[np.bool_] | None = None,
+    lit: BoolArray | None = None,
 ) -> BallFit:
     """Find the ball by its spots and tell which light made each.
 
@@ -298,20 +298,25 @@ def locate_ball(
     right, down = camera.rotation[0], camera.rotation[1]
     start = about + pixel_mm * (shift[0] * right + shift[1] * down)
     return _refine(
-        found, camera, lights, shows, np.append(start, radius_mm), pixel_mm,
+        found,
+        camera,
+        lights,
+        shows,
+        np.append(start, radius_mm),
+        pixel_mm,
         expected=np.append(about, radius_mm),
         prior=np.array([REACH_MM, REACH_MM, depth_stderr_mm, radius_stderr_mm]),
         margin_px=margin_mm / pixel_mm,
         noise_px=noise_px,
-    )  # fmt: skip
+    )
 
 
 def light_directions(
     camera: CameraPose,
     ball: Ball,
-    pixels: FloatArray,
-    pixel_stderr: FloatArray,
-    distance_mm: FloatArray,
+    pixels: Float64Array,
+    pixel_stderr: Float64Array,
+    distance_mm: Float64Array,
 ) -> LightDirections:
     """Return the directions of lights from their spots.
 
@@ -327,7 +332,7 @@ def light_directions(
         Nominal distances of the lights from the rig's origin.
     """
 
-    def direct(px: FloatArray, place: FloatArray) -> FloatArray:
+    def direct(px: Float64Array, place: Float64Array) -> Float64Array:
         point, way, hit = reflect(camera, px, place[:3], float(place[3]))
         along = np.sum(point * way, axis=1)
         inside = along**2 + distance_mm**2 - np.sum(point**2, axis=1)
@@ -353,7 +358,7 @@ def light_directions(
 
 
 def _require_field(
-    nominal: FloatArray, camera: CameraPose, pixel_mm: float, radius_mm: float
+    nominal: Float64Array, camera: CameraPose, pixel_mm: float, radius_mm: float
 ) -> None:
     inside = _inside(nominal, camera, 0.0)
     if inside.sum() < max(LEAST_SHARE * len(nominal), 1):
@@ -365,7 +370,7 @@ def _require_field(
         )
 
 
-def _vote(found: FloatArray, nominal: FloatArray, pixel_mm: float) -> tuple[FloatArray, int]:
+def _vote(found: Float64Array, nominal: Float64Array, pixel_mm: float) -> tuple[Float64Array, int]:
     """Return the shift of the pattern, px, that most spots agree to, and how many do."""
     expected = nominal[np.isfinite(nominal).all(axis=1)]
     offset = (found[:, None] - expected[None]).reshape(-1, 2)
@@ -388,15 +393,15 @@ def _vote(found: FloatArray, nominal: FloatArray, pixel_mm: float) -> tuple[Floa
 
 
 def _refine(
-    found: FloatArray,
+    found: Float64Array,
     camera: CameraPose,
-    lights: FloatArray,
-    shows: NDArray[np.bool_],
-    place: FloatArray,
+    lights: Float64Array,
+    shows: BoolArray,
+    place: Float64Array,
     pixel_mm: float,
     *,
-    expected: FloatArray,
-    prior: FloatArray,
+    expected: Float64Array,
+    prior: Float64Array,
     margin_px: float,
     noise_px: float,
 ) -> BallFit:
@@ -454,8 +459,8 @@ def _refine(
 
 
 def _match(
-    tree: cKDTree, found: FloatArray, expected: FloatArray, gate_px: float
-) -> NDArray[np.int64]:
+    tree: cKDTree, found: Float64Array, expected: Float64Array, gate_px: float
+) -> Int64Array:
     """Return each light's spot where both are each other's nearest within the gate, else -1."""
     spot = np.full(len(expected), -1)
     known = np.flatnonzero(np.isfinite(expected).all(axis=1))
@@ -468,17 +473,17 @@ def _match(
     return spot
 
 
-def _inside(pixels: FloatArray, camera: CameraPose, margin: float) -> NDArray[np.bool_]:
+def _inside(pixels: Float64Array, camera: CameraPose, margin: float) -> BoolArray:
     width, height = camera.image_size
     x, y = pixels[:, 0], pixels[:, 1]
     with np.errstate(invalid="ignore"):
         return (x > margin) & (y > margin) & (x < width - 1 - margin) & (y < height - 1 - margin)
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _least_axis(vectors: FloatArray) -> FloatArray:
+def _least_axis(vectors: Float64Array) -> Float64Array:
     """Return the coordinate axis that each vector is least along."""
     return np.eye(3)[np.argmin(np.abs(vectors), axis=-1)]

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import (
     Calibration,
     CalibrationMismatch,
@@ -23,8 +23,6 @@ from capture.calibration.validity import require
 from capture.rig import Rig
 
 __all__ = ["SphereCalibration", "SphereFilms", "SphereLightTable"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +48,13 @@ class SphereLightTable:
     """
 
     names: tuple[str, ...]
-    directions: FloatArray
-    directions_stderr: FloatArray
-    intensities: FloatArray
-    intensities_stderr: FloatArray
-    seen: NDArray[np.bool_]
-    valid: NDArray[np.bool_]
-    dead: NDArray[np.bool_]
+    directions: Float64Array
+    directions_stderr: Float64Array
+    intensities: Float64Array
+    intensities_stderr: Float64Array
+    seen: BoolArray
+    valid: BoolArray
+    dead: BoolArray
 
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
@@ -177,13 +175,13 @@ class SphereFilms:
     """
 
     names: tuple[str, ...]
-    leakage: FloatArray
-    leakage_stderr: FloatArray
-    glass_leakage: FloatArray
-    glass_leakage_stderr: FloatArray
-    axis_error_rad: FloatArray
-    axis_error_stderr_rad: FloatArray
-    valid: NDArray[np.bool_]
+    leakage: Float64Array
+    leakage_stderr: Float64Array
+    glass_leakage: Float64Array
+    glass_leakage_stderr: Float64Array
+    axis_error_rad: Float64Array
+    axis_error_stderr_rad: Float64Array
+    valid: BoolArray
     misalignment_rad: float
     misalignment_stderr_rad: float
     light_leak: float
@@ -314,7 +312,7 @@ class SphereCalibration:
         )
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> BoolArray:
         """Lights of measured intensity that shine, shape (L,)."""
         return self.lights.valid & ~self.lights.dead
 
@@ -331,10 +329,10 @@ class _Columns:
         self.names = tuple(light.name for light in rig.lights)
         self._calibration = calibration
 
-    def values(self, name: str) -> FloatArray:
+    def values(self, name: str) -> Float64Array:
         return np.array([self._calibration.quantity(n, name).value for n in self.names])
 
-    def both(self, name: str) -> tuple[FloatArray, FloatArray]:
+    def both(self, name: str) -> tuple[Float64Array, Float64Array]:
         rows = [self._calibration.quantity(n, name) for n in self.names]
         errors = [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
         return np.array([q.value for q in rows]), np.array(errors)

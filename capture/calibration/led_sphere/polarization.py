@@ -12,14 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.polarization import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection
 
 __all__ = ["FilmFit", "fit_films", "leakage"]
 
-FloatArray = NDArray[np.float64]
 
 WIDEST_ZERO_DEG = 30  # of the analyser, searched
 USUAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
@@ -60,15 +60,15 @@ class FilmFit:
         Above 1 the errors have been widened.
     """
 
-    strength: FloatArray
-    strength_stderr: FloatArray
-    turn_rad: FloatArray
-    turn_stderr_rad: FloatArray
+    strength: Float64Array
+    strength_stderr: Float64Array
+    turn_rad: Float64Array
+    turn_stderr_rad: Float64Array
     zero_rad: float
     zero_stderr_rad: float
     light_leak: float
     analyser_leak: float
-    covariance: FloatArray
+    covariance: Float64Array
     turn_scatter_rad: float
     chi2_per_dof: float
 
@@ -81,9 +81,9 @@ class FilmFit:
 
 def fit_films(
     readings_rad: ArrayLike,
-    rates: FloatArray,
-    variance: FloatArray,
-    good: NDArray[np.bool_],
+    rates: Float64Array,
+    variance: Float64Array,
+    good: BoolArray,
     reflection: Reflection,
 ) -> FilmFit:
     """Fit the films and the strengths of the lights to the spots' fluxes.
@@ -138,7 +138,7 @@ def fit_films(
     return min(fits, key=lambda fit: fit.cost).result(seen)
 
 
-def leakage(fit: FilmFit, reflection: Reflection) -> tuple[FloatArray, FloatArray]:
+def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64Array]:
     """Return how much of a mirror reflection passes crossed, over parallel, with standard errors.
 
     Parameters
@@ -177,7 +177,7 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[FloatArray, FloatArra
 
 
 def _starts(
-    readings: FloatArray, values: FloatArray, weight: FloatArray, reflection: Reflection
+    readings: Float64Array, values: Float64Array, weight: Float64Array, reflection: Reflection
 ) -> list[float]:
     """Return the two best zeros of the analyser if the lights stood as drawn, rad."""
     # lights' own axes are off: their spots differ from this by some thousandths of their light
@@ -203,9 +203,9 @@ class _Films:
 
     def __init__(
         self,
-        readings: FloatArray,
-        values: FloatArray,
-        weight: FloatArray,
+        readings: Float64Array,
+        values: Float64Array,
+        weight: Float64Array,
         reflection: Reflection,
         zero: float,
     ) -> None:
@@ -221,11 +221,11 @@ class _Films:
         power = np.sum(weight * u**2, axis=0)
         self.strength = np.sum(weight * u * values, axis=0) / np.where(power > 0, power, 1.0)
 
-    def _through(self, turn: FloatArray, shared: FloatArray) -> FloatArray:
+    def _through(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
         zero, light, analyser = shared
         return self.reflection.through(self.readings, turn, zero, np.exp(light), np.exp(analyser))
 
-    def _objective(self, strength: FloatArray, turn: FloatArray, shared: FloatArray) -> float:
+    def _objective(self, strength: Float64Array, turn: Float64Array, shared: Float64Array) -> float:
         miss = self.values - strength * self._through(turn, shared)
         beyond = (shared[1:] - np.log(USUAL_LEAK)) / LEAK_SCATTER
         return float(
@@ -242,7 +242,9 @@ class _Films:
         tails = np.log1p(self.turn[self.lit] ** 2 / (FREEDOM * self.scatter**2))
         return data + float((FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter))
 
-    def _normal(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _normal(
+        self,
+    ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array, Float64Array]:
         """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
         h = DERIVATIVE
         u = self._through(self.turn, self.shared)
@@ -314,7 +316,7 @@ class _Films:
             self.solve()
         return self
 
-    def _light_cost(self, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _light_cost(self, turn: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return each light's own part of the cost at its best strength, and that strength."""
         u = self._through(turn, self.shared)
         power = np.sum(self.weight * u**2, axis=0)
@@ -323,7 +325,7 @@ class _Films:
         tail = (FREEDOM + 1) * np.log1p(turn**2 / (FREEDOM * self.scatter**2))
         return miss + tail, strength
 
-    def _modes(self) -> tuple[FloatArray, FloatArray]:
+    def _modes(self) -> tuple[Float64Array, Float64Array]:
         """Return the two best answers for each light's turn and their costs, shapes (2, L)."""
         even = np.linspace(-1.0, 1.0, MODES_GRID)
         # closely where most axes are, coarsely where one far off may be
@@ -351,12 +353,12 @@ class _Films:
         costs[1, single] = np.inf
         return modes, costs
 
-    def _scatter(self, variance: FloatArray) -> float:
+    def _scatter(self, variance: Float64Array) -> float:
         """Return the width of the axes' scatter: one step of expectation and maximization."""
         square = (self.pull * (self.turn**2 + variance))[self.lit].mean()
         return float(np.clip(np.sqrt(square), *TURN_RANGE_RAD))
 
-    def result(self, seen: NDArray[np.bool_]) -> FilmFit:
+    def result(self, seen: BoolArray) -> FilmFit:
         """Return the fit, with errors widened where the residuals are larger than the noise."""
         # how much the scattered axes tell: slope and spread of their pull (a sandwich), since
         # weights that follow the residuals would count their own scatter as knowledge
@@ -403,13 +405,13 @@ class _Films:
 
 
 def _solve_arrow(
-    block: FloatArray,
-    border: FloatArray,
-    corner: FloatArray,
-    one: FloatArray,
-    other: FloatArray,
+    block: Float64Array,
+    border: Float64Array,
+    corner: Float64Array,
+    one: Float64Array,
+    other: Float64Array,
     damping: float,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Solve arrow-shaped normal equations with a damped diagonal."""
     damped = block + damping * block * np.eye(2)
     inverse = np.linalg.inv(damped)
@@ -422,8 +424,8 @@ def _solve_arrow(
 
 
 def _solve_arrow_covariance(
-    block: FloatArray, border: FloatArray, corner: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    block: Float64Array, border: Float64Array, corner: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return covariances of each light's two numbers, with the shared ones, and of those."""
     inverse = np.linalg.inv(block)
     through = inverse @ border

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.spot_photometry import (
     RING,
     RateImage,
@@ -36,7 +36,6 @@ from capture.rig import Rig, View
 
 __all__ = ["GlassBall", "SphereSurvey", "survey_sphere"]
 
-FloatArray = NDArray[np.float64]
 
 MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
 WAVELENGTH_MM = 5.5e-4
@@ -213,17 +212,22 @@ def survey_sphere(
     fit = replace(fit, in_field=fit.in_field & (good.any(axis=0) | saturated))
     told = _findings(result, fit, place, saturated, films, spots, total, middle, pixel_mm)
     return SphereSurvey(
-        lights, result.films, fit.ball, fit.light_scatter_mm, films.turn_scatter_rad,
-        result.readings_deg, told,
-    )  # fmt: skip
+        lights,
+        result.films,
+        fit.ball,
+        fit.light_scatter_mm,
+        films.turn_scatter_rad,
+        result.readings_deg,
+        told,
+    )
 
 
 def _locate(
-    spots: FloatArray,
+    spots: Float64Array,
     camera: CameraPose,
-    place: FloatArray,
+    place: Float64Array,
     what: GlassBall,
-    lit: NDArray[np.bool_] | None = None,
+    lit: BoolArray | None = None,
     noise_px: float = 0.5,
 ) -> BallFit:
     return locate_ball(
@@ -248,7 +252,7 @@ def _pupil_mm(view: View) -> float:
 
 def _spot_radius(
     shown: Mirrored, camera: CameraPose, what: GlassBall, rig: Rig, view: str
-) -> FloatArray:
+) -> Float64Array:
     """Return the radius of a disc that holds each spot, mm at the plane in focus, shape (L,).
 
     A ball shows a distant light where its rays seem to cross, R cos / 2 behind its surface in the
@@ -269,11 +273,11 @@ def _spot_radius(
 
 def _again(
     fit: BallFit,
-    spots: FloatArray,
-    middle: FloatArray,
-    measured: NDArray[np.bool_],
+    spots: Float64Array,
+    middle: Float64Array,
+    measured: BoolArray,
     camera: CameraPose,
-    place: FloatArray,
+    place: Float64Array,
     what: GlassBall,
 ) -> BallFit:
     """Return the ball by the spots' middles instead of their brightest pixels."""
@@ -307,9 +311,9 @@ def _reflection(
     camera: CameraPose,
     view: str,
     eta: float,
-    to_light: FloatArray,
-    to_camera: FloatArray,
-    facing: FloatArray,
+    to_light: Float64Array,
+    to_camera: Float64Array,
+    facing: Float64Array,
 ) -> Reflection:
     axis = rig.view(view).analyser_axis_deg
     if axis is None:
@@ -319,14 +323,14 @@ def _reflection(
     )
 
 
-def _to(camera: CameraPose) -> FloatArray:
+def _to(camera: CameraPose) -> Float64Array:
     center = camera.center_mm
     return np.asarray(center / np.linalg.norm(center))
 
 
 def _fluxes(
-    shots: Sequence[Shot], at: FloatArray, aperture_px: FloatArray, within: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+    shots: Sequence[Shot], at: Float64Array, aperture_px: Float64Array, within: Float64Array
+) -> tuple[Float64Array, Float64Array, BoolArray, BoolArray]:
     """Return rates, variances, whether they may be used, (E, L), and always saturated, (L,)."""
     rows = []
     saturated = np.ones(len(at), bool)
@@ -341,12 +345,12 @@ def _fluxes(
     return rates, variances, good, saturated
 
 
-def _two_readings(readings: FloatArray, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _two_readings(readings: Float64Array, good: BoolArray) -> BoolArray:
     return np.array([len(set(readings[ok] % 180.0)) >= 2 for ok in good.T])
 
 
 def _with_geometry(
-    films: FilmFit, glass: Reflection, what: GlassBall, angle_rad: FloatArray
+    films: FilmFit, glass: Reflection, what: GlassBall, angle_rad: Float64Array
 ) -> FilmFit:
     """Return the films with what errors of directions and of the glass's index add to theirs.
 
@@ -354,7 +358,7 @@ def _with_geometry(
     angle glass turns the polarization of light fast with the angle, and reflects little.
     """
 
-    def seen(turn: FloatArray, reflection: Reflection) -> tuple[FloatArray, FloatArray]:
+    def seen(turn: Float64Array, reflection: Reflection) -> tuple[Float64Array, Float64Array]:
         field = reflection.fields(turn)[:, 0]
         doubled = (field[:, 0] + 1j * field[:, 1]) ** 2
         return doubled, np.log(np.abs(doubled))
@@ -362,7 +366,9 @@ def _with_geometry(
     h = 1e-4
     turn = films.turn_rad
 
-    def change(high: tuple[FloatArray, FloatArray], low: tuple[FloatArray, FloatArray]) -> Any:
+    def change(
+        high: tuple[Float64Array, Float64Array], low: tuple[Float64Array, Float64Array]
+    ) -> Any:
         return 0.5 * np.angle(high[0] / low[0]), high[1] - low[1]
 
     by_turn = [v / (2 * h) for v in change(seen(turn + h, glass), seen(turn - h, glass))]
@@ -371,8 +377,11 @@ def _with_geometry(
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     turn2 = np.zeros_like(turn)
     share2 = np.zeros_like(turn)
-    shifts = [(h * first, 0.0, angle_rad / h), (h * np.cross(first, glass.to_light), 0.0,
-              angle_rad / h), (0.0 * first, 0.5 * what.eta_stderr, 2.0)]  # fmt: skip
+    shifts = [
+        (h * first, 0.0, angle_rad / h),
+        (h * np.cross(first, glass.to_light), 0.0, angle_rad / h),
+        (0.0 * first, 0.5 * what.eta_stderr, 2.0),
+    ]
     for move, index, scale in shifts:
         ends = [
             seen(turn, glass.moved(glass.to_light + sign * move, glass.eta + sign * index))
@@ -400,8 +409,8 @@ def _intensities(
     ball: Ball,
     films: FilmFit,
     shown: Mirrored,
-    direction: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+    direction: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
     """Return the light that each light sends to the origin, any common unit, with errors."""
     place = direction * np.linalg.norm([light.position_mm for light in rig.lights], axis=1)[:, None]
     distance2 = np.sum(place**2, axis=1)
@@ -426,10 +435,10 @@ def _film_table(
     lights: SphereLightTable,
     films: FilmFit,
     skin: Reflection,
-    rates: FloatArray,
-    variance: FloatArray,
-    good: NDArray[np.bool_],
-    readings: FloatArray,
+    rates: Float64Array,
+    variance: Float64Array,
+    good: BoolArray,
+    readings: Float64Array,
     eta: float,
 ) -> SphereFilms:
     leaked, leaked_stderr = leakage(films, skin)
@@ -472,19 +481,19 @@ def _film_table(
 def _findings(
     survey: SphereSurvey,
     fit: BallFit,
-    place: FloatArray,
-    saturated: NDArray[np.bool_],
+    place: Float64Array,
+    saturated: BoolArray,
     films: FilmFit,
-    spots: FloatArray,
+    spots: Float64Array,
     total: RateImage,
-    middle: FloatArray,
+    middle: Float64Array,
     pixel_mm: float,
 ) -> tuple[str, ...]:
     lights, table = survey.lights, survey.films
     names = np.array(lights.names)
     told = []
 
-    def listed(chosen: NDArray[np.bool_]) -> str:
+    def listed(chosen: BoolArray) -> str:
         return ", ".join(names[chosen])
 
     if lights.dead.any():
@@ -525,10 +534,11 @@ def _findings(
         usual_peak = float(np.median(peak[fit.spot[fit.spot >= 0]]))
         own = middle[np.isfinite(middle).all(axis=1)]
         bright = [
-            k for k in fit.stray
+            k
+            for k in fit.stray
             if peak[k] > STRAY_SHARE * usual_peak
             and np.linalg.norm(own - spots[k], axis=1).min() > STRAY_MM / pixel_mm
-        ]  # fmt: skip
+        ]
         if bright:
             told.append(f"{len(bright)} bright spots are no light's; keep other light away")
     return tuple(told)

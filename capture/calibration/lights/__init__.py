@@ -3,8 +3,4 @@
 from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
 from capture.calibration.lights.light_list import CameraResponse, LightTable
 
-__all__ = [
-    "CameraResponse",
-    "LightTable",
-    "directions_from_chrome_ball",
-]
+__all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 
 __all__ = ["ChromeBallError", "directions_from_chrome_ball", "highlight_center"]
 
-FloatArray = NDArray[np.float64]
 
 BRIGHT_SHARE = 0.9  # of the brightest pixel: what belongs to a highlight
 LEAST_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
@@ -23,7 +23,7 @@ class ChromeBallError(CalibrationError):
     """Photographs of a ball that show no light; the message names them."""
 
 
-def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> FloatArray:
+def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Float64Array:
     """Return the directions to distant lights from their highlights on a mirror ball.
 
     Parameters
@@ -92,7 +92,7 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     return np.array(directions).reshape(-1, 3)
 
 
-def highlight_center(gray: NDArray, inside: NDArray[np.bool_]) -> FloatArray | None:
+def highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:
     """Return column and row of the middle of the brightest spot, or None where none stands out.
 
     Parameters

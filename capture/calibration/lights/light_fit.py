@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from capture.arrays import Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.light_list import CameraResponse, LightTable
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
@@ -24,7 +24,6 @@ from capture.calibration.record import CalibrationError
 
 __all__ = ["LightFit", "LightFitError", "check_order", "fit_lights"]
 
-FloatArray = NDArray[np.float64]
 
 LIGHT, CAMERA, POSE = 6, 5, 2  # numbers of a light (intensities, exponent, tilt), camera, pose
 LEAST_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
@@ -203,13 +202,13 @@ class _Frame:
     light: int
     view: str
     pose: int
-    part: NDArray[np.int64]  # (n,)
-    turns: FloatArray  # how the log follows small slopes of the plate along its axes, (n, 2)
-    known: FloatArray  # log of white, cosine, distance, (n,)
-    direction: FloatArray  # unit vectors from the light to the parts, (n, 3)
-    r2: FloatArray  # squared distance from the image's middle, 1 in the corner
-    log_signal: FloatArray  # (n, 3)
-    relative: FloatArray  # relative variance, (n, 3)
+    part: Int64Array  # (n,)
+    turns: Float64Array  # how the log follows small slopes of the plate along its axes, (n, 2)
+    known: Float64Array  # log of white, cosine, distance, (n,)
+    direction: Float64Array  # unit vectors from the light to the parts, (n, 3)
+    r2: Float64Array  # squared distance from the image's middle, 1 in the corner
+    log_signal: Float64Array  # (n, 3)
+    relative: Float64Array  # relative variance, (n, 3)
 
 
 def _frame(
@@ -248,7 +247,7 @@ def _frame(
 
 def _solve(
     frames: Sequence[_Frame], table: LightTable, views: list[str], slope_rad: float
-) -> tuple[FloatArray, FloatArray, float]:
+) -> tuple[Float64Array, Float64Array, float]:
     """Return all numbers, their covariance and the rms residual."""
     lights = len(table.names)
     poses = 1 + max(f.pose for f in frames)
@@ -323,11 +322,11 @@ def _solve(
 def _rows(
     f: _Frame,
     table: LightTable,
-    light: FloatArray,
-    camera: FloatArray,
-    side: FloatArray,
-    across: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    light: Float64Array,
+    camera: Float64Array,
+    side: Float64Array,
+    across: Float64Array,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return model minus data (3 n,), and derivatives by the light (6) and the camera (5)."""
     n = len(f.known)
     axis, by_side, by_across = _tilted(table, f.light, light[4:6], side, across)
@@ -350,8 +349,8 @@ def _rows(
 
 
 def _tilted(
-    table: LightTable, light: int, tilt: FloatArray, side: FloatArray, across: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    table: LightTable, light: int, tilt: Float64Array, side: Float64Array, across: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return a light's tilted axis and how it follows the two tilts."""
     raw = table.axis[light] + tilt[0] * side[light] + tilt[1] * across[light]
     length = np.linalg.norm(raw)
@@ -363,7 +362,7 @@ def _tilted(
     )
 
 
-def _sides(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sides(axis: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return two unit vectors across each axis."""
     helper = np.where(np.abs(axis[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     side = np.cross(axis, helper)
@@ -371,7 +370,7 @@ def _sides(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
     return side, np.cross(axis, side)
 
 
-def _shapes(table: LightTable, points: FloatArray, normals: FloatArray) -> FloatArray:
+def _shapes(table: LightTable, points: Float64Array, normals: Float64Array) -> Float64Array:
     """Return what each light of intensity 1 gives to points with normals, shape (L, n)."""
     to_light = table.position_mm[:, None] - points
     distance = np.linalg.norm(to_light, axis=-1)
@@ -381,8 +380,8 @@ def _shapes(table: LightTable, points: FloatArray, normals: FloatArray) -> Float
 
 
 def _result(
-    numbers: FloatArray,
-    covariance: FloatArray,
+    numbers: Float64Array,
+    covariance: Float64Array,
     residual: float,
     frames: Sequence[_Frame],
     table: LightTable,
@@ -403,10 +402,12 @@ def _result(
         if not seen[k] and name not in dead and name not in answers
     )
     side, across = _sides(table.axis)
-    axis = np.array([
-        _tilted(table, k, rows[k, 4:6] if seen[k] else np.zeros(2), side, across)[0]
-        for k in range(lights)
-    ])  # fmt: skip
+    axis = np.array(
+        [
+            _tilted(table, k, rows[k, 4:6] if seen[k] else np.zeros(2), side, across)[0]
+            for k in range(lights)
+        ]
+    )
     intensity = np.where(seen[:, None], np.exp(rows[:, :3]), 0.0)
     responses = {}
     for c, view in enumerate(sorted(cameras)):

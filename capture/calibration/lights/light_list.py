@@ -9,15 +9,15 @@ from datetime import date
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
 from capture.calibration.record import Calibration, Quantity, Source, default_validity
 from capture.rig import Rig
 
 __all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]
 
-FloatArray = NDArray[np.float64]
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
@@ -37,10 +37,10 @@ class CameraResponse:
         Standard errors.
     """
 
-    gain: FloatArray = field(default_factory=lambda: np.ones(3))
-    vignetting: FloatArray = field(default_factory=lambda: np.zeros(2))
-    gain_stderr: FloatArray = field(default_factory=lambda: np.zeros(3))
-    vignetting_stderr: FloatArray = field(default_factory=lambda: np.zeros(2))
+    gain: Float64Array = field(default_factory=lambda: np.ones(3))
+    vignetting: Float64Array = field(default_factory=lambda: np.zeros(2))
+    gain_stderr: Float64Array = field(default_factory=lambda: np.zeros(3))
+    vignetting_stderr: Float64Array = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no response."""
@@ -53,7 +53,7 @@ class CameraResponse:
                 f" {self.vignetting.tolist()}, expected a positive response everywhere"
             )
 
-    def at(self, pixels: ArrayLike, image_size: tuple[int, int]) -> FloatArray:
+    def at(self, pixels: ArrayLike, image_size: tuple[int, int]) -> Float64Array:
         """Return the response at pixels, shape (..., 3).
 
         Parameters
@@ -105,15 +105,15 @@ class LightTable:
         By serial; a camera that is not named has response 1.
     """
 
-    position_mm: FloatArray
-    intensity: FloatArray
-    exponent: FloatArray
+    position_mm: Float64Array
+    intensity: Float64Array
+    exponent: Float64Array
     names: tuple[str, ...]
-    axis: FloatArray = _LEFT_OUT
-    valid: NDArray[np.bool_] = _LEFT_OUT
-    position_stderr_mm: FloatArray = _LEFT_OUT
-    intensity_stderr: FloatArray = _LEFT_OUT
-    exponent_stderr: FloatArray = _LEFT_OUT
+    axis: Float64Array = _LEFT_OUT
+    valid: BoolArray = _LEFT_OUT
+    position_stderr_mm: Float64Array = _LEFT_OUT
+    intensity_stderr: Float64Array = _LEFT_OUT
+    exponent_stderr: Float64Array = _LEFT_OUT
     cameras: Mapping[str, CameraResponse] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -189,7 +189,7 @@ class LightTable:
             tuple(light.name for light in rig.lights),
         )
 
-    def irradiance(self, points_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def irradiance(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return the directions to the lights and the signal of a white that faces them.
 
         Parameters
@@ -221,7 +221,7 @@ class LightTable:
         lobe[cosine == 0] = 0.0
         return direction, self.intensity[:, None] * (lobe[..., None] / distance**2)
 
-    def response(self, serial: str, pixels: ArrayLike, image_size: tuple[int, int]) -> FloatArray:
+    def response(self, serial: str, pixels: ArrayLike, image_size: tuple[int, int]) -> Float64Array:
         """Return a camera's response at pixels, shape (..., 3); see `CameraResponse.at`."""
         return self.cameras.get(serial, CameraResponse()).at(pixels, image_size)
 
@@ -280,7 +280,7 @@ class LightTable:
         def of(name: str) -> list[Quantity]:
             return [calibration.quantity(light.name, name) for light in rig.lights]
 
-        def errors(name: str) -> FloatArray:
+        def errors(name: str) -> Float64Array:
             return np.array(
                 [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in of(name)]
             )
@@ -310,7 +310,7 @@ class LightTable:
         )
 
 
-def _array(owner: str, name: str, row: object, shape: tuple[int, ...]) -> FloatArray:
+def _array(owner: str, name: str, row: object, shape: tuple[int, ...]) -> Float64Array:
     """Return a field as a read-only float64 array of a shape; None becomes zeros."""
     given = getattr(row, name)
     array = np.array(np.zeros(shape) if given is None else given, dtype=np.float64)

@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation, label
 from scipy.optimize import linear_sum_assignment
 from threadpoolctl import threadpool_limits
 
+from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.mirror_sphere import (
     SphereError,
@@ -28,7 +29,6 @@ from capture.calibration.lights.mirror_sphere import (
 
 __all__ = ["Highlights", "LightPlaces", "SphereWindow", "find_highlights", "locate_lights"]
 
-FloatArray = NDArray[np.float64]
 
 RIM_PX = 1.5  # highlights closer to the outline are left alone
 NOISE_SIGMAS = 8.0  # above the median in the sphere
@@ -57,7 +57,7 @@ class SphereWindow:
 
     rows: slice
     columns: slice
-    inside: NDArray[np.bool_]
+    inside: BoolArray
 
     @classmethod
     def of(cls, camera: CameraPose, place: SpherePlace) -> SphereWindow:
@@ -102,8 +102,8 @@ class Highlights:
     view: str
     sphere: int
     lit: tuple[str, ...]
-    pixels: FloatArray
-    flux: FloatArray
+    pixels: Float64Array
+    flux: Float64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,19 +134,19 @@ class LightPlaces:
     """
 
     names: tuple[str, ...]
-    position_mm: FloatArray
-    stderr_mm: FloatArray
-    covariance_mm2: FloatArray
-    cameras: NDArray[np.int64]
-    highlights: NDArray[np.int64]
-    valid: NDArray[np.bool_]
+    position_mm: Float64Array
+    stderr_mm: Float64Array
+    covariance_mm2: Float64Array
+    cameras: Int64Array
+    highlights: Int64Array
+    valid: BoolArray
     unseen: tuple[str, ...]
     answers: dict[str, str]
-    spheres_mm: FloatArray
+    spheres_mm: Float64Array
     sigma_px: float
 
 
-def find_highlights(image: NDArray, window: SphereWindow) -> tuple[FloatArray, FloatArray]:
+def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array, Float64Array]:
     """Find the bright spots in a sphere.
 
     Parameters
@@ -190,7 +190,7 @@ def locate_lights(
     seen: Sequence[Highlights],
     cameras: Mapping[str, CameraPose],
     spheres: Mapping[int, SpherePlace],
-    nominal: Mapping[str, FloatArray],
+    nominal: Mapping[str, Float64Array],
     *,
     light_radius_mm: float = 10.0,
     nominal_stderr_mm: float | None = None,
@@ -267,7 +267,7 @@ def locate_lights(
     )
 
 
-Matched = tuple[int, str, int, FloatArray]  # light, view, sphere, pixel
+Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
 
 
 def _match(
@@ -275,7 +275,7 @@ def _match(
     cameras: Mapping[str, CameraPose],
     spheres: Mapping[int, SpherePlace],
     names: tuple[str, ...],
-    start: FloatArray,
+    start: Float64Array,
     gate_mm: float,
 ) -> tuple[list[Matched], dict[str, str], tuple[str, ...]]:
     """Say which light made which spot; lights that answer for others; lights never seen."""
@@ -283,7 +283,7 @@ def _match(
     expected: Counter[int] = Counter()
     found: Counter[int] = Counter()
     instead: Counter[tuple[int, int]] = Counter()
-    strange: list[tuple[int, int, str, int, FloatArray]] = []
+    strange: list[tuple[int, int, str, int, Float64Array]] = []
     for shot in seen:
         camera, sphere = cameras[shot.view], spheres[shot.sphere]
         lit = [names.index(name) for name in shot.lit]
@@ -325,7 +325,7 @@ def _match(
     return matched, answers, unseen
 
 
-def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: FloatArray) -> NDArray[np.bool_]:
+def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: Float64Array) -> BoolArray:
     """Return which pixels lie in the inner nine tenths of a sphere and in the image."""
     inside = np.zeros(len(pixels), bool)
     good = np.isfinite(pixels).all(axis=1)
@@ -340,8 +340,8 @@ def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: FloatArray) -
 
 
 def _miss_mm(
-    camera: CameraPose, sphere: SpherePlace, pixels: FloatArray, lights_mm: FloatArray
-) -> FloatArray:
+    camera: CameraPose, sphere: SpherePlace, pixels: Float64Array, lights_mm: Float64Array
+) -> Float64Array:
     """Return how far each light is from each reflected ray, mm, shape (spots, lights)."""
     point, direction, hit = reflect(camera, pixels, sphere.center_mm, sphere.radius_mm)
     to_light = lights_mm[None] - point[:, None]
@@ -354,11 +354,11 @@ def _adjust(
     matched: Sequence[Matched],
     cameras: Mapping[str, CameraPose],
     spheres: Mapping[int, SpherePlace],
-    start: FloatArray,
-    valid: NDArray[np.bool_],
+    start: Float64Array,
+    valid: BoolArray,
     light_radius_mm: float,
     nominal_stderr_mm: float | None,
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+) -> tuple[Float64Array, Float64Array, Float64Array, float]:
     """Return lights, centres, the lights' covariances and the noise, by Gauss-Newton steps."""
     numbers = sorted(spheres)
     lights = np.nonzero(valid)[0]
@@ -419,11 +419,11 @@ def _adjust(
 def _highlight_rows(
     cameras: Mapping[str, CameraPose],
     views: NDArray,
-    centers_mm: FloatArray,
+    centers_mm: Float64Array,
     radius_mm: float,
-    lights_mm: FloatArray,
-    pixels: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+    lights_mm: Float64Array,
+    pixels: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
     """Return residuals (n, 2) and their derivatives (n, 2, 6) by light and by centre.
 
     A light that the sphere cannot show any more (beyond its rim) has residual and derivative 0.

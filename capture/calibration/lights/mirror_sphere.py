@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
 
@@ -29,7 +30,6 @@ __all__ = [
     "reflection_points",
 ]
 
-FloatArray = NDArray[np.float64]
 
 ANGLES = 180  # places on the outline where an edge is sought
 REACH = 0.12  # how far from the outline, of its radius, in the first search
@@ -72,16 +72,16 @@ class SpherePlace:
         Those whose outline was used.
     """
 
-    center_mm: FloatArray
+    center_mm: Float64Array
     radius_mm: float
-    covariance_mm2: FloatArray
+    covariance_mm2: Float64Array
     rms_px: float
     fitted_radius_mm: float
     fitted_radius_stderr_mm: float
     cameras: tuple[str, ...]
 
 
-def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> FloatArray | None:
+def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> Float64Array | None:
     """Find a sphere near the rig's origin in an image, and edges on its outline.
 
     Parameters
@@ -123,7 +123,7 @@ def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> FloatA
 
 
 def locate_sphere(
-    outlines: Mapping[str, FloatArray],
+    outlines: Mapping[str, Float64Array],
     cameras: Mapping[str, CameraPose],
     radius_mm: float,
     *,
@@ -183,7 +183,9 @@ def locate_sphere(
     )
 
 
-def contour(camera: CameraPose, center_mm: FloatArray, radius_mm: float, count: int) -> FloatArray:
+def contour(
+    camera: CameraPose, center_mm: Float64Array, radius_mm: float, count: int
+) -> Float64Array:
     """Return points of a sphere's outline in an image, shape (count, 2); NaN behind the camera."""
     to_center = center_mm - camera.center_mm
     distance = float(np.linalg.norm(to_center))
@@ -202,8 +204,8 @@ def contour(camera: CameraPose, center_mm: FloatArray, radius_mm: float, count: 
 
 
 def reflect(
-    camera: CameraPose, pixels: FloatArray, center_mm: FloatArray, radius_mm: float
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    camera: CameraPose, pixels: Float64Array, center_mm: Float64Array, radius_mm: float
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return where rays of pixels meet a sphere and where they go from there.
 
     Parameters
@@ -231,8 +233,8 @@ def reflect(
 
 
 def reflection_points(
-    eyes_mm: FloatArray, centers_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+    eyes_mm: Float64Array, centers_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
+) -> tuple[Float64Array, BoolArray]:
     """Return where spheres show lights to eyes.
 
     Parameters
@@ -285,8 +287,8 @@ def reflection_points(
 
 
 def reflection_pixels(
-    camera: CameraPose, center_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
-) -> FloatArray:
+    camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
+) -> Float64Array:
     """Return where a sphere shows lights to a camera, shape (n, 2); NaN where it does not.
 
     Parameters
@@ -303,7 +305,7 @@ def reflection_pixels(
     return np.where(seen[:, None], camera.project(point), np.nan)
 
 
-def _vote(gray: FloatArray, radii_px: list[float]) -> tuple[FloatArray, float] | None:
+def _vote(gray: Float64Array, radii_px: list[float]) -> tuple[Float64Array, float] | None:
     """Return middle and radius of the dark disc that most edges point away from."""
     smooth = gaussian_filter(gray, 1.5)
     gy, gx = np.gradient(smooth)
@@ -314,7 +316,7 @@ def _vote(gray: FloatArray, radii_px: list[float]) -> tuple[FloatArray, float] |
         return None
     ux, uy = gx[rows, columns] / size[rows, columns], gy[rows, columns] / size[rows, columns]
     shape = tuple(int(n / VOTES_STEP_PX) + 1 for n in gray.shape)
-    best: tuple[float, FloatArray, float] | None = None
+    best: tuple[float, Float64Array, float] | None = None
     for radius in radii_px:
         x = ((columns - radius * ux) / VOTES_STEP_PX).astype(int)
         y = ((rows - radius * uy) / VOTES_STEP_PX).astype(int)
@@ -330,8 +332,8 @@ def _vote(gray: FloatArray, radii_px: list[float]) -> tuple[FloatArray, float] |
 
 
 def _edges(
-    gray: FloatArray, camera: CameraPose, center: FloatArray, radius_mm: float, reach: float
-) -> FloatArray:
+    gray: Float64Array, camera: CameraPose, center: Float64Array, radius_mm: float, reach: float
+) -> Float64Array:
     """Return subpixel edges, dark inside, along normals of the expected outline."""
     outline, outward = _outline(camera, center, radius_mm)
     steps = np.arange(-reach - 2.0, reach + 2.0 + EDGE_STEP_PX / 2, EDGE_STEP_PX)
@@ -358,8 +360,8 @@ def _edges(
 
 
 def _fine_edges(
-    image: FloatArray, camera: CameraPose, center: FloatArray, radius_mm: float
-) -> FloatArray:
+    image: Float64Array, camera: CameraPose, center: Float64Array, radius_mm: float
+) -> Float64Array:
     """Return edges to a few hundredths of a pixel, near an outline known to about one.
 
     Just inside the rim a sphere shows what is just behind it, then, as the root of the distance,
@@ -395,7 +397,7 @@ def _fine_edges(
 
 
 @lru_cache(maxsize=512)
-def _edge_basis_cached(steps: tuple[float, ...], at: float) -> FloatArray:
+def _edge_basis_cached(steps: tuple[float, ...], at: float) -> Float64Array:
     s = np.array(steps)
     fine = np.arange(s[0] - 3.0, s[-1] + 3.0, 0.05)
     d = at - fine  # depth inside the rim
@@ -407,21 +409,21 @@ def _edge_basis_cached(steps: tuple[float, ...], at: float) -> FloatArray:
     return np.asarray(np.linalg.qr(basis)[0])
 
 
-def _edge_basis(steps: FloatArray, at: float) -> FloatArray:
+def _edge_basis(steps: Float64Array, at: float) -> Float64Array:
     """Return an orthonormal basis of lines with an edge at a place, shape (steps, 5)."""
     return _edge_basis_cached(tuple(np.round(steps, 6).tolist()), round(float(at), 6))
 
 
 def _outline(
-    camera: CameraPose, center: FloatArray, radius_mm: float
-) -> tuple[FloatArray, FloatArray]:
+    camera: CameraPose, center: Float64Array, radius_mm: float
+) -> tuple[Float64Array, Float64Array]:
     """Return points of the expected outline, and unit vectors out of it."""
     outline = contour(camera, center[:3], radius_mm, ANGLES)
     outward = outline - outline.mean(axis=0)
     return outline, outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
-def _in_image(pixels: FloatArray, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+def _in_image(pixels: Float64Array, shape: tuple[int, ...], margin: float) -> BoolArray:
     height, width = shape
     low = (pixels > margin).all(axis=1)
     return np.asarray(
@@ -429,7 +431,7 @@ def _in_image(pixels: FloatArray, shape: tuple[int, ...], margin: float) -> NDAr
     )
 
 
-def _alone(edges: FloatArray, camera: CameraPose, radius_mm: float) -> FloatArray:
+def _alone(edges: Float64Array, camera: CameraPose, radius_mm: float) -> Float64Array:
     """Return a centre from one outline: by the axis and angle of its cone."""
     rays = camera.rays(edges)
     # rays of a cone end in a plane: rays @ a = 1 with a along the axis
@@ -440,8 +442,8 @@ def _alone(edges: FloatArray, camera: CameraPose, radius_mm: float) -> FloatArra
 
 
 def _outline_px(
-    camera: CameraPose, edges: FloatArray, sphere: FloatArray, radius_mm: float
-) -> FloatArray:
+    camera: CameraPose, edges: Float64Array, sphere: Float64Array, radius_mm: float
+) -> Float64Array:
     """Return how far edges are outside the outline, px near the image's middle."""
     radius = sphere[3] if len(sphere) == 4 else radius_mm
     to_center = sphere[:3] - camera.center_mm
@@ -453,17 +455,17 @@ def _outline_px(
 
 
 def _fit(
-    outlines: Mapping[str, FloatArray],
+    outlines: Mapping[str, Float64Array],
     cameras: Mapping[str, CameraPose],
-    start: FloatArray,
+    start: Float64Array,
     radius_mm: float,
     *,
     free_radius: bool = False,
-) -> tuple[FloatArray, float, FloatArray]:
+) -> tuple[Float64Array, float, Float64Array]:
     """Return centre (and radius), the edges' noise and the normal matrix of a robust fit."""
     sphere = np.append(start[:3], radius_mm) if free_radius else np.array(start[:3])
 
-    def residuals(at: FloatArray) -> FloatArray:
+    def residuals(at: Float64Array) -> Float64Array:
         parts = [_outline_px(cameras[n], e, at, radius_mm) for n, e in outlines.items()]
         return np.concatenate(parts)
 

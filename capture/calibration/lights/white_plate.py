@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.geometry.board import Sighting, find_markers
 from capture.calibration.geometry.bundle import BoardPlace
 
 __all__ = ["PlateSamples", "PlateWindow", "WhitePlate"]
 
-FloatArray = NDArray[np.float64]
 
 CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
 LEAST_PIXELS = 12  # of a part in an image
@@ -57,7 +57,7 @@ class WhitePlate:
     slope_rad: float = 1e-3
 
     @cached_property
-    def points_mm(self) -> FloatArray:
+    def points_mm(self) -> Float64Array:
         """Corners of the markers, clockwise from each one's top left, shape (32, 3)."""
         steps = [
             (self.margin_mm, (side - self.marker_mm) / 2, side - self.marker_mm - self.margin_mm)
@@ -70,7 +70,7 @@ class WhitePlate:
         return np.column_stack([corners, np.zeros(len(corners))])
 
     @cached_property
-    def bare_mm(self) -> tuple[FloatArray, FloatArray]:
+    def bare_mm(self) -> tuple[Float64Array, Float64Array]:
         """Top left and bottom right corner of the bare white."""
         inset = self.margin_mm + self.marker_mm + EDGE_MM
         return np.array([inset, inset]), np.array(self.size_mm) - inset
@@ -108,15 +108,15 @@ class PlateSamples:
     view: str
     light: str
     on_s: float
-    rotation: FloatArray
-    part: NDArray[np.int64]
-    points_mm: FloatArray
-    pixels: FloatArray
-    signal: FloatArray
-    variance: FloatArray
+    rotation: Float64Array
+    part: Int64Array
+    points_mm: Float64Array
+    pixels: Float64Array
+    signal: Float64Array
+    variance: Float64Array
 
     @property
-    def normal(self) -> FloatArray:
+    def normal(self) -> Float64Array:
         """Of the plate, towards its front, rig frame, shape (3,)."""
         return -self.rotation[:, 2]
 
@@ -141,11 +141,11 @@ class PlateWindow:
 
     rows: slice
     columns: slice
-    part: NDArray[np.int64]
-    points_mm: FloatArray
-    pixels: FloatArray
-    count: NDArray[np.int64]
-    rotation: FloatArray
+    part: Int64Array
+    points_mm: Float64Array
+    pixels: Float64Array
+    count: Int64Array
+    rotation: Float64Array
 
     @classmethod
     def of(cls, camera: CameraPose, place: BoardPlace, plate: WhitePlate) -> PlateWindow | None:
@@ -192,9 +192,15 @@ class PlateWindow:
         )
 
     def sample(
-        self, rgb: NDArray, variance: NDArray, valid: NDArray[np.bool_], *, view: str, light: str,
+        self,
+        rgb: NDArray,
+        variance: NDArray,
+        valid: BoolArray,
+        *,
+        view: str,
+        light: str,
         on_s: float,
-    ) -> PlateSamples:  # fmt: skip
+    ) -> PlateSamples:
         """Return the mean of each part of the plate in a frame.
 
         Parameters

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
+from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
@@ -25,7 +26,6 @@ __all__ = [
     "modulated_pixels",
 ]
 
-Float = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 LEAST_MODULATION_SIGMAS = 5.0
@@ -55,14 +55,14 @@ class MalusFit:
         Scatter over its expectation without light jitter.
     """
 
-    zero_rad: Float
-    zero_stderr_rad: Float
-    leak: Float
-    leak_stderr: Float
-    extinction_lower: Float
-    extinction_upper: Float
-    light_jitter: Float
-    chi2_per_dof: Float
+    zero_rad: Float64Array
+    zero_stderr_rad: Float64Array
+    leak: Float64Array
+    leak_stderr: Float64Array
+    extinction_lower: Float64Array
+    extinction_upper: Float64Array
+    light_jitter: Float64Array
+    chi2_per_dof: Float64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,9 @@ class PolarizationCalibration:
     extinction_interval: tuple[tuple[float, float | None], ...]
     light_jitter: float
 
-    def crossed_leak(self, *, parallel_rad: float = 0.0, crossed_rad: float = np.pi / 2) -> Float:
+    def crossed_leak(
+        self, *, parallel_rad: float = 0.0, crossed_rad: float = np.pi / 2
+    ) -> Float64Array:
         """Return how much of polarized light passes crossed, over parallel, per color, shape (C,).
 
         Includes the analyser not standing exactly at its zero.
@@ -108,10 +110,7 @@ class PolarizationCalibration:
         ]
         return np.asarray(passed[0] / passed[1], dtype=np.float64)
 
-    def to_calibration(
-        self,
-        **about: Unpack[Provenance],
-    ) -> Calibration:
+    def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
         """Return this as a `Calibration` of kind "polarization" for one camera."""
         values = {
             "analyser_zero_rad": self.zero_rad,
@@ -244,9 +243,9 @@ def modulated_pixels(
     angles_rad: ArrayLike,
     images: Sequence[NDArray],
     *,
-    valid: NDArray[np.bool_] | None = None,
+    valid: BoolArray | None = None,
     share: float = 0.5,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return the pixels whose intensity follows the analyser most: the polarized target.
 
     Parameters
@@ -286,7 +285,9 @@ def modulated_pixels(
     return usable & (amplitude >= share * top) & (amplitude > 0)
 
 
-def _weighted(design: Float, y: Float, variance: Float) -> tuple[Float, Float, float]:
+def _weighted(
+    design: Float64Array, y: Float64Array, variance: Float64Array
+) -> tuple[Float64Array, Float64Array, float]:
     root = 1.0 / np.sqrt(variance)
     coefficients, *_ = np.linalg.lstsq(design * root[:, None], y * root, rcond=None)
     covariance = np.linalg.inv((design * root[:, None]).T @ (design * root[:, None]))
@@ -294,7 +295,9 @@ def _weighted(design: Float, y: Float, variance: Float) -> tuple[Float, Float, f
     return np.asarray(coefficients, dtype=np.float64), np.asarray(covariance), chi2
 
 
-def _with_jitter(design: Float, y: Float, variance: Float) -> tuple[Float, Float, float, float]:
+def _with_jitter(
+    design: Float64Array, y: Float64Array, variance: Float64Array
+) -> tuple[Float64Array, Float64Array, float, float]:
     """Fit with the relative scatter of the light that makes chi2 equal its degrees of freedom."""
     dof = max(len(y) - 3, 1)
     model = np.maximum(y, 0.0)
@@ -304,7 +307,7 @@ def _with_jitter(design: Float, y: Float, variance: Float) -> tuple[Float, Float
     for _ in range(8):
         if chi2_per_dof > 1.0:
 
-            def excess(j: float, model: Float = model) -> float:
+            def excess(j: float, model: Float64Array = model) -> float:
                 return _weighted(design, y, variance + (j * model) ** 2)[2] - dof
 
             jitter = (
@@ -315,7 +318,9 @@ def _with_jitter(design: Float, y: Float, variance: Float) -> tuple[Float, Float
     return coefficients, covariance * max(chi2 / dof, 1.0), jitter, chi2_per_dof
 
 
-def _fit_curve(design: Float, y: Float, variance: Float | None) -> tuple[float, ...]:
+def _fit_curve(
+    design: Float64Array, y: Float64Array, variance: Float64Array | None
+) -> tuple[float, ...]:
     dof = len(y) - 3
     if variance is None:
         coefficients, covariance, chi2 = _weighted(design, y, np.ones_like(y))

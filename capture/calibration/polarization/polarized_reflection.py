@@ -6,18 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import Float64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.polarization.malus import PolarizationError
 from capture.rig import Light
 
 __all__ = ["Reflection", "fresnel_amplitudes"]
 
-FloatArray = NDArray[np.float64]
 
-
-def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[FloatArray, FloatArray]:
+def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Float64Array]:
     """Return Fresnel's amplitudes of reflection, across (s) and in (p) the plane of incidence.
 
     Parameters
@@ -69,14 +68,14 @@ class Reflection:
         Refractive index of the facets.
     """
 
-    to_light: FloatArray
-    to_camera: FloatArray
-    normal: FloatArray
-    light_right: FloatArray
-    light_up: FloatArray
-    axis_rad: FloatArray
-    image_right: FloatArray
-    image_up: FloatArray
+    to_light: Float64Array
+    to_camera: Float64Array
+    normal: Float64Array
+    light_right: Float64Array
+    light_up: Float64Array
+    axis_rad: Float64Array
+    image_right: Float64Array
+    image_up: Float64Array
     analyser_rad: float
     eta: float
 
@@ -88,9 +87,9 @@ class Reflection:
         analyser_deg: float,
         eta: float,
         *,
-        to_light: FloatArray,
-        to_camera: FloatArray,
-        facing: FloatArray | None = None,
+        to_light: Float64Array,
+        to_camera: Float64Array,
+        facing: Float64Array | None = None,
     ) -> Self:
         """Return the reflection by facets that mirror each light into the camera.
 
@@ -135,7 +134,7 @@ class Reflection:
             eta,
         )
 
-    def moved(self, to_light: FloatArray, eta: float) -> Self:
+    def moved(self, to_light: Float64Array, eta: float) -> Self:
         """Return the reflection with lights in other directions, and of another index.
 
         Parameters
@@ -148,7 +147,7 @@ class Reflection:
         normal = _unit(light + self.to_camera)
         return replace(self, to_light=light, normal=normal, eta=eta)
 
-    def fields(self, turn_rad: ArrayLike = 0.0) -> FloatArray:
+    def fields(self, turn_rad: ArrayLike = 0.0) -> Float64Array:
         """Return the reflected fields, shape (L, 2, 2).
 
         Parameters
@@ -185,7 +184,7 @@ class Reflection:
         zero_rad: ArrayLike = 0.0,
         light_leak: ArrayLike = 0.0,
         analyser_leak: ArrayLike = 0.0,
-    ) -> FloatArray:
+    ) -> Float64Array:
         """Return what reaches the sensor of each light, shape (E, L).
 
         Parameters
@@ -221,19 +220,19 @@ class Reflection:
             rows.append(behind[:, 0] + light * behind[:, 1])
         return np.array(rows)
 
-    def _image_axes(self) -> tuple[FloatArray, FloatArray]:
+    def _image_axes(self) -> tuple[Float64Array, Float64Array]:
         """Return the image's right and up made perpendicular to each ray, shapes (L, 3)."""
         camera = self.to_camera
         x = _unit(self.image_right - (camera @ self.image_right)[:, None] * camera)
         return x, _cross(camera, x)
 
     @staticmethod
-    def _in_image(vectors: FloatArray, axes: tuple[FloatArray, FloatArray]) -> FloatArray:
+    def _in_image(vectors: Float64Array, axes: tuple[Float64Array, Float64Array]) -> Float64Array:
         """Return components of vectors (L, n, 3) across each ray, shape (L, n, 2)."""
         return np.stack([np.sum(vectors * axis[:, None], axis=-1) for axis in axes], axis=-1)
 
 
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+def _cross(first: Float64Array, second: Float64Array) -> Float64Array:
     """Return cross products of rows of three, as `numpy.cross` in a fifth of its time."""
     out = np.empty(np.broadcast_shapes(first.shape, second.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -242,5 +241,5 @@ def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
     return out
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -3,9 +3,4 @@
 from capture.calibration.sensor.noise_model import SensorCalibration, photon_transfer
 from capture.calibration.sensor.transfer_curve import FlatPair, PhotonTransferError
 
-__all__ = [
-    "FlatPair",
-    "PhotonTransferError",
-    "SensorCalibration",
-    "photon_transfer",
-]
+__all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]

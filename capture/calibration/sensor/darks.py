@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.sensor.transfer_curve import plane
 
 __all__ = ["Darks", "pool", "reduce_darks"]
 
-Float = NDArray[np.float64]
 
 HOT_SIGMAS = 6.0
 
@@ -41,11 +40,11 @@ class Darks:
     dof: float
     dsnu_dn: tuple[float, float]
     slope_dn_per_s: tuple[float, float] | None
-    good: tuple[NDArray[np.bool_], ...]
+    good: tuple[BoolArray, ...]
 
 
 def reduce_darks(
-    darks: Sequence[NDArray[np.uint16]],
+    darks: Sequence[UInt16Array],
     exposures_s: Sequence[float] | None,
     positions: tuple[tuple[int, int], ...],
     pattern: str,
@@ -107,7 +106,7 @@ def reduce_darks(
     )
 
 
-def _common_spread(a: Float, b: Float, ok: NDArray[np.bool_]) -> tuple[float, float]:
+def _common_spread(a: Float64Array, b: Float64Array, ok: BoolArray) -> tuple[float, float]:
     """Spread common to two independent averages: root of their covariance, with its error."""
     x, y = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
     covariance = float(x @ y) / (x.size - 1)

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
+
+from capture.arrays import Float64Array
 
 __all__ = ["SmoothField", "fit_smooth_field", "pixel_response"]
-
-Float = NDArray[np.float64]
 
 
 @cache
@@ -24,7 +23,9 @@ def _count(terms: int) -> int:
     return degree
 
 
-def _basis(rows: Float, columns: Float, shape: tuple[int, int], degree: int) -> tuple[Float, Float]:
+def _basis(
+    rows: Float64Array, columns: Float64Array, shape: tuple[int, int], degree: int
+) -> tuple[Float64Array, Float64Array]:
     """Legendre polynomials of the coordinates scaled to [-1, 1], each (n, degree + 1)."""
     v = 2.0 * rows / max(shape[0] - 1, 1) - 1.0
     u = 2.0 * columns / max(shape[1] - 1, 1) - 1.0
@@ -50,17 +51,17 @@ class SmoothField:
         What the samples are at the image's center, in their unit.
     """
 
-    coefficients: Float
-    covariance: Float
+    coefficients: Float64Array
+    covariance: Float64Array
     residual: float
     level: float = 1.0
 
     @property
-    def stderr(self) -> Float:
+    def stderr(self) -> Float64Array:
         """Standard errors of the coefficients, shape (T,)."""
         return np.sqrt(np.diag(self.covariance)).astype(np.float64)
 
-    def evaluate_stderr(self, height: int, width: int) -> Float:
+    def evaluate_stderr(self, height: int, width: int) -> Float64Array:
         """Return the standard error of the field on every pixel of an image, shape (H, W)."""
         scales, vectors = np.linalg.eigh(self.covariance)
         total = np.zeros((height, width))
@@ -68,7 +69,7 @@ class SmoothField:
             total += scale * SmoothField(vector, self.covariance, 0.0).evaluate(height, width) ** 2
         return np.sqrt(total)
 
-    def evaluate(self, height: int, width: int) -> Float:
+    def evaluate(self, height: int, width: int) -> Float64Array:
         """Return the field on every pixel of an image, shape (H, W)."""
         degree = _count(self.coefficients.size)
         p, q = _basis(
@@ -84,13 +85,13 @@ class SmoothField:
 
 
 def fit_smooth_field(
-    values: Float,
-    rows: Float,
-    columns: Float,
+    values: Float64Array,
+    rows: Float64Array,
+    columns: Float64Array,
     *,
     shape: tuple[int, int],
     degree: int = 4,
-    weight: Float | None = None,
+    weight: Float64Array | None = None,
 ) -> SmoothField:
     """Fit a polynomial field to scattered samples and scale it to 1 at the image's center.
 
@@ -153,7 +154,7 @@ def fit_smooth_field(
     )
 
 
-def pixel_response(first: Float, second: Float, *, block: int) -> tuple[float, float]:
+def pixel_response(first: Float64Array, second: Float64Array, *, block: int) -> tuple[float, float]:
     """Return the relative pixel-to-pixel spread of sensitivity and its standard error.
 
     The covariance of two independent averages of flats, after a quadratic surface is taken off

@@ -11,10 +11,7 @@ __all__ = ["fit_linearity"]
 
 
 def fit_linearity(
-    pairs: Sequence[FlatPair],
-    positions: tuple[tuple[int, int], ...],
-    pattern: str,
-    dark: Darks,
+    pairs: Sequence[FlatPair], positions: tuple[tuple[int, int], ...], pattern: str, dark: Darks
 ) -> tuple[float, float, float, float]:
     """Fit the response of one color to the amount of light.
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from capture.arrays import Float32Array, Float64Array
 from capture.raw import RawFrame
 
 __all__ = ["channel_levels", "neutral_mosaic"]
@@ -12,7 +13,7 @@ __all__ = ["channel_levels", "neutral_mosaic"]
 _COLORS = "RGB"
 
 
-def channel_levels(frame: RawFrame) -> NDArray[np.float64]:
+def channel_levels(frame: RawFrame) -> Float64Array:
     """Return the median of each channel above black, fraction of full scale, shape (3,).
 
     Of a frame that shows gray things only these are the color of the light.
@@ -25,7 +26,7 @@ def channel_levels(frame: RawFrame) -> NDArray[np.float64]:
     return np.array([float(np.mean(levels[color])) for color in _COLORS])
 
 
-def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> NDArray[np.float32]:
+def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> Float32Array:
     """Return a gray image of the sensor's full resolution, without interpolation.
 
     Parameters

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import Float64Array, UInt16Array
 from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 from capture.calibration.sensor.darks import Darks, pool, reduce_darks
 from capture.calibration.sensor.flat_field import SmoothField, fit_smooth_field, pixel_response
@@ -28,7 +28,6 @@ from capture.calibration.sensor.transfer_curve import (
 
 __all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
 
-Float = NDArray[np.float64]
 
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
@@ -115,7 +114,7 @@ class SensorCalibration:
         offset = (float(self.mean_read_noise_e().value) / gain) ** 2 + QUANTIZATION_DN2
         return 1.0 / (gain * span), offset / span**2
 
-    def flat_mosaic(self, height: int, width: int) -> Float:
+    def flat_mosaic(self, height: int, width: int) -> Float64Array:
         """Return the flat field on the CFA, shape (H, W), 1 at the center of each color."""
         mosaic = np.empty((height, width))
         step = 1 if self.pattern == "MONO" else 2
@@ -125,10 +124,7 @@ class SensorCalibration:
                 mosaic[row::step, column::step] = full[row::step, column::step]
         return mosaic
 
-    def to_calibration(
-        self,
-        **about: Unpack[Provenance],
-    ) -> Calibration:
+    def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
         """Return this as a `Calibration` of kind "sensor" for one camera."""
         values: dict[str, Quantity] = {name: getattr(self, name) for name in _PER_COLOR}
         if self.dark_e_per_s is not None:
@@ -192,7 +188,7 @@ _PER_COLOR = (
 
 def photon_transfer(
     pairs: Sequence[FlatPair],
-    darks: Sequence[NDArray[np.uint16]],
+    darks: Sequence[UInt16Array],
     *,
     white_dn: int,
     pattern: str = "RGGB",
@@ -288,7 +284,7 @@ def photon_transfer(
 
 def _check_frames(
     pairs: Sequence[FlatPair],
-    darks: Sequence[NDArray[np.uint16]],
+    darks: Sequence[UInt16Array],
     dark_exposures_s: Sequence[float] | None,
 ) -> tuple[int, int]:
     if len({pair.light for pair in pairs}) < 3:
@@ -327,9 +323,7 @@ def _fixed_pattern(
     for position, black, good in zip(positions, dark.black_dn, dark.good, strict=True):
         sums = [
             np.where(
-                good,
-                np.sum([plane(f, position, pattern) - black for f in frames], axis=0),
-                np.nan,
+                good, np.sum([plane(f, position, pattern) - black for f in frames], axis=0), np.nan
             )
             for frames in ([p.first for p in pairs], [p.second for p in pairs])
         ]

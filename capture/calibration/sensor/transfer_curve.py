@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.record import CalibrationError
 
 __all__ = [
@@ -24,7 +25,6 @@ __all__ = [
     "fit_curve",
 ]
 
-Float = NDArray[np.float64]
 
 LOW_SIGNAL_SHARE = 0.4  # of the white level: below it nothing saturates in a usable sensor
 COMPRESSED = 0.5  # variance over its prediction below which a block counts as saturated
@@ -48,8 +48,8 @@ class FlatPair:
         Relative amount of light (flash power times exposure where it matters), > 0.
     """
 
-    first: NDArray[np.uint16]
-    second: NDArray[np.uint16]
+    first: UInt16Array
+    second: UInt16Array
     light: float
 
     def __post_init__(self) -> None:
@@ -81,10 +81,10 @@ class Blocks:
         Light of the first frame over that of the second.
     """
 
-    signal: Float
-    variance: Float
-    dof: Float
-    clipped: NDArray[np.bool_]
+    signal: Float64Array
+    variance: Float64Array
+    dof: Float64Array
+    clipped: BoolArray
     ratio: float
 
 
@@ -110,7 +110,7 @@ class CurveFit:
 
     offset_dn2: float
     slope_dn: float
-    covariance: Float
+    covariance: Float64Array
     chi2_per_dof: float
     saturation_dn: float
     saturated_by: str
@@ -141,13 +141,13 @@ def cfa_planes(pattern: str) -> dict[str, tuple[tuple[int, int], ...]]:
     }
 
 
-def plane(frame: NDArray, position: tuple[int, int], pattern: str) -> Float:
+def plane(frame: NDArray, position: tuple[int, int], pattern: str) -> Float64Array:
     """Return the pixels of one CFA position as float64, shape (H/2, W/2) (or all, for MONO)."""
     step = 1 if pattern == "MONO" else 2
     return np.asarray(frame[position[0] :: step, position[1] :: step], dtype=np.float64)
 
 
-def block_sums(image: Float, size: int) -> Float:
+def block_sums(image: Float64Array, size: int) -> Float64Array:
     """Sum an image over whole blocks of `size` x `size`, shape (H // size, W // size)."""
     rows, columns = image.shape[0] // size, image.shape[1] // size
     return (
@@ -156,12 +156,12 @@ def block_sums(image: Float, size: int) -> Float:
 
 
 def block_statistics(
-    first: Float,
-    second: Float,
+    first: Float64Array,
+    second: Float64Array,
     *,
     black_dn: float,
     white_dn: float,
-    good: NDArray[np.bool_],
+    good: BoolArray,
     block: int,
 ) -> Blocks:
     """Reduce a pair of planes to signal and temporal variance in blocks.
@@ -212,7 +212,9 @@ def block_statistics(
     )
 
 
-def _weighted_line(x: Float, y: Float, dof: Float) -> tuple[Float, Float, float]:
+def _weighted_line(
+    x: Float64Array, y: Float64Array, dof: Float64Array
+) -> tuple[Float64Array, Float64Array, float]:
     """Fit y = c0 + c1 x where y has relative error sqrt(2/dof); return fit, covariance, chi2/dof.
 
     The weights come from the fitted line, not from the scattered values, which would pull it down.
@@ -233,11 +235,7 @@ def _weighted_line(x: Float, y: Float, dof: Float) -> tuple[Float, Float, float]
 
 
 def fit_curve(
-    levels: Sequence[Blocks],
-    *,
-    dark_variance_dn2: float,
-    dark_dof: float,
-    range_dn: float,
+    levels: Sequence[Blocks], *, dark_variance_dn2: float, dark_dof: float, range_dn: float
 ) -> CurveFit:
     """Fit the photon transfer line through blocks below saturation and the darks.
 
@@ -267,7 +265,7 @@ def fit_curve(
     dof = np.concatenate([b.dof for b in levels])
     clipped = np.concatenate([b.clipped for b in levels])
 
-    def fit(chosen: NDArray[np.bool_]) -> tuple[Float, Float, float]:
+    def fit(chosen: BoolArray) -> tuple[Float64Array, Float64Array, float]:
         if chosen.sum() < 4 or np.ptp(x[chosen]) < 0.05 * range_dn:
             raise PhotonTransferError(
                 f"photon transfer: {int(chosen.sum())} blocks below saturation, spanning"

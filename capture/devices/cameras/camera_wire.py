@@ -27,8 +27,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from capture.arrays import UInt16Array
 from capture.devices import wire
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger
 
@@ -146,7 +146,7 @@ def frame_to_message(frame: Frame) -> tuple[dict[str, Any], bytes]:
 
 def frame_from_message(table: Mapping[str, Any], blob: bytes) -> Frame:
     """Return the frame that `frame_to_message` was given; raise `BadMessage`."""
-    image: NDArray[np.uint16] | bytes = blob
+    image: UInt16Array | bytes = blob
     try:
         if "shape" in table:
             height, width = (int(side) for side in table["shape"])

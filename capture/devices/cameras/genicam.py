@@ -276,9 +276,12 @@ class GenicamCamera:
             )
         try:
             image = self._readout.pixel_format.unpack(
-                data, width_px=size[0], height_px=size[1], padding_bytes=padding,
+                data,
+                width_px=size[0],
+                height_px=size[1],
+                padding_bytes=padding,
                 big_endian=big_endian,
-            )  # fmt: skip
+            )
         except ValueError as error:
             raise FrameRefused(f"{self._url}: {error}") from error
         self._check_stamp(start_s)

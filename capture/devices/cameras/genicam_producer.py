@@ -24,10 +24,16 @@ SEARCH_PATH = "GENICAM_GENTL64_PATH"
 
 # what a camera answers to a wrong request; anything else means that it does not answer
 _REFUSALS = (
-    "AccessException", "OutOfRangeException", "InvalidArgumentException", "LogicalErrorException",
-    "PropertyException", "InvalidParameterException", "InvalidValueException",
-    "NotImplementedException", "NotAvailableException",
-)  # fmt: skip
+    "AccessException",
+    "OutOfRangeException",
+    "InvalidArgumentException",
+    "LogicalErrorException",
+    "PropertyException",
+    "InvalidParameterException",
+    "InvalidValueException",
+    "NotImplementedException",
+    "NotAvailableException",
+)
 _BUSY = ("AccessDeniedException", "ResourceInUseException", "BusyException")
 
 # the library logs what it then raises, with a traceback; the error says it once

@@ -19,11 +19,17 @@ _DN_UNITS = ("dn", "lsb", "adu", "count", "counts", "digital number")
 
 # what would make values or times depend on something else, where a camera has it
 _RAW_SETTINGS = (
-    ("TriggerSelector", "FrameStart"), ("AcquisitionMode", "Continuous"),
-    ("AcquisitionFrameRateEnable", False), ("ExposureMode", "Timed"), ("ExposureAuto", "Off"),
-    ("GainAuto", "Off"), ("BlackLevelAuto", "Off"), ("BalanceWhiteAuto", "Off"),
-    ("GammaEnable", False), ("LUTEnable", False),
-)  # fmt: skip
+    ("TriggerSelector", "FrameStart"),
+    ("AcquisitionMode", "Continuous"),
+    ("AcquisitionFrameRateEnable", False),
+    ("ExposureMode", "Timed"),
+    ("ExposureAuto", "Off"),
+    ("GainAuto", "Off"),
+    ("BlackLevelAuto", "Off"),
+    ("BalanceWhiteAuto", "Off"),
+    ("GammaEnable", False),
+    ("LUTEnable", False),
+)
 
 
 @dataclass(frozen=True, slots=True)

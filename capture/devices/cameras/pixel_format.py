@@ -12,12 +12,18 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from capture.arrays import UInt8Array, UInt16Array
 
 _NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG))(8|10|12|14|16)(p|Packed|)")
 _PACKED = {"p": (10, 12, 14), "Packed": (10, 12)}
-_PATTERNS = {"BayerRG": "RGGB", "BayerGR": "GRBG", "BayerGB": "GBRG", "BayerBG": "BGGR",
-             "Mono": "MONO"}  # fmt: skip
+_PATTERNS = {
+    "BayerRG": "RGGB",
+    "BayerGR": "GRBG",
+    "BayerGB": "GBRG",
+    "BayerBG": "BGGR",
+    "Mono": "MONO",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,7 @@ class PixelFormat:
         height_px: int,
         padding_bytes: int = 0,
         big_endian: bool = False,
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Return the sensor values of a frame's bytes.
 
         Parameters
@@ -127,7 +133,7 @@ class PixelFormat:
             self._unpack_gapless(lines, out)
         return out
 
-    def _unpack_gapless(self, lines: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
+    def _unpack_gapless(self, lines: UInt8Array, out: UInt16Array) -> None:
         group_px = 8 // math.gcd(self.bits, 8)
         group_bytes = group_px * self.bits // 8
         for pixel in range(group_px):

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration import geometry
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
+from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
 from reconstruction.pipeline.evidence import Evidence
 
@@ -26,7 +26,7 @@ class Dome:
     """The lights, one row for each of ``images.lights``."""
     lights: LightTable
     """One row for each of ``images.captures``."""
-    response: tuple[NDArray[np.float32], ...]
+    response: tuple[Float32Array, ...]
     """Response of each camera at the pixels of its images, (h, w, 3)."""
     absolute: bool
     """Whether the lights' intensities are known, and so the albedo."""
@@ -50,7 +50,7 @@ class Dome:
         return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
 
 
-def seen_from(dome: Dome, rotation: NDArray[np.float64], shift_mm: NDArray[np.float64]) -> Dome:
+def seen_from(dome: Dome, rotation: Float64Array, shift_mm: Float64Array) -> Dome:
     """Return the dome in the frame of a mesh that stands in it at ``rotation @ p + shift_mm``.
 
     Parameters
@@ -108,9 +108,10 @@ def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
         poses = geometry.poses_from(found, rig.subset(views=images.views))
         cameras = tuple(poses[view.name] for view in views)
     lit = evidence.load(
-        "lights", images.lights,
+        "lights",
+        images.lights,
         "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
-    )  # fmt: skip
+    )
     lights_rig = rig.subset(lights=images.lights)
     lights = LightTable.nominal(lights_rig)
     # a calibration from spheres alone says nothing of strengths, one from the plate none of places
@@ -140,14 +141,20 @@ def rows(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
     kept = {
         field: getattr(lights, field)[order]
         for field in (
-            "position_mm", "intensity", "exponent", "axis", "valid",
-            "position_stderr_mm", "intensity_stderr", "exponent_stderr",
+            "position_mm",
+            "intensity",
+            "exponent",
+            "axis",
+            "valid",
+            "position_stderr_mm",
+            "intensity_stderr",
+            "exponent_stderr",
         )
-    }  # fmt: skip
+    }
     return dataclasses.replace(lights, names=tuple(names), **kept)
 
 
-def _response(lights: LightTable, camera: CameraPose) -> NDArray[np.float32]:
+def _response(lights: LightTable, camera: CameraPose) -> Float32Array:
     width, height = camera.image_size
     row, column = np.mgrid[0 : height // 2, 0 : width // 2]
     pixels = 2.0 * np.stack([column, row], axis=-1) + 0.5

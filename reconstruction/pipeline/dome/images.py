@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import hdr, raw
 from capture.session import FrameRecord, Session
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.hold_out import NOTHING, HoldOut
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["DomeImage", "DomeImages", "SensorNoise"]
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +33,12 @@ class DomeImage:
         (h, w) bool; False where every exposure is saturated.
     """
 
-    rgb: Float32
-    variance: Float32
-    valid: NDArray[np.bool_]
+    rgb: Float32Array
+    variance: Float32Array
+    valid: BoolArray
 
     @staticmethod
-    def from_sensor_px(pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    def from_sensor_px(pixels: FloatArray) -> Float64Array:
         """Return where positions on the sensor, (..., 2) column and row in px, lie in ``rgb``.
 
         Examples
@@ -111,7 +109,7 @@ class DomeImages:
         )
         kept = [-1] if merge else exposures
         self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
-        self._darks: dict[str, tuple[Float32, Float32] | None] = {}
+        self._darks: dict[str, tuple[Float32Array, Float32Array] | None] = {}
 
     def apart(self) -> DomeImages:
         """Return the same images with each exposure one of its own."""
@@ -161,7 +159,7 @@ class DomeImages:
             raise EvidenceError(f"{self._session.path}: lacks camera {view}, light {light}")
         return shots
 
-    def _dark(self, view: str) -> tuple[Float32, Float32] | None:
+    def _dark(self, view: str) -> tuple[Float32Array, Float32Array] | None:
         """Return the rate of what is seen without any LED, and its variance."""
         if view not in self._darks:
             records = [r for r in self._session.frames("dark") if r.camera == view]
@@ -174,7 +172,7 @@ class DomeImages:
 
     def _merge(
         self, view: str, frames: Sequence[raw.RawFrame], levels: Sequence[float]
-    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
         """Merge mosaics to fractions of full scale per second at level 1."""
         first = frames[0]
         serial = self._session.rig.view(view).serial

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration.geometry import CameraPose
 from capture.session import Session
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.registration import head_motion
@@ -29,7 +29,7 @@ class HalfPixels:
         self._camera = camera
         self.center_mm = camera.center_mm
 
-    def project(self, points_mm: NDArray[np.floating]) -> NDArray[np.float64]:
+    def project(self, points_mm: FloatArray) -> Float64Array:
         """Return column and row in pixels of the images."""
         return DomeImage.from_sensor_px(self._camera.project(points_mm))
 
@@ -50,10 +50,10 @@ class Motion:
         How far the face's points were from their mean place, root mean square, (N,).
     """
 
-    poses: NDArray[np.float64]
-    usable: NDArray[np.bool_]
+    poses: Float64Array
+    usable: BoolArray
     head: head_motion.HeadMotion
-    displacement_mm: NDArray[np.float64]
+    displacement_mm: Float64Array
     still: bool
     """Whether the head hardly moved: then exposures can be merged and poses ignored."""
 
@@ -150,7 +150,7 @@ def _time_s(record: Any) -> float:
     return float(time)
 
 
-def _gray(session: Session, record: Any) -> NDArray[np.float32]:
+def _gray(session: Session, record: Any) -> Float32Array:
     """Return a tracking frame over its light: their levels and exposures differ."""
     frame = session.read(record)
     light = float(record.settings.get("level", 1.0)) * float(frame.exposure_s or 1.0)

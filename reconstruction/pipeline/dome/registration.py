@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.pipeline.dome.calibrated import Dome, rows
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.scan import registration as scan_registration
@@ -37,7 +37,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
     chosen = spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
     shares = []
 
-    def stacks(view: int) -> NDArray[np.float32]:
+    def stacks(view: int) -> Float32Array:
         layers = []
         for capture in chosen:
             image = dome.image(view, capture)
@@ -65,7 +65,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         ) from exc
 
 
-def spread(position_mm: NDArray[np.float64], usable: NDArray[np.bool_], count: int) -> list[int]:
+def spread(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
     """Choose lights that light the face, each next one the farthest from those before."""
     way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
     front = np.flatnonzero(usable & (way[:, 2] > -0.1))

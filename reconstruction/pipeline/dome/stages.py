@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinMap
 from reconstruction import brdf_basis, photometric_stereo
+from reconstruction.arrays import Float64Array
 from reconstruction.lumitexels import Lumitexels, Surface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
@@ -70,9 +70,15 @@ def weight_names(rank: int = RANK) -> tuple[str, ...]:
 def maps_of(rank: int = RANK) -> tuple[str, ...]:
     """Return the names of the maps that can be made of a dome session."""
     return (
-        "position", "half_vector_normals", "normals", "r_d", *weight_names(rank), "lobe_residual",
-        "normals_refined", "samples",
-    )  # fmt: skip
+        "position",
+        "half_vector_normals",
+        "normals",
+        "r_d",
+        *weight_names(rank),
+        "lobe_residual",
+        "normals_refined",
+        "samples",
+    )
 
 
 REFINEMENTS = 2
@@ -111,10 +117,7 @@ class Samples:
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(evidence)
-    base: dict[str, Any] = {
-        "revision": REVISION,
-        "inputs": dict(sorted(evidence.hashes.items())),
-    }
+    base: dict[str, Any] = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     if evidence.hold_out:
         base["held_out"] = evidence.hold_out.record()
     weights_made = weight_names(evidence.rank or RANK)
@@ -129,44 +132,92 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     )
 
     def stage(
-        name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any, refused: str = "",
+        name: str,
+        needs: tuple[str, ...],
+        makes: tuple[str, ...],
+        run: Any,
+        refused: str = "",
         **more: Any,
-    ) -> stages.Stage:  # fmt: skip
+    ) -> stages.Stage:
         return stages.Stage(name, needs, makes, run, {**base, **more}, refused)
 
     return [
         stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
-        stage("texture", ("surface",), ("texture", "position", MESH_FILE),
-              lambda surface: _texture(dome, surface)),
-        stage("motion", ("surface",), ("motion",),
-              lambda surface: {"motion": _motion(evidence, dome, surface)}),
-        stage("lumitexels", ("surface", "motion"), ("lumitexels",),
-              lambda surface, motion: {
-                  "lumitexels": _lumitexels(dome, surface, motion)}),
-        stage("sample counts", ("lumitexels", "texture"), ("samples",),
-              lambda lumitexels, texture: _counts(dome, lumitexels, texture)),
-        stage("half-vector normals", ("lumitexels", "texture"), ("half_vector_normals",),
-              lambda lumitexels, texture: _half_vectors(dome, lumitexels, texture)),
-        stage("normals", ("surface", "lumitexels", "texture"), ("point_normals", "normals"),
-              lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture)),
-        stage("albedo", ("surface", "lumitexels", "point_normals", "texture"),
-              ("point_r_d", "r_d"),
-              lambda surface, lumitexels, point_normals, texture: _albedo(
-                  dome, surface, lumitexels, point_normals, texture), unscaled),
-        stage("lobes", ("lumitexels", "point_normals", "point_r_d"),
-              ("basis", "weights", "basis_file"),
-              lambda lumitexels, point_normals, point_r_d: _lobes(
-                  evidence, lumitexels, point_normals, point_r_d), ranks=list(RANKS)),
-        stage("refined normals",
-              ("surface", "lumitexels", "point_normals", "point_r_d", "basis", "weights",
-               "basis_file", "texture"),
-              ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
-              lambda surface, lumitexels, point_normals, point_r_d, basis, weights, basis_file,
-              texture: {
-                  BASIS_FILE: basis_file,
-                  **_refined(dome, surface, lumitexels, point_normals, point_r_d, basis, weights,
-                             texture)}),
-    ]  # fmt: skip
+        stage(
+            "texture",
+            ("surface",),
+            ("texture", "position", MESH_FILE),
+            lambda surface: _texture(dome, surface),
+        ),
+        stage(
+            "motion",
+            ("surface",),
+            ("motion",),
+            lambda surface: {"motion": _motion(evidence, dome, surface)},
+        ),
+        stage(
+            "lumitexels",
+            ("surface", "motion"),
+            ("lumitexels",),
+            lambda surface, motion: {"lumitexels": _lumitexels(dome, surface, motion)},
+        ),
+        stage(
+            "sample counts",
+            ("lumitexels", "texture"),
+            ("samples",),
+            lambda lumitexels, texture: _counts(dome, lumitexels, texture),
+        ),
+        stage(
+            "half-vector normals",
+            ("lumitexels", "texture"),
+            ("half_vector_normals",),
+            lambda lumitexels, texture: _half_vectors(dome, lumitexels, texture),
+        ),
+        stage(
+            "normals",
+            ("surface", "lumitexels", "texture"),
+            ("point_normals", "normals"),
+            lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture),
+        ),
+        stage(
+            "albedo",
+            ("surface", "lumitexels", "point_normals", "texture"),
+            ("point_r_d", "r_d"),
+            lambda surface, lumitexels, point_normals, texture: _albedo(
+                dome, surface, lumitexels, point_normals, texture
+            ),
+            unscaled,
+        ),
+        stage(
+            "lobes",
+            ("lumitexels", "point_normals", "point_r_d"),
+            ("basis", "weights", "basis_file"),
+            lambda lumitexels, point_normals, point_r_d: _lobes(
+                evidence, lumitexels, point_normals, point_r_d
+            ),
+            ranks=list(RANKS),
+        ),
+        stage(
+            "refined normals",
+            (
+                "surface",
+                "lumitexels",
+                "point_normals",
+                "point_r_d",
+                "basis",
+                "weights",
+                "basis_file",
+                "texture",
+            ),
+            ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
+            lambda surface, lumitexels, point_normals, point_r_d, basis, weights, file, texture: {
+                BASIS_FILE: file,
+                **_refined(
+                    dome, surface, lumitexels, point_normals, point_r_d, basis, weights, texture
+                ),
+            },
+        ),
+    ]
 
 
 def _dome(evidence: Evidence) -> Dome:
@@ -316,9 +367,7 @@ def _albedo(
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
     found = lumitexels.collect(
         lambda part, samples: estimates.albedo(
-            samples,
-            estimates.part_of(point_normals, part),
-            stderr_rad=typical,
+            samples, estimates.part_of(point_normals, part), stderr_rad=typical
         ),
         progress=partial(dome.tell, "albedo"),
     )
@@ -326,17 +375,17 @@ def _albedo(
     return {
         "point_r_d": found,
         "r_d": texture.map(
-            found.values, found.stderr, found.valid, "1",
+            found.values,
+            found.stderr,
+            found.valid,
+            "1",
             "diffuse reflectance, camera RGB over that of a perfect white",
         ),
-    }  # fmt: skip
+    }
 
 
 def _lobes(
-    evidence: Evidence,
-    lumitexels: Samples,
-    point_normals: PointValues,
-    point_r_d: PointValues,
+    evidence: Evidence, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
 ) -> Mapping[str, Any]:
     folder = evidence.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
@@ -373,11 +422,13 @@ def _lobes(
     basis = materials.mixed(mixes[rank][0])
     found = lumitexels.collect(
         lambda part, samples: estimates.lobe_weights(
-            samples, estimates.part_of(point_normals, part),
-            estimates.part_of(point_r_d, part), basis,
+            samples,
+            estimates.part_of(point_normals, part),
+            estimates.part_of(point_r_d, part),
+            basis,
         ),
         progress=partial(evidence.tell, "lobes"),
-    )  # fmt: skip
+    )
     return {
         "basis": basis,
         "weights": found.values[:, :rank],
@@ -385,9 +436,7 @@ def _lobes(
     }
 
 
-def _comparable(
-    shares: NDArray[np.float64], materials: BrdfBasis, *, least: int
-) -> NDArray[np.float64]:
+def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Float64Array:
     """Return mixtures scaled to reflect equally much, without those that no sample holds down.
 
     A lobe so narrow that no pair of light and view met it can have any share.
@@ -405,7 +454,7 @@ def _comparable(
 
 
 def _basis_bytes(
-    materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[NDArray[np.float64], float]]
+    materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[Float64Array, float]]
 ) -> bytes:
     """Keep the lobes, and of every rank the mixtures of materials that they would be."""
     mix = mixes[rank][0]
@@ -430,16 +479,19 @@ def _refined(
     point_normals: PointValues,
     point_r_d: PointValues,
     basis: BrdfBasis,
-    weights: NDArray[np.float64],
+    weights: Float64Array,
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap]:
     started = lumitexels.collect(
         lambda part, samples: estimates.normals_from_remainder(
-            samples, estimates.part_of(point_normals, part), estimates.part_of(point_r_d, part),
-            weights[part], basis,
+            samples,
+            estimates.part_of(point_normals, part),
+            estimates.part_of(point_r_d, part),
+            weights[part],
+            basis,
         ),
         progress=partial(dome.tell, "normals by what lobes leave"),
-    )  # fmt: skip
+    )
     known = point_normals.valid & point_r_d.valid
     inside = PointValues(
         np.where(started.valid[:, None], started.values, point_normals.values),
@@ -451,11 +503,15 @@ def _refined(
         normals, shares = found, weights
         found = lumitexels.collect(
             lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples, estimates.part_of(inside, part), estimates.part_of(point_r_d, part),
-                w[part], basis, now=n.values[part],
+                samples,
+                estimates.part_of(inside, part),
+                estimates.part_of(point_r_d, part),
+                w[part],
+                basis,
+                now=n.values[part],
             ),
             progress=partial(dome.tell, f"normals by all light, {turn + 1} of {REFINEMENTS}"),
-        )  # fmt: skip
+        )
         fitted = lumitexels.collect(
             lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
                 samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis

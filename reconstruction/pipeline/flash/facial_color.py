@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table
 from model.facial_color import HemoglobinRig
 from model.skin import UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.detectability import detectable
 from reconstruction.correspondence import expression_alignment
@@ -31,9 +31,6 @@ from reconstruction.facial_color.repeatability import Drift, Repeatability, Repe
 from reconstruction.facial_color.shared_melanin import SharedMelanin
 from reconstruction.pipeline.flash.stages import EXPOSURE_SPREAD
 from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
-
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 CORRELATED_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
@@ -66,9 +63,9 @@ class AlignedImage:
     """
 
     image: StateImage
-    rgb: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    valid: Mask
+    rgb: Float32Array
+    variance: Float32Array
+    valid: BoolArray
     alignment: Alignment | None
 
 
@@ -214,9 +211,12 @@ def fit(
     )
     good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
     melanin = SkinMap(
-        np.where(good, shared.melanin, 0.0), UNITS["melanin"],
-        np.where(good, shared.stderr_melanin, 0.0), good, f"shared by {len(kept)} states",
-    )  # fmt: skip
+        np.where(good, shared.melanin, 0.0),
+        UNITS["melanin"],
+        np.where(good, shared.stderr_melanin, 0.0),
+        good,
+        f"shared by {len(kept)} states",
+    )
     return FacialColorFit(
         rig=rig,
         melanin=melanin,
@@ -249,11 +249,13 @@ def _align(
         both = marks[0] is not None and marks[1] is not None
         try:
             alignment = expression_alignment.align(
-                _light(diffuse), _light(fixed),
+                _light(diffuse),
+                _light(fixed),
                 landmarks_moving=marks[0] if both else None,
                 landmarks_neutral=marks[1] if both else None,
-                valid_moving=_valid(diffuse), valid_neutral=_valid(fixed),
-            )  # fmt: skip
+                valid_moving=_valid(diffuse),
+                valid_neutral=_valid(fixed),
+            )
         except expression_alignment.AlignmentError as error:
             left_out.append((image.name, str(error)))
             continue
@@ -267,7 +269,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
         return None
 
-    def over(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+    def over(name: str) -> tuple[Float32Array, Float32Array, BoolArray]:
         values, errors, good = [], [], []
         for one in aligned:
             found, noise = one.image.maps[name], one.image.maps[f"{name}_noise_stderr"]
@@ -292,15 +294,19 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
         return Repeats(compared, ())
     try:
         drifts = repeatability.drift(
-            melanin, states, [one.image.captured_s for one in aligned], stderr=melanin_error,
-            valid=melanin_good, correlated_px=CORRELATED_PX,
-        )  # fmt: skip
+            melanin,
+            states,
+            [one.image.captured_s for one in aligned],
+            stderr=melanin_error,
+            valid=melanin_good,
+            correlated_px=CORRELATED_PX,
+        )
     except RepeatabilityError:
         drifts = ()
     return Repeats(compared, drifts)
 
 
-def _light(diffuse: SkinMap) -> NDArray[np.float32]:
+def _light(diffuse: SkinMap) -> Float32Array:
     return np.where(_valid(diffuse)[..., None], diffuse.values, np.nan).astype(np.float32)
 
 
@@ -308,14 +314,15 @@ def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -
     stderr = np.zeros_like(diffuse.values) if diffuse.stderr is None else diffuse.stderr
     good = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
     return AlignedImage(
-        image, np.where(good[..., None], diffuse.values, 0.0),
-        np.where(good[..., None], stderr**2, 0.0), good, alignment,
-    )  # fmt: skip
+        image,
+        np.where(good[..., None], diffuse.values, 0.0),
+        np.where(good[..., None], stderr**2, 0.0),
+        good,
+        alignment,
+    )
 
 
-def _average(
-    images: list[AlignedImage],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+def _average(images: list[AlignedImage]) -> tuple[Float32Array, Float32Array, BoolArray]:
     return repeat_average.average(
         np.stack([one.rgb for one in images]),
         np.stack([one.variance for one in images]),
@@ -323,7 +330,7 @@ def _average(
     )
 
 
-def _model_error(averages: list[tuple[NDArray[np.float32], NDArray[np.float32], Mask]]) -> Floats:
+def _model_error(averages: list[tuple[Float32Array, Float32Array, BoolArray]]) -> Float64Array:
     """Return each pixel's model error: the mean of what those states tell that show it."""
     total = np.zeros((*averages[0][2].shape, 3, 3))
     count = np.zeros(averages[0][2].shape)
@@ -335,7 +342,7 @@ def _model_error(averages: list[tuple[NDArray[np.float32], NDArray[np.float32], 
     return np.where((count > 0)[..., None, None], mean, model_error.color_errors().transport)
 
 
-def _own_error(images: list[AlignedImage]) -> Floats:
+def _own_error(images: list[AlignedImage]) -> Float64Array:
     """Return what a state's mean color errs by as its images were laid over another.
 
     Repeats move alike and err alike: their mean errs as one of them.
@@ -346,9 +353,12 @@ def _own_error(images: list[AlignedImage]) -> Floats:
         count += one.valid
         if one.alignment is not None:
             total += misplacement.own_error(
-                one.rgb, one.variance, one.valid, one.alignment,
+                one.rgb,
+                one.variance,
+                one.valid,
+                one.alignment,
                 light_window_px=shared_melanin.SHADING_WINDOW_PX,
-            )  # fmt: skip
+            )
     return np.asarray(total / np.maximum(count, 1.0)[..., None, None])
 
 
@@ -356,23 +366,27 @@ def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good = shared.valid_states[k] & ~shared.misfits[k]
     good &= detectable(shared.hemoglobin[k], shared.stderr_hemoglobin[k], good)
     return SkinMap(
-        np.where(good, shared.hemoglobin[k], 0.0), UNITS["hemoglobin"],
-        np.where(good, shared.stderr_hemoglobin[k], 0.0), good,
+        np.where(good, shared.hemoglobin[k], 0.0),
+        UNITS["hemoglobin"],
+        np.where(good, shared.stderr_hemoglobin[k], 0.0),
+        good,
         "given the melanin that all states share",
-    )  # fmt: skip
+    )
 
 
 def _change(shared: SharedMelanin, k: int) -> SkinMap:
     both = shared.valid_states[k] & shared.valid_states[shared.reference]
     good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
     return SkinMap(
-        np.where(good, shared.change[k], 0.0), UNITS["hemoglobin"],
-        np.where(good, shared.stderr_change[k], 0.0), good,
+        np.where(good, shared.change[k], 0.0),
+        UNITS["hemoglobin"],
+        np.where(good, shared.stderr_change[k], 0.0),
+        good,
         "less the neutral state; errors that both share are left out",
-    )  # fmt: skip
+    )
 
 
-def _valid(skin_map: SkinMap) -> Mask:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 

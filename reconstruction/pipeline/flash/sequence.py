@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan.multiplexed import phase_grid
 from capture.session import FrameRecord, Session
 from model.skin import SkinMap
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.chromophores import model_error
 from reconstruction.correspondence import expression_alignment, landmark_table
 from reconstruction.facial_color import perfusion_curves, perfusion_fit
@@ -42,9 +42,6 @@ BEND = 0.07
 and light that goes from skin to skin, of which the inversion knows nothing, is absorbed twice. Set
 on 14 events of seeds 0 to 19, 192 px across: the least with which 95 % intervals hold 92 % or
 more (93 %); with none they hold 87 %."""
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
@@ -156,7 +153,7 @@ def _state(records: Sequence[FrameRecord]) -> str:
 
 
 def _places(
-    evidence: Evidence, maps: Sequence[SkinMap], at_rest: Bools
+    evidence: Evidence, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
     """Return where the places lie on the face at rest, px."""
     skin = (
@@ -186,8 +183,8 @@ def _places(
 
 
 def _laid_over_rest(
-    maps: Sequence[SkinMap], phase: Floats, prompt_s: float, evidence: Evidence
-) -> tuple[Bools, list[SkinMap]]:
+    maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, evidence: Evidence
+) -> tuple[BoolArray, list[SkinMap]]:
     """Tell in which frames the face has moved, and lay those over the face at rest."""
     settled_on = (phase > 0.5 * prompt_s) & (phase < prompt_s)
     settled_off = phase > 1.5 * prompt_s
@@ -218,22 +215,20 @@ def _laid_over_rest(
     return moved, laid
 
 
-def _mean(maps: Sequence[SkinMap], chosen: Bools) -> tuple[NDArray[np.float32], Bools]:
+def _mean(maps: Sequence[SkinMap], chosen: BoolArray) -> tuple[Float32Array, BoolArray]:
     picked = [m for m, take in zip(maps, chosen, strict=True) if take]
     valid = np.logical_and.reduce([sequence_blood.usable(m) for m in picked])
     mean = np.asarray(np.mean([m.values for m in picked], axis=0, dtype=np.float64), np.float32)
     return mean, np.asarray(valid, bool)
 
 
-def _more_like(
-    image: SkinMap, one: NDArray[np.float32], other: NDArray[np.float32], both: Bools
-) -> bool:
+def _more_like(image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray) -> bool:
     """Tell whether a frame is more like one picture than like another, in red: blood's least."""
     good = both & sequence_blood.usable(image)
     if not good.any():
         return False
 
-    def distance(template: NDArray[np.float32]) -> float:
+    def distance(template: Float32Array) -> float:
         ratio = np.log(image.values[good, 0]) - np.log(template[good, 0])
         return float(np.mean(np.abs(ratio - np.median(ratio))))
 
@@ -241,8 +236,8 @@ def _more_like(
 
 
 def _of_cycle(
-    time: Floats,
-    phase: Floats,
+    time: Float64Array,
+    phase: Float64Array,
     blood: sequence_blood.PlaceBlood,
     prompt_s: float,
     session: Session,
@@ -294,8 +289,8 @@ def _of_cycle(
 
 
 def _fit_prompts(
-    phase: Floats,
-    known: Bools,
+    phase: Float64Array,
+    known: BoolArray,
     blood: sequence_blood.PlaceBlood,
     which: Sequence[int],
     cycle_s: float,
@@ -307,13 +302,17 @@ def _fit_prompts(
     stderr = np.array([_not_too_small(row) for row in blood.means.stderr[which][:, known] * slope])
     of_pose = blood.stderr_of_pose[which] * np.nanmean(slope, axis=1)
     found = perfusion_fit.fit_cycle(
-        phase, root, cycle_s=cycle_s, stderr=stderr, bend=BEND,
+        phase,
+        root,
+        cycle_s=cycle_s,
+        stderr=stderr,
+        bend=BEND,
         pose=PoseStep(blood.moved[known], of_pose),
-    )  # fmt: skip
+    )
     return perfusion_fit.of_vessels(found)
 
 
-def _not_too_small(stderr: Floats) -> Floats:
+def _not_too_small(stderr: Float64Array) -> Float64Array:
     """Return standard errors that count no frame for much more than the usual one."""
     finite = stderr[np.isfinite(stderr)]
     usual = float(np.median(finite)) if finite.size else 0.0
@@ -321,7 +320,7 @@ def _not_too_small(stderr: Floats) -> Floats:
 
 
 def _of_event(
-    time: Floats, means: perfusion_curves.DiscMeans, names: Sequence[str]
+    time: Float64Array, means: perfusion_curves.DiscMeans, names: Sequence[str]
 ) -> dict[str, Any]:
     """Return the part of the document about what follows an event."""
     known = np.isfinite(time)
@@ -372,9 +371,7 @@ def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, An
     return document
 
 
-def _of_transition(
-    found: perfusion_curves.Transition, indices: NDArray[np.int64]
-) -> dict[str, Any]:
+def _of_transition(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
     return {
         "seen": found.seen,
         "decided": found.decided,

@@ -13,20 +13,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table
 from model.color_table import ColorTable
 from model.skin import SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from reconstruction.facial_color.perfusion_curves import DiscMeans, disc_means, disc_pixels
 from reconstruction.pipeline.flash import stages as flash_stages
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LIGHT_RADII, LEAST_LIGHT_PX = 3.0, 6.0
 """How smoothly the light of a place changes between frames: in radii of its disc, and px."""
@@ -45,7 +42,7 @@ class Light:
 
     table: ColorTable
     prior: ShadingPrior
-    model_error: NDArray[np.floating]
+    model_error: FloatArray
     """Relative covariance of the table's colors."""
 
     @staticmethod
@@ -64,10 +61,10 @@ class PlaceBlood:
 
     means: DiscMeans
     """Means and standard errors from frame to frame."""
-    stderr_of_pose: Floats
+    stderr_of_pose: Float64Array
     """(P,): standard error that all frames of a moved face share, against those at rest; 0 where
     nothing has moved."""
-    moved: Bools
+    moved: BoolArray
     """(N,): frames in which the face has moved."""
 
 
@@ -77,7 +74,7 @@ def blood_of_discs(
     radius_px: float,
     light: Light,
     *,
-    moved: Bools,
+    moved: BoolArray,
 ) -> PlaceBlood:
     """Return the mean blood of discs in each of some frames.
 
@@ -106,7 +103,7 @@ def blood_of_discs(
     return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 
-def usable(skin_map: SkinMap) -> Bools:
+def usable(skin_map: SkinMap) -> BoolArray:
     """Return where a map means something, (H, W)."""
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
@@ -118,7 +115,7 @@ def _of_place(
     place: tuple[float, float],
     radius_px: float,
     light: Light,
-    moved: Bools,
+    moved: BoolArray,
 ) -> tuple[DiscMeans, float]:
     shape = maps[0].values.shape[:2]
     window_px = max(LIGHT_RADII * radius_px, LEAST_LIGHT_PX)
@@ -132,7 +129,7 @@ def _of_place(
     variance = np.square([error[patch] for error in errors])
     at = {name: (place[0] - left, place[1] - top)}
 
-    def weighed(frames: Bools, smooth_px: float | None) -> DiscMeans:
+    def weighed(frames: BoolArray, smooth_px: float | None) -> DiscMeans:
         blood = shared_melanin.weigh(
             np.where(valid[frames][..., None], rgb[frames], np.nan),
             light.table,

@@ -22,6 +22,7 @@ from model import color_table
 from model.skin import UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import polarization
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
 from reconstruction.chromophores import face as face_chromophores
 from reconstruction.chromophores import posterior as chromophore_posterior
@@ -33,23 +34,30 @@ REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = (
-    "melanin", "hemoglobin", "shading", "residual", "gamut_distance",
-    "diffuse", "specular", "picture", "specular_picture",
-    "tsumura_melanin", "tsumura_hemoglobin",
-    "melanin_noise_stderr", "hemoglobin_noise_stderr",
-)  # fmt: skip
+    "melanin",
+    "hemoglobin",
+    "shading",
+    "residual",
+    "gamut_distance",
+    "diffuse",
+    "specular",
+    "picture",
+    "specular_picture",
+    "tsumura_melanin",
+    "tsumura_hemoglobin",
+    "melanin_noise_stderr",
+    "hemoglobin_noise_stderr",
+)
 """Maps that can be made of a flash session."""
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
     """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
 
-    rgb: Float32
-    variance: Float32
-    valid: NDArray[np.bool_]
+    rgb: Float32Array
+    variance: Float32Array
+    valid: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +71,7 @@ class Inputs:
     white: WhiteReference | None
     polarization: PolarizationCalibration | None
     color: ColorMatrix | None
-    neutral: NDArray[np.float64] | None
+    neutral: Float64Array | None
     """Camera RGB of a white surface, as the color matrix was fitted to."""
     camera: str
     """Name of the spectral sensitivities that the color table is built for."""
@@ -78,28 +86,49 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
     return [
         stages.Stage(
-            "frames", (), ("parallel", "crossed"), lambda: _frames(inputs),
+            "frames",
+            (),
+            ("parallel", "crossed"),
+            lambda: _frames(inputs),
             base | {"state": inputs.state, "repeat": inputs.repeat},
         ),
         stages.Stage(
-            "separation", ("parallel", "crossed"), ("diffuse", "specular"),
-            lambda parallel, crossed: _separate(inputs, parallel, crossed), base,
+            "separation",
+            ("parallel", "crossed"),
+            ("diffuse", "specular"),
+            lambda parallel, crossed: _separate(inputs, parallel, crossed),
+            base,
         ),
         stages.Stage(
-            "chromophores", ("diffuse",),
-            ("melanin", "hemoglobin", "shading", "residual", "gamut_distance",
-             "melanin_noise_stderr", "hemoglobin_noise_stderr"),
-            lambda diffuse: _chromophores(inputs, diffuse), table | model_error.identity(),
+            "chromophores",
+            ("diffuse",),
+            (
+                "melanin",
+                "hemoglobin",
+                "shading",
+                "residual",
+                "gamut_distance",
+                "melanin_noise_stderr",
+                "hemoglobin_noise_stderr",
+            ),
+            lambda diffuse: _chromophores(inputs, diffuse),
+            table | model_error.identity(),
         ),
         stages.Stage(
-            "tsumura", ("diffuse",), ("tsumura_melanin", "tsumura_hemoglobin"),
-            lambda diffuse: _tsumura(diffuse), base,
+            "tsumura",
+            ("diffuse",),
+            ("tsumura_melanin", "tsumura_hemoglobin"),
+            lambda diffuse: _tsumura(diffuse),
+            base,
         ),
         stages.Stage(
-            "pictures", ("diffuse", "specular"), ("picture", "specular_picture"),
-            lambda diffuse, specular: _pictures(inputs, diffuse, specular), table,
+            "pictures",
+            ("diffuse", "specular"),
+            ("picture", "specular_picture"),
+            lambda diffuse, specular: _pictures(inputs, diffuse, specular),
+            table,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def inputs_of(evidence: Evidence) -> Inputs:
@@ -124,9 +153,7 @@ def inputs_of(evidence: Evidence) -> Inputs:
         "color", [view.serial], "pictures show balanced camera RGB as if it were linear sRGB"
     )
     illuminant = session.rig.lights[0].illuminant
-    evidence.noted["color_table"] = {
-        "camera": view.spectral_sensitivity, "illuminant": illuminant
-    }  # fmt: skip
+    evidence.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
     return Inputs(
         session=session,
         state=evidence.state,
@@ -190,11 +217,7 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
 
 def _light_without_darks(
     inputs: Inputs,
-) -> tuple[
-    Callable[[FrameRecord], raw.LinearImage],
-    NDArray[np.float64] | float,
-    NDArray[np.float64] | float,
-]:
+) -> tuple[Callable[[FrameRecord], raw.LinearImage], Float64Array | float, Float64Array | float]:
     """Return how to read a frame's light, and the mean dark frame with its variance."""
     session = inputs.session
     # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
@@ -278,10 +301,12 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
     return {
         "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
         "specular": _map3(
-            specular / level, specular_error / level, specular_valid & valid,
+            specular / level,
+            specular_error / level,
+            specular_valid & valid,
             "specular light over that of a white tile",
         ),
-    }  # fmt: skip
+    }
 
 
 DARKEST_SIGMAS = 5.0
@@ -290,7 +315,7 @@ ASSUMED_WHITE = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
 
 
-def _assumed_white(inputs: Inputs) -> Float32:
+def _assumed_white(inputs: Inputs) -> Float32Array:
     record = inputs.session.frames("subject", state=inputs.state)[0]
     neutral = inputs.session.read(record).neutral
     level = np.full(3, ASSUMED_WHITE)
@@ -300,22 +325,25 @@ def _assumed_white(inputs: Inputs) -> Float32:
 
 
 def _map3(
-    values: NDArray[Any], stderr: NDArray[Any], valid: NDArray[np.bool_], description: str
+    values: NDArray[Any], stderr: NDArray[Any], valid: BoolArray, description: str
 ) -> SkinMap:
     good = valid & np.isfinite(values).all(axis=-1) & np.isfinite(stderr).all(axis=-1)
     keep = good[..., None]
     return SkinMap(
-        np.where(keep, values, 0.0), "1", np.where(keep, stderr, 0.0), good,
+        np.where(keep, values, 0.0),
+        "1",
+        np.where(keep, stderr, 0.0),
+        good,
         f"camera RGB, {description}",
-    )  # fmt: skip
+    )
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
-def _stderr(skin_map: SkinMap) -> Float32:
+def _stderr(skin_map: SkinMap) -> Float32Array:
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
 
@@ -328,9 +356,11 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     variance = np.square(_stderr(diffuse))
     errors = model_error.of_picture(diffuse.values, variance, _valid(diffuse))
     # of a face in light of unknown strength its pixels together tell no more
-    face = None if inputs.white is None else face_chromophores.in_known_light(
-        rgb, table, variance=variance, model_error=errors
-    )  # fmt: skip
+    face = (
+        None
+        if inputs.white is None
+        else face_chromophores.in_known_light(rgb, table, variance=variance, model_error=errors)
+    )
     known = partial(chromophore_posterior.weigh, rgb, table, prior=prior)
     found = by_face = known(face=face, variance=variance, model_error=errors)
     noise_alone = known(face=face, variance=variance)
@@ -347,19 +377,22 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         without_model_error = getattr(noise_alone, f"stderr_{name}")
         # spots are wide on purpose; they say nothing of what is known of the skin around them
         good = detectable(
-            getattr(by_face, name), getattr(by_face, f"stderr_{name}"),
+            getattr(by_face, name),
+            getattr(by_face, f"stderr_{name}"),
             usable & np.isfinite(without_model_error),
-        )  # fmt: skip
+        )
         why = "invalid where noise and model error leave it unknown"
         return {
             name: SkinMap(
                 np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good, why
             ),
             name + NOISE_STDERR: SkinMap(
-                np.where(good, without_model_error, 0.0), UNITS[name], valid=good,
+                np.where(good, without_model_error, 0.0),
+                UNITS[name],
+                valid=good,
                 description="standard error that noise alone would leave, without model error",
             ),
-        }  # fmt: skip
+        }
 
     return {
         **chromophore("melanin"),
@@ -367,10 +400,11 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         "shading": SkinMap(np.where(usable, found.shading, 0.0), "1", valid=usable),
         "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
         "gamut_distance": SkinMap(
-            np.nan_to_num(found.gamut_distance), "1",
+            np.nan_to_num(found.gamut_distance),
+            "1",
             description="how far the color lies outside the model's, relative",
         ),
-    }  # fmt: skip
+    }
 
 
 NOISE_STDERR = "_noise_stderr"
@@ -385,11 +419,13 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
     note = "independent component of optical density, no absolute scale"
     return {
         f"tsumura_{name}": SkinMap(
-            np.where(found.valid, getattr(found, name), 0.0), "1", valid=found.valid,
+            np.where(found.valid, getattr(found, name), 0.0),
+            "1",
+            valid=found.valid,
             description=note,
         )
         for name in ("melanin", "hemoglobin")
-    }  # fmt: skip
+    }
 
 
 def _pictures(inputs: Inputs, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:

@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import raw
 from capture.session import FrameRecord, Session
+from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["GradientImages", "Patterns", "SkinState", "state_name"]
 
-Float32 = NDArray[np.float32]
 Key = tuple[str, str]
 
 
@@ -64,11 +63,11 @@ class Patterns:
         (H, W) bool; False where a picture is saturated.
     """
 
-    values: Mapping[Key, Float32]
-    variance: Mapping[Key, Float32]
-    valid: NDArray[np.bool_]
+    values: Mapping[Key, Float32Array]
+    variance: Mapping[Key, Float32Array]
+    valid: BoolArray
 
-    def crossed(self) -> Float32:
+    def crossed(self) -> Float32Array:
         """Return the light from inside the skin: all crossed pictures together.
 
         Raises
@@ -78,11 +77,11 @@ class Patterns:
         """
         return self._sum("crossed")
 
-    def parallel(self) -> Float32:
+    def parallel(self) -> Float32Array:
         """Return all pictures with parallel polarizers together, as `crossed`."""
         return self._sum("parallel")
 
-    def _sum(self, polarizer: str) -> Float32:
+    def _sum(self, polarizer: str) -> Float32Array:
         chosen = [
             picture
             for (pattern, turned), picture in self.values.items()
@@ -127,11 +126,13 @@ class GradientImages:
             found.setdefault(
                 name,
                 SkinState(
-                    name, angle, step,
+                    name,
+                    angle,
+                    step,
                     float(actual.get("aperture_mm", math.nan)),
                     float(actual.get("force_n", math.nan)),
                 ),
-            )  # fmt: skip
+            )
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
@@ -144,7 +145,7 @@ class GradientImages:
                 "could be compared with"
             )
         self.states = (first, *(state for state in states if state is not first))
-        self._dark: Float32 | None = None
+        self._dark: Float32Array | None = None
         self._dark_variance = 0.0
 
     @property
@@ -162,9 +163,9 @@ class GradientImages:
         EvidenceError
             When frames differ in size.
         """
-        values: dict[Key, Float32] = {}
-        variance: dict[Key, Float32] = {}
-        valid: NDArray[np.bool_] | None = None
+        values: dict[Key, Float32Array] = {}
+        variance: dict[Key, Float32Array] = {}
+        valid: BoolArray | None = None
         dark = self._darkness()
         for key, records in self._records[state.name].items():
             if key[0] == "dark":
@@ -181,8 +182,8 @@ class GradientImages:
             raise EvidenceError(f"state {state.name}: has no lit picture")
         return Patterns(values, variance, valid)
 
-    def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32, Float32, NDArray[np.bool_]]:
-        total: Float32 | None = None
+    def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
+        total: Float32Array | None = None
         for record in records:
             frame = self._session.read(record)
             noise = self._noise
@@ -200,7 +201,7 @@ class GradientImages:
         count = np.float32(len(records))
         return total / count, variance / count**2, valid
 
-    def _darkness(self) -> Float32 | None:
+    def _darkness(self) -> Float32Array | None:
         """Return the mean of all frames without light, with the fixed pattern of the sensor."""
         if self._dark is None:
             records = [

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.pipeline.gradient.images import GradientImages, SkinState
 from reconstruction.registration.strain import Strain, measure_strain
 
@@ -18,11 +18,8 @@ SKIN_LEVEL = 0.4
 """Of the bright part of a crossed picture: what is darker, over some pixels, is no skin."""
 SKIN_SIGMA_PX = 8.0
 
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
-
-def skin_mask(picture: Float32) -> Bools:
+def skin_mask(picture: Float32Array) -> BoolArray:
     """Return where a crossed picture shows skin: jaws and background are dark.
 
     Parameters
@@ -31,7 +28,7 @@ def skin_mask(picture: Float32) -> Bools:
         Light from inside the skin, (H, W).
     """
     even = ndimage.gaussian_filter(picture, SKIN_SIGMA_PX, mode="nearest")
-    mask: Bools = even > SKIN_LEVEL * np.percentile(even, 90)
+    mask: BoolArray = even > SKIN_LEVEL * np.percentile(even, 90)
     return ndimage.binary_erosion(mask, iterations=round(SKIN_SIGMA_PX), border_value=1)
 
 
@@ -66,22 +63,25 @@ class StateStrain:
         shear, shear_error = strain.shear(angle)
         turn, turn_error = strain.rotation
         shift_error = np.sqrt(np.maximum(np.diag(strain.covariance)[4:], 0.0))
-        return (
-            asdict(self.state)
-            | {
-                "reading_ratio": self.ratio,
-                "stretch_s": r_s, "stretch_s_stderr": r_s_error,
-                "stretch_t": r_t, "stretch_t_stderr": r_t_error,
-                "shear_rad": shear, "shear_stderr_rad": shear_error,
-                "rotation_rad": turn, "rotation_stderr_rad": turn_error,
-                "shift_um": strain.shift_px * pixel_um,
-                "shift_stderr_um": shift_error * pixel_um,
-                "slip": self.ratio - r_s,
-                "gradient": strain.gradient, "covariance": strain.covariance,
-                "residual_um": strain.residual_px * pixel_um,
-                "windows": strain.windows, "valid": strain.valid,
-            }
-        )  # fmt: skip
+        return asdict(self.state) | {
+            "reading_ratio": self.ratio,
+            "stretch_s": r_s,
+            "stretch_s_stderr": r_s_error,
+            "stretch_t": r_t,
+            "stretch_t_stderr": r_t_error,
+            "shear_rad": shear,
+            "shear_stderr_rad": shear_error,
+            "rotation_rad": turn,
+            "rotation_stderr_rad": turn_error,
+            "shift_um": strain.shift_px * pixel_um,
+            "shift_stderr_um": shift_error * pixel_um,
+            "slip": self.ratio - r_s,
+            "gradient": strain.gradient,
+            "covariance": strain.covariance,
+            "residual_um": strain.residual_px * pixel_um,
+            "windows": strain.windows,
+            "valid": strain.valid,
+        }
 
 
 def measure_states(images: GradientImages) -> list[StateStrain]:
@@ -113,7 +113,7 @@ def measure_states(images: GradientImages) -> list[StateStrain]:
 
 def _starts(
     state: SkinState, ratio: float, found: Mapping[str, StateStrain]
-) -> list[NDArray[np.float64] | None]:
+) -> list[Float64Array | None]:
     axis = np.array([math.cos(state.angle_rad), math.sin(state.angle_rad)])
     before = [
         other
@@ -122,7 +122,7 @@ def _starts(
         and other.state.angle_deg == state.angle_deg
         and other.state.step * state.step >= 0
     ]
-    starts: list[NDArray[np.float64] | None] = []
+    starts: list[Float64Array | None] = []
     if before:
         nearest = min(before, key=lambda other: abs(other.state.step - state.step))
         change = ratio / nearest.ratio if nearest.ratio > 0 else 1.0

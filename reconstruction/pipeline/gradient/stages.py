@@ -9,13 +9,13 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
 from model.skin import UNITS, SkinMap
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
 from reconstruction.gradient_normals.lobe_response import SphereLights
 from reconstruction.normal_integration import integrate_map, relief_errors
@@ -53,8 +53,6 @@ WAVELENGTH_UM = 0.535
 """Of a white LED's light behind a monochrome sensor, its mean."""
 STDERR_SAMPLES = 6
 STDERR_SIGMA_PX = 8.0
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
@@ -80,19 +78,19 @@ class Rig:
     pixel_um: float
     """Of skin, in the middle of the field."""
     focal_px: float
-    camera_mm: NDArray[np.float64]
+    camera_mm: Float64Array
     """Centre of projection, shape (3,)."""
     lights: SphereLights
     lens: Aperture
 
-    def points_mm(self, shape: tuple[int, int]) -> Float32:
+    def points_mm(self, shape: tuple[int, int]) -> Float32Array:
         """Return where the pixels are on the plane z = 0, shape (H, W, 2)."""
         rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
         x = (columns - (shape[1] - 1) / 2) * (self.pixel_um / 1e3)
         y = ((shape[0] - 1) / 2 - rows) * (self.pixel_um / 1e3)
         return np.stack([x, y], axis=-1).astype(np.float32)
 
-    def views(self, shape: tuple[int, int]) -> Float32:
+    def views(self, shape: tuple[int, int]) -> Float32Array:
         """Return unit vectors from the pixels' places to the camera, shape (H, W, 3)."""
         points = self.points_mm(shape)
         way = np.concatenate([-points, np.zeros((*shape, 1), np.float32)], axis=-1)
@@ -112,43 +110,58 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     neutral = rig.images.neutral
     heights = tuple(f"height_{state.name}" for state in states)
     made = [
-        stages.Stage(
-            "strain", (), ("_strains", STRAIN_FILE), lambda: _strain(evidence, rig), base
-        ),
+        stages.Stage("strain", (), ("_strains", STRAIN_FILE), lambda: _strain(evidence, rig), base),
         stages.Stage("facets", (), ("_facets",), lambda: _facets(evidence, rig), base),
         stages.Stage(
-            f"diffuse normals {neutral.name}", (), (f"diffuse_normals_{neutral.name}",),
-            lambda: _diffuse(rig), base,
+            f"diffuse normals {neutral.name}",
+            (),
+            (f"diffuse_normals_{neutral.name}",),
+            lambda: _diffuse(rig),
+            base,
         ),
         stages.Stage(
-            "histograms", ("_strains", *heights), (HISTOGRAM_FILE, "_histograms"),
-            lambda **made: _histograms(rig, made), base,
+            "histograms",
+            ("_strains", *heights),
+            (HISTOGRAM_FILE, "_histograms"),
+            lambda **made: _histograms(rig, made),
+            base,
         ),
         stages.Stage(
-            "kernels", ("_strains", "_histograms", *heights), (KERNEL_FILE,),
-            lambda **made: _kernels(evidence, rig, made), base,
+            "kernels",
+            ("_strains", "_histograms", *heights),
+            (KERNEL_FILE,),
+            lambda **made: _kernels(evidence, rig, made),
+            base,
         ),
-    ]  # fmt: skip
+    ]
     for state in states:
         made.append(
             stages.Stage(
-                f"crossed {state.name}", (), (f"crossed_{state.name}",),
-                partial(_crossed, rig, state), base,
+                f"crossed {state.name}",
+                (),
+                (f"crossed_{state.name}",),
+                partial(_crossed, rig, state),
+                base,
             )
-        )  # fmt: skip
+        )
         made.append(
             stages.Stage(
-                f"normals {state.name}", ("_facets",),
+                f"normals {state.name}",
+                ("_facets",),
                 (f"normals_{state.name}", f"_restored_{state.name}"),
-                partial(_normals, rig, state), base,
+                partial(_normals, rig, state),
+                base,
             )
-        )  # fmt: skip
+        )
         made.append(
             stages.Stage(
-                f"height {state.name}", (f"_restored_{state.name}",), (f"height_{state.name}",),
-                partial(_height, rig, state), base,
+                f"height {state.name}",
+                (f"_restored_{state.name}",),
+                (f"height_{state.name}",),
+                partial(_height, rig, state),
+                base,
             )
-        )  # fmt: skip
+        )
     return made
 
 
@@ -168,13 +181,18 @@ def _rig(evidence: Evidence) -> Rig:
     images = GradientImages(session, noise=noise)
     evidence.noted["states"] = [state.name for state in images.states]
     return Rig(
-        images, pixel_um, view.focal_px, np.array(view.position_mm),
+        images,
+        pixel_um,
+        view.focal_px,
+        np.array(view.position_mm),
         _lights(evidence, view.serial),
         Aperture.of(
-            f_number=view.f_number, magnification=view.pixel_um / pixel_um,
-            wavelength_um=WAVELENGTH_UM, pixel_um=pixel_um,
+            f_number=view.f_number,
+            magnification=view.pixel_um / pixel_um,
+            wavelength_um=WAVELENGTH_UM,
+            pixel_um=pixel_um,
         ),
-    )  # fmt: skip
+    )
 
 
 def _lights(evidence: Evidence, serial: str) -> SphereLights:
@@ -231,10 +249,13 @@ def _crossed(rig: Rig, state: SkinState) -> Mapping[str, SkinMap]:
     variance = np.sum([patterns.variance[key] for key in lit], axis=0) / len(lit) ** 2
     return {
         f"crossed_{state.name}": SkinMap(
-            patterns.crossed(), "1", np.sqrt(variance), patterns.valid,
+            patterns.crossed(),
+            "1",
+            np.sqrt(variance),
+            patterns.valid,
             "light from inside the skin, mean of all crossed pictures, fraction of full scale",
         )
-    }  # fmt: skip
+    }
 
 
 def _patterns_normals(
@@ -267,9 +288,13 @@ def _facets(evidence: Evidence, rig: Rig) -> Mapping[str, Roughness]:
     patterns = rig.images.of(rig.images.neutral)
     shape = patterns.valid.shape
     found = estimate_roughness(
-        patterns.values, lights=rig.lights, view=rig.views((shape[0], shape[1])),
-        variance=patterns.variance, valid=patterns.valid, smooth_px=SMOOTH_PX,
-    )  # fmt: skip
+        patterns.values,
+        lights=rig.lights,
+        view=rig.views((shape[0], shape[1])),
+        variance=patterns.variance,
+        valid=patterns.valid,
+        smooth_px=SMOOTH_PX,
+    )
     evidence.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
     return {"_facets": found}
 
@@ -303,7 +328,7 @@ def _diffuse(rig: Rig) -> Mapping[str, SkinMap]:
     return {f"diffuse_normals_{state.name}": _normal_map(found, skin, what)}
 
 
-def _normal_map(found: NormalMaps, skin: Bools, what: str, *, relief: bool = False) -> SkinMap:
+def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool = False) -> SkinMap:
     valid = found.valid & skin
     # of each of the two directions across the normal, as everywhere
     stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
@@ -321,28 +346,34 @@ def _normal_map(found: NormalMaps, skin: Bools, what: str, *, relief: bool = Fal
 def _height(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, SkinMap]:
     """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
     restored: Restored
-    valid: Bools
+    valid: BoolArray
     restored, valid, stderr_rad = made[f"_restored_{state.name}"]
     shape = valid.shape
     settings: dict[str, Any] = {
-        "pixel": rig.pixel_um, "camera": rig.perspective((shape[0], shape[1])),
+        "pixel": rig.pixel_um,
+        "camera": rig.perspective((shape[0], shape[1])),
         # steep walls of furrows, dim and partly hidden, count less
         "stderr_rad": stderr_rad,
-    }  # fmt: skip
+    }
     found = integrate_map(restored.normals, valid=valid, **settings)
     height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
     by_noise = _height_stderr(restored, found.valid, settings)
     stderr = relief_errors.of_height(height, by_noise, found.valid)
     return {
         f"height_{state.name}": SkinMap(
-            height.astype(np.float32), "um", stderr, found.valid,
+            height.astype(np.float32),
+            "um",
+            stderr,
+            found.valid,
             f"height towards the camera, the lens's blur undone as far as noise allows, without "
             f"what is longer than {CUTOFF_UM / 1e3:g} mm",
         )
-    }  # fmt: skip
+    }
 
 
-def _height_stderr(restored: Restored, valid: Bools, settings: Mapping[str, Any]) -> Float32:
+def _height_stderr(
+    restored: Restored, valid: BoolArray, settings: Mapping[str, Any]
+) -> Float32Array:
     """Return the standard error of a height by what fields of noise become on the same way."""
     rng = np.random.default_rng(0)
     total = np.zeros(valid.shape)
@@ -370,9 +401,12 @@ def _histograms(rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
 def _kernels(evidence: Evidence, rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
     strains: list[StateStrain] = made["_strains"]
     document = fit_kernels(
-        strains, _heights(strains, made), made["_histograms"], pixel_um=rig.pixel_um,
+        strains,
+        _heights(strains, made),
+        made["_histograms"],
+        pixel_um=rig.pixel_um,
         tell=lambda share: evidence.tell("kernels", share),
-    )  # fmt: skip
+    )
     return {KERNEL_FILE: stages.document_bytes(document)}
 
 

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.microstructure import KernelTableError
 from model.skin import SkinMap
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
@@ -33,9 +33,6 @@ HIDDEN = 0.1
 patch. The root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at 1.19
 (seeds 0 to 5). It is no scatter: states and patches have it alike, and how much it is the pictures
 do not tell (what the lens's transfer takes is given back by then)."""
-
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 def count_normals(
@@ -81,10 +78,14 @@ def histogram_document(
         "axes": "rows n across the jaws, columns n along them, each -1 to 1",
         "states": [
             {
-                "name": each.state.name, "angle_deg": each.state.angle_deg,
-                "counts": one.histogram, "samples": one.samples, "outside": one.outside,
+                "name": each.state.name,
+                "angle_deg": each.state.angle_deg,
+                "counts": one.histogram,
+                "samples": one.samples,
+                "outside": one.outside,
                 "effective_samples": one.effective_samples,
-                "samples_per_bucket": one.samples_per_bucket, "aliased": one.aliased,
+                "samples_per_bucket": one.samples_per_bucket,
+                "aliased": one.aliased,
                 "variance_s": one.variance_x,
                 "variance_s_stderr": math.hypot(one.stderr_x, HIDDEN * one.variance_x),
                 "variance_t": one.variance_y,
@@ -93,12 +94,12 @@ def histogram_document(
             for each in strains
             if (one := found.get(each.state.name)) is not None
         ],
-    }  # fmt: skip
+    }
 
 
 def _common(
     each: StateStrain, neutral: StateStrain, heights: Mapping[str, SkinMap], *, there: bool
-) -> Bools:
+) -> BoolArray:
     """Return which pixels show skin that both the state and the neutral one show.
 
     Parameters
@@ -117,16 +118,18 @@ def _common(
     return ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
 
 
-def _moved(affine: NDArray[np.float64], shape: tuple[int, ...]) -> list[NDArray[np.float64]]:
+def _moved(affine: Float64Array, shape: tuple[int, ...]) -> list[Float64Array]:
     """Return the rows and columns that a map of pixels (column, row) takes each pixel to."""
     columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
-    return [affine[1, 0] * columns + affine[1, 1] * rows + affine[1, 2],
-            affine[0, 0] * columns + affine[0, 1] * rows + affine[0, 2]]  # fmt: skip
+    return [
+        affine[1, 0] * columns + affine[1, 1] * rows + affine[1, 2],
+        affine[0, 0] * columns + affine[0, 1] * rows + affine[0, 2],
+    ]
 
 
 def _skin_blocks(
-    each: StateStrain, height: SkinMap, *, pixel_um: float, there: Bools
-) -> NDArray[np.int64]:
+    each: StateStrain, height: SkinMap, *, pixel_um: float, there: BoolArray
+) -> Int64Array:
     """Count a state's normals in the skin of each block of the neutral map turned to its jaws.
 
     Parameters
@@ -158,18 +161,24 @@ def _skin_blocks(
     inside = (down >= 0) & (down < grid[0]) & (right >= 0) & (right < grid[1])
     block = np.where(inside, down * grid[1] + right, -1)
     counts = block_counts(
-        height.values, block, grid[0] * grid[1], pixel=pixel_um, valid=there,
+        height.values,
+        block,
+        grid[0] * grid[1],
+        pixel=pixel_um,
+        valid=there,
         angle_rad=each.state.angle_rad,
-    )  # fmt: skip
+    )
     return counts.reshape(*grid, *counts.shape[1:])
 
 
-def _inverse(affine: NDArray[np.float64]) -> NDArray[np.float64]:
+def _inverse(affine: Float64Array) -> Float64Array:
     linear = np.linalg.inv(affine[:, :2])
     return np.column_stack([linear, -linear @ affine[:, 2]])
 
 
-def _along_x(height: NDArray[np.float32], valid: Bools, angle_rad: float) -> tuple[Float32, Bools]:
+def _along_x(
+    height: Float32Array, valid: BoolArray, angle_rad: float
+) -> tuple[Float32Array, BoolArray]:
     """Turn a map so that the jaws' axis lies along its rows."""
     if abs(math.sin(angle_rad)) < 1e-9:
         return height, valid
@@ -228,11 +237,18 @@ def fit_kernels(
         there = _valid(strained) & _common(each, neutral, heights, there=True)
         every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSER
         fit = fit_kernel(
-            turned, target.histogram, stretch=each.stretch_s[0], axis="x", pixel_um=pixel_um,
-            valid=inside, stretch_across=each.stretch_t[0], alphas=ALPHAS[::every],
-            sigmas_um=SIGMAS_UM[::every], target_samples=target.effective_samples,
+            turned,
+            target.histogram,
+            stretch=each.stretch_s[0],
+            axis="x",
+            pixel_um=pixel_um,
+            valid=inside,
+            stretch_across=each.stretch_t[0],
+            alphas=ALPHAS[::every],
+            sigmas_um=SIGMAS_UM[::every],
+            target_samples=target.effective_samples,
             target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
-        )  # fmt: skip
+        )
         fits.append(_entry(each, fit))
     angles = sorted({fit["angle_deg"] for fit in fits})
     tables = [table for angle in (None, *angles) if (table := _table(fits, angle)) is not None]
@@ -246,19 +262,32 @@ def fit_kernels(
 
 def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
     return {
-        "name": each.state.name, "angle_deg": each.state.angle_deg,
-        "stretch_s": each.stretch_s[0], "stretch_s_stderr": each.stretch_s[1],
+        "name": each.state.name,
+        "angle_deg": each.state.angle_deg,
+        "stretch_s": each.stretch_s[0],
+        "stretch_s_stderr": each.stretch_s[1],
         "stretch_t": each.stretch_t[0],
-        "alpha": fit.alpha, "alpha_stderr": fit.alpha_stderr,
-        "sigma_um": fit.sigma_um, "sigma_stderr_um": fit.sigma_stderr_um,
-        "alpha_95": fit.alpha_95, "sigma_95_um": fit.sigma_95_um,
-        "alpha_interval": fit.alpha_interval, "sigma_interval_um": fit.sigma_interval_um,
-        "alpha_refined": fit.alpha_refined, "sigma_refined_um": fit.sigma_refined_um,
-        "distance": fit.distance, "distance_before": fit.distance_before,
-        "distance_noise": fit.noise, "noise_floor": fit.floor,
-        "near_best_count": len(fit.near_best), "at_edge": fit.at_edge, "aliased": fit.aliased,
-        "search": fit.search, "valid": fit.valid, "reason": fit.reason,
-    }  # fmt: skip
+        "alpha": fit.alpha,
+        "alpha_stderr": fit.alpha_stderr,
+        "sigma_um": fit.sigma_um,
+        "sigma_stderr_um": fit.sigma_stderr_um,
+        "alpha_95": fit.alpha_95,
+        "sigma_95_um": fit.sigma_95_um,
+        "alpha_interval": fit.alpha_interval,
+        "sigma_interval_um": fit.sigma_interval_um,
+        "alpha_refined": fit.alpha_refined,
+        "sigma_refined_um": fit.sigma_refined_um,
+        "distance": fit.distance,
+        "distance_before": fit.distance_before,
+        "distance_noise": fit.noise,
+        "noise_floor": fit.floor,
+        "near_best_count": len(fit.near_best),
+        "at_edge": fit.at_edge,
+        "aliased": fit.aliased,
+        "search": fit.search,
+        "valid": fit.valid,
+        "reason": fit.reason,
+    }
 
 
 def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, Any] | None:
@@ -287,16 +316,19 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
             sigma[part] = line[0] * r[part] + line[1]
     return {
         "name": "all angles" if angle is None else f"{angle:.0f} degrees",
-        "alpha_breaks": found.table.alpha_breaks, "alpha_lines": found.table.alpha_lines,
+        "alpha_breaks": found.table.alpha_breaks,
+        "alpha_lines": found.table.alpha_lines,
         "sigma_compression_um": found.table.sigma_compression_um,
         "sigma_stretch_um": found.table.sigma_stretch_um,
-        "stretch_range": (low, high), "alpha_rms": found.alpha_rms,
+        "stretch_range": (low, high),
+        "alpha_rms": found.alpha_rms,
         "sigma_rms_um": found.sigma_rms_um,
         "lines": {
-            "stretch": r, "alpha": np.clip(found.table.unlimited_alpha(r), -2.0, 1.0),
+            "stretch": r,
+            "alpha": np.clip(found.table.unlimited_alpha(r), -2.0, 1.0),
             "sigma_um": sigma,
         },
-    }  # fmt: skip
+    }
 
 
 def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
@@ -308,19 +340,25 @@ def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     try:
         table = fit_table(columns["stretch_s"], columns["alpha"], columns["sigma_um"]).table
         found = direction_dependence(
-            table, columns["stretch_s"], columns["alpha"], columns["sigma_um"],
+            table,
+            columns["stretch_s"],
+            columns["alpha"],
+            columns["sigma_um"],
             np.radians(columns["angle_deg"]),
-        )  # fmt: skip
+        )
     except (KernelTableFitError, KernelTableError):
         return None
     return {
-        "angle_deg": np.degrees(found.angle_rad), "alpha_offset": found.alpha_offset,
-        "alpha_stderr": found.alpha_stderr, "sigma_offset_um": found.sigma_offset_um,
-        "sigma_stderr_um": found.sigma_stderr_um, "p_alpha": found.p_alpha,
+        "angle_deg": np.degrees(found.angle_rad),
+        "alpha_offset": found.alpha_offset,
+        "alpha_stderr": found.alpha_stderr,
+        "sigma_offset_um": found.sigma_offset_um,
+        "sigma_stderr_um": found.sigma_stderr_um,
+        "p_alpha": found.p_alpha,
         "p_sigma": found.p_sigma,
-    }  # fmt: skip
+    }
 
 
-def _valid(skin_map: SkinMap) -> Bools:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

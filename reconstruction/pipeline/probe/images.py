@@ -83,11 +83,14 @@ class ProbeImages:
             raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
         self.measurements = tuple(
             Measurement(
-                placement, len(records), _level(records), _mean(records, "suction_mbar"),
+                placement,
+                len(records),
+                _level(records),
+                _mean(records, "suction_mbar"),
                 _mean(records, "camera_c"),
             )
             for placement, records in self._records.items()
-        )  # fmt: skip
+        )
         self._darks: DarkModel | None = None
 
     @property

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.fiber.darks import CameraNoise
 from capture.calibration.fiber.gains import FibreCalibration, FibreReflectance
@@ -23,6 +22,7 @@ from reconstruction import subsurface
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy.direction_harmonics import LEAST_DIRECTIONS
 from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages
@@ -48,8 +48,6 @@ FALSE_ALARMS = 0.01
 UNLIKE = 0.03
 """Relative misfit from which a bent profile is that of no homogeneous medium, but of layered
 tissue. What each fibre has off by itself, as by dirt on it, bends none."""
-
-Floats = NDArray[np.float64]
 
 
 def products(_: Session) -> Mapping[str, tuple[str, ...]]:
@@ -90,12 +88,12 @@ class ProfileFit:
 
     profile: Profile
     fit: SubsurfaceFit
-    log_stderr: Floats
-    log_common: Floats
-    log_coefficients: Floats
+    log_stderr: Float64Array
+    log_common: Float64Array
+    log_coefficients: Float64Array
 
     @property
-    def log_total(self) -> Floats:
+    def log_total(self) -> Float64Array:
         """Standard error of log sigma_tr by all causes, shape (C,)."""
         return np.asarray(np.sqrt(self.log_stderr**2 + (self.log_common**2).sum(axis=0)))
 
@@ -114,9 +112,9 @@ class SiteValue:
     """
 
     site: str
-    measurements: NDArray[np.int64]
-    sigma_tr_per_mm: Floats
-    stderr_per_mm: Floats
+    measurements: Int64Array
+    sigma_tr_per_mm: Float64Array
+    stderr_per_mm: Float64Array
 
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
@@ -140,27 +138,41 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     return [
         stages.Stage(
-            "profiles", (), ("_profiles", PROFILE_FILE),
-            lambda: _profiles(evidence, fibres, sensor), base,
-            refused="" if fibres is not None else (
+            "profiles",
+            (),
+            ("_profiles", PROFILE_FILE),
+            lambda: _profiles(evidence, fibres, sensor),
+            base,
+            refused=""
+            if fibres is not None
+            else (
                 "the fibres are not calibrated: capture a phantom of known optics "
                 "(`--target phantom`), and give the folder that `skinrig calibrate fibre` makes of "
                 "it as --calibration"
             ),
         ),
         stages.Stage(
-            "subsurface", ("_profiles",), ("_fits", "_sites", SUBSURFACE_FILE),
-            lambda _profiles: _subsurface(_profiles, probe), base,
+            "subsurface",
+            ("_profiles",),
+            ("_fits", "_sites", SUBSURFACE_FILE),
+            lambda _profiles: _subsurface(_profiles, probe),
+            base,
         ),
         stages.Stage(
-            "anisotropy", ("_fits",), (ANISOTROPY_FILE,),
-            lambda _fits: {ANISOTROPY_FILE: _anisotropy(_fits)}, base,
+            "anisotropy",
+            ("_fits",),
+            (ANISOTROPY_FILE,),
+            lambda _fits: {ANISOTROPY_FILE: _anisotropy(_fits)},
+            base,
         ),
         stages.Stage(
-            "translucency", ("_sites",), ("translucency",),
-            lambda _sites: _translucency(_sites, places, evidence), base,
+            "translucency",
+            ("_sites",),
+            ("translucency",),
+            lambda _sites: _translucency(_sites, places, evidence),
+            base,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _fibres(evidence: Evidence) -> FibreCalibration | None:
@@ -280,7 +292,7 @@ def fit_profiles(
         unlike = _layered(profiles, unlike, other.scale[0])
         fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
-    def change_of(coefficient: Floats) -> Floats:
+    def change_of(coefficient: Float64Array) -> Float64Array:
         logs = np.log(coefficient)
         return np.asarray(np.nan_to_num(logs[1:] - logs[0]))
 
@@ -290,16 +302,17 @@ def fit_profiles(
     log_stderr = fit.sigma_tr_stderr[0] / fit.sigma_tr_per_mm[0]
     return [
         ProfileFit(
-            profile, _one(fit, (0, number)), log_stderr[number],
-            change[:, number].reshape(causes, -1), shared[:, number],
+            profile,
+            _one(fit, (0, number)),
+            log_stderr[number],
+            change[:, number].reshape(causes, -1),
+            shared[:, number],
         )
         for number, profile in enumerate(profiles)
-    ]  # fmt: skip
+    ]
 
 
-def _layered(
-    profiles: Sequence[Profile], unlike: NDArray[np.bool_], factor: Floats
-) -> NDArray[np.bool_]:
+def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Array) -> BoolArray:
     """Return which profiles are fitted as those of layers, (M, C); a turn is of one tissue.
 
     A layer on top dims in all directions. Tissue that scatters by direction is unlike any medium,
@@ -323,7 +336,7 @@ def _turns(profiles: Sequence[Profile]) -> dict[tuple[str, int], list[int]]:
     return groups
 
 
-def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: NDArray[np.bool_]) -> SubsurfaceFit:
+def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> SubsurfaceFit:
     """Return one batch's fits, but another's where told to."""
     merged = {}
     for name in (field.name for field in dataclasses.fields(fit) if field.name != "method"):
@@ -441,20 +454,25 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
         for c, channel in enumerate(CHANNELS):
             rows.append(
                 {
-                    "site": site, "repeat": repeat, "channel": channel,
+                    "site": site,
+                    "repeat": repeat,
+                    "channel": channel,
                     "directions": int(found.used[:, c].sum()),
-                    "ratio": found.ratio[c], "ratio_stderr": found.ratio_stderr[c],
+                    "ratio": found.ratio[c],
+                    "ratio_stderr": found.ratio_stderr[c],
                     "axis_deg": math.degrees(found.axis_rad[c]),
                     "axis_stderr_deg": math.degrees(found.axis_stderr_rad[c]),
                     "p_value": found.p_value[c],
                     "anisotropic": bool(found.valid[c] and found.p_value[c] < FALSE_ALARMS),
                     "mean_per_mm": found.mean_per_mm[c],
                     "mean_stderr_per_mm": found.mean_stderr_per_mm[c],
-                    "tilt": found.tilt[c], "tilt_p_value": found.tilt_p_value[c],
+                    "tilt": found.tilt[c],
+                    "tilt_p_value": found.tilt_p_value[c],
                     "worst_direction_percent": 100.0 * off[c],
-                    "valid": found.valid[c], "reason": str(found.reason[c]),
+                    "valid": found.valid[c],
+                    "reason": str(found.reason[c]),
                 }
-            )  # fmt: skip
+            )
     return stages.document_bytes(
         {
             "schema": "skinrig.anisotropy/1",
@@ -503,15 +521,20 @@ def _translucency(
     evidence.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
     return {
         "translucency": SkinMap(
-            found.values, "mm", found.stderr, np.asarray(found.valid.all(axis=-1)),
+            found.values,
+            "mm",
+            found.stderr,
+            np.asarray(found.valid.all(axis=-1)),
             "1/sigma_tr of red, green and blue light, between measured sites by kriging",
         )
-    }  # fmt: skip
+    }
 
 
 def _head(measurement: Measurement) -> dict[str, Any]:
     placement = measurement.placement
     return {
-        "name": measurement.name, "site": placement.site, "repeat": placement.repeat,
+        "name": measurement.name,
+        "site": placement.site,
+        "repeat": placement.repeat,
         "angle_deg": placement.angle_deg,
-    }  # fmt: skip
+    }

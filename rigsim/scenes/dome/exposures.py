@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import View
+from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.geometry.mesh import Float32Array
 from rigsim.scenes.exposing import LitLight, full_power_s
 from rigsim.sensor import Sensor, expose
 
@@ -57,7 +56,7 @@ class Exposures:
         exposure_s: float,
         seed: int,
         instant: Callable[[float], float],
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose a camera once.
 
         Parameters
@@ -92,11 +91,7 @@ class Exposures:
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 
     def _frame(
-        self,
-        view: View,
-        light: int,
-        t_s: float,
-        render: Callable[[View, int, float], Float32Array],
+        self, view: View, light: int, t_s: float, render: Callable[[View, int, float], Float32Array]
     ) -> Float32Array:
         key = (view.name, light, t_s)
         if key not in self._frames:

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, View, load_rig
-from rigsim.geometry.atlas import BoolArray, spread
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
+from rigsim.geometry.atlas import spread
 from rigsim.light.plastic import plastic_scale
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.render import MovedLight, look_at, radiance
@@ -39,7 +38,7 @@ class Way:
     """Root mean square error over all images, relative to their mean."""
     mean_ratio: float
     """Mean of its images over that of the reference."""
-    squared_by_tile: NDArray[np.float64]
+    squared_by_tile: Float64Array
     """Squared relative error of each tile of 16 x 16 pixels that shows skin, for its scatter."""
 
 
@@ -180,9 +179,7 @@ def compare(
     return Comparison(way("ours"), way("path"), way("direct"))
 
 
-def _by_tile(
-    difference: NDArray[np.float64], shown: NDArray[np.bool_], side: int = 16
-) -> NDArray[np.float64]:
+def _by_tile(difference: Float64Array, shown: BoolArray, side: int = 16) -> Float64Array:
     """Return the mean square of each tile of images (L, H, W, 3), those without skin left out."""
     squared = np.mean(difference**2, axis=(0, 3))
     seen = np.asarray(shown.any(axis=(0, 3)))

@@ -7,12 +7,11 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import View
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.dome import BuiltDome
 from rigsim.geometry.atlas import spread, unwrap
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.olat_vector import VectorLight
@@ -109,7 +108,7 @@ class DomeRows:
             self._vector[key] = VectorLight(hits, caster)
         return self._vector[key]
 
-    def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
 
     def _look(
@@ -141,6 +140,6 @@ class DomeRows:
         return dome_views.at_skin(caster, moved, texture, how), caster
 
 
-def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def _vector(values: Float64Array) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in values)
     return x, y, z

@@ -25,9 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 from capture.rig import Light, Rig, RigError, View
 from model import spectra
 from model.skin import SkinAppearance
+from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
 from rigsim.geometry.atlas import sample, spread
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import olat, surface_brdf
 from rigsim.light.led_light import white_intensity
 from rigsim.light.olat import Hits, Lamp
@@ -229,7 +229,7 @@ class DomeScene:
             return np.zeros(3, np.float32)
         return white_intensity(led, self._view(view_name)).astype(np.float32)
 
-    def _white_in_origin(self) -> NDArray[np.float64]:
+    def _white_in_origin(self) -> Float64Array:
         """Return full scales per second of a white plate that faces the brightest light."""
         each = [
             white_intensity(light, self.rig.views[0]) / float(np.square(light.position_mm).sum())
@@ -272,7 +272,7 @@ class DomeScene:
 
     def exposure(
         self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose a camera once.
 
         Parameters
@@ -293,9 +293,14 @@ class DomeScene:
         """
         view = self._view(view_name)
         return self._exposures.expose(
-            view, self._sensors[view.name], self._render, pops=pops, exposure_s=exposure_s,
-            seed=seed, instant=self._rows.instant,
-        )  # fmt: skip
+            view,
+            self._sensors[view.name],
+            self._render,
+            pops=pops,
+            exposure_s=exposure_s,
+            seed=seed,
+            instant=self._rows.instant,
+        )
 
     # truth ------------------------------------------------------------------------------------
 
@@ -452,6 +457,6 @@ class DomeScene:
         return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
 
-def _toward_origin(light: Light) -> NDArray[np.float64]:
+def _toward_origin(light: Light) -> Float64Array:
     place = np.asarray(light.position_mm, np.float64)
     return np.asarray(-place / np.linalg.norm(place))

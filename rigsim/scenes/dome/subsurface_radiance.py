@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import View
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import sample
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import olat
 from rigsim.light.interreflection import SkinBounce, bounce_on
 from rigsim.light.lateral_scattering import SkinBleeding

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig, RigError, View
+from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
@@ -23,7 +24,6 @@ from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
 
-FloatArray = NDArray[np.float64]
 Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 
 BALL_RADIUS_MM: Final = 50.0
@@ -119,7 +119,7 @@ class TargetScene:
             else printed_plate.charuco_board()
         )
         self._hand = rng.standard_normal((max(PLACES.values()), 6))
-        self._rays: dict[str, FloatArray] = {}
+        self._rays: dict[str, Float64Array] = {}
         lights = self.rig.lights
         self._lamp_mm = np.array([light.position_mm for light in lights])
         self._exponent = np.array([lobe_exponent(light) for light in lights])
@@ -137,7 +137,10 @@ class TargetScene:
                 "the ball mirrors them" if mirror else "paper is matt",
             ),
             decide(
-                "sizes of the LEDs in the light on plates", sizes, None, switch="",
+                "sizes of the LEDs in the light on plates",
+                sizes,
+                None,
+                switch="",
                 because=f"{100 * LED_SIZES:g} % of the light",
             ),
             *absent(
@@ -152,7 +155,7 @@ class TargetScene:
                     ("blur of the lenses", "every pixel averages over its own square"),
                 ]
             ),
-        ]  # fmt: skip
+        ]
         return SceneNeeds(tuple(effects))
 
     @property
@@ -168,7 +171,7 @@ class TargetScene:
 
     def exposure(
         self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose a camera once.
 
         Parameters
@@ -197,10 +200,11 @@ class TargetScene:
             if self.rig.lights[light].name not in self.dome.dead:
                 energy = pulse.level * (pulse.t_off_s - pulse.t_on_s)
                 on_s[light] += energy * (1.0 + POWER_DEVIATION * rng.standard_normal())
-        return expose(self.light(view_name, on_s), sensor=sensor_of(view), rng=rng,
-                      exposure_s=exposure_s)  # fmt: skip
+        return expose(
+            self.light(view_name, on_s), sensor=sensor_of(view), rng=rng, exposure_s=exposure_s
+        )
 
-    def light(self, view_name: str, on_s: Sequence[float] | FloatArray) -> NDArray[np.float32]:
+    def light(self, view_name: str, on_s: Sequence[float] | Float64Array) -> Float32Array:
         """Return the light on a sensor without noise and vignetting, camera RGB, (H, W, 3).
 
         Parameters
@@ -227,12 +231,19 @@ class TargetScene:
             rotation, place = self.plate_pose()
             plate = self._plate
             gray = printed_plate.plate_light(
-                rays, eye, rotation, place, plate.reflectance, CELL_MM, plate.waviness,
-                *lamps, EDGE_SUBPIXELS,
-            )  # fmt: skip
+                rays,
+                eye,
+                rotation,
+                place,
+                plate.reflectance,
+                CELL_MM,
+                plate.waviness,
+                *lamps,
+                EDGE_SUBPIXELS,
+            )
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
-    def plate_pose(self, pose: int | None = None) -> tuple[FloatArray, FloatArray]:
+    def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
         """Return how a plate stands: rotation to the rig frame, place of its top left corner, mm.
 
         A plate's own axes are x right and y down as seen from its front, z into it.
@@ -258,7 +269,7 @@ class TargetScene:
         width, height = self._plate.size_mm
         return rotation, values[3:] - rotation @ np.array([width / 2, height / 2, 0.0])
 
-    def ball_mm(self, pose: int | None = None) -> FloatArray:
+    def ball_mm(self, pose: int | None = None) -> Float64Array:
         """Return the middle of the mirror ball."""
         number = self.pose if pose is None else pose
         return np.array(BALL_PLACES[number]) + HAND_MM * self._hand[number, :3]
@@ -297,7 +308,7 @@ class TargetScene:
         except RigError as error:
             raise TargetError(str(error)) from error
 
-    def _corner_rays(self, view: View) -> FloatArray:
+    def _corner_rays(self, view: View) -> Float64Array:
         if view.name not in self._rays:
             distortion = self.dome.distortion.get(view.name, np.zeros(5))
             self._rays[view.name] = pixel_corner_rays(view, distortion)
@@ -306,11 +317,11 @@ class TargetScene:
     def _ball(
         self,
         view: View,
-        rays: FloatArray,
-        eye: FloatArray,
+        rays: Float64Array,
+        eye: Float64Array,
         lit: NDArray[np.intp],
-        lamps: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    ) -> NDArray[np.float32]:
+        lamps: tuple[Float64Array, Float64Array, Float64Array, Float64Array],
+    ) -> Float32Array:
         ball = self.ball_mm()
         cloth = mirror_ball.light_on_cloth(*lamps)
         image = mirror_ball.surroundings(
@@ -323,23 +334,34 @@ class TargetScene:
                 if box is None:
                     continue
                 mirror_ball.add_lamp(
-                    image, rays, box, eye, ball, BALL_RADIUS_MM, mirror_ball.REFLECTANCE,
-                    lamp, axis, float(exponent), radius, float(strength), reflected,
+                    image,
+                    rays,
+                    box,
+                    eye,
+                    ball,
+                    BALL_RADIUS_MM,
+                    mirror_ball.REFLECTANCE,
+                    lamp,
+                    axis,
+                    float(exponent),
+                    radius,
+                    float(strength),
+                    reflected,
                     SPOT_SUBPIXELS,
-                )  # fmt: skip
+                )
         return np.asarray(image)
 
     def _box(
         self,
         view: View,
-        eye: FloatArray,
-        ball: FloatArray,
-        lamp: FloatArray,
-        axis: FloatArray,
+        eye: Float64Array,
+        ball: Float64Array,
+        lamp: Float64Array,
+        axis: Float64Array,
         radius: float,
         *,
         reflected: bool,
-    ) -> NDArray[np.int64] | None:
+    ) -> Int64Array | None:
         """Return rows and columns that an LED can cover, or None outside the image."""
         if not reflected and (eye - lamp) @ axis <= 0.0:
             return None

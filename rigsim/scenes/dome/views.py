@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import View
+from rigsim.arrays import Float32Array, Int32Array
 from rigsim.geometry.atlas import sample
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light import olat
 from rigsim.light.olat import Hits
 from rigsim.render import Caster, GBuffer
@@ -45,7 +45,7 @@ def at_skin(caster: Caster, view: View, texture: Float32Array, how: Looking) -> 
         Rays and lens.
     """
 
-    def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+    def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
         uv = buffers.uv.reshape(-1, 2)[rows]
         values = sample(texture, uv, np.ones(len(rows), np.bool_))
         return unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
@@ -64,7 +64,7 @@ def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
     """Look at a target that reflects."""
     rgb = target.rgb(view.spectral_sensitivity, how.illuminant)
 
-    def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+    def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
         uv = buffers.uv.reshape(-1, 2)[rows]
         surface = np.zeros((len(rows), 7), np.float32)
         size = rgb.shape[0]

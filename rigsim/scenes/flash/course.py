@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.needs.effects import SceneNeeds, unmodeled
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import POWER_DEVIATION, FlashScene
@@ -139,7 +139,7 @@ class FlashCourseScene:
 
     def exposure(
         self, view_name: str, *, pops: Sequence[object], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose a camera once, with the blood of the time of each pop; see `FlashScene`."""
         view = self.rig.view(view_name)
         rng = np.random.default_rng([self.seed, seed])
@@ -151,9 +151,12 @@ class FlashCourseScene:
             level, pose = self.course.level(t_s), self.course.pose(t_s)
             energy = power * (1.0 + POWER_DEVIATION * rng.standard_normal())
             light += np.float32(energy) * self.radiance(
-                pose, level, pop.polarizer, pop.analyser_deg,  # type: ignore[attr-defined]
+                pose,
+                level,
+                pop.polarizer,  # type: ignore[attr-defined]
+                pop.analyser_deg,  # type: ignore[attr-defined]
                 view_name=view_name,
-            )  # fmt: skip
+            )
             if self._on_flash is not None:
                 self._on_flash(FlashTime(str(pop.token), t_s, level, pose))  # type: ignore[attr-defined]
         sensor = self.at("neutral", LEVELS[0]).sensor(view_name)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from rigsim import shading
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.polarizers import Films, absorbing_axis
-from rigsim.geometry.atlas import BoolArray, sample, spread
-from rigsim.geometry.mesh import Float32Array
+from rigsim.geometry.atlas import sample, spread
 from rigsim.light.olat import pixel_order
 from rigsim.light.subsurface_radiance import SkinGlow, spread_through_pigment, toward
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
@@ -64,20 +64,14 @@ class Look:
     """The camera."""
     films: Films
     """The polarizing films."""
-    weights: NDArray[np.float64]
+    weights: Float64Array
     """Energy of each light over the sum that a plate at the origin gets, mm^2."""
     subpixels: int
     """Rays along each side of a pixel."""
     spread: LensSpread | None = None
     """How the lens spreads light; None: it is sharp everywhere."""
 
-    def at_skin(
-        self,
-        caster: Caster,
-        subject: Subject,
-        state: str,
-        glow: SkinGlow,
-    ) -> Picture:
+    def at_skin(self, caster: Caster, subject: Subject, state: str, glow: SkinGlow) -> Picture:
         """Look at a face.
 
         Parameters

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, View, load_rig
 from rigsim import shading
+from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.polarizers import absorbing_axis
-from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.subsurface_radiance import toward
 from rigsim.render import Caster, g_buffer, look_at, radiance
 from rigsim.render.variant import choose_variant
@@ -250,6 +250,6 @@ def _film(place: Any, faces: Any, half_mm: float, passes_deg: float) -> dict[str
     }
 
 
-def _wholly_covered(view: View, caster: Caster) -> NDArray[np.bool_]:
+def _wholly_covered(view: View, caster: Caster) -> BoolArray:
     mask = g_buffer(caster, view, subpixels=4).mask
     return np.asarray(mask.reshape(view.height_px, 4, view.width_px, 4).all(axis=(1, 3)))

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from model import spectra
 from rigsim import shading
+from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Films, films_of
-from rigsim.geometry.mesh import Float32Array, Mesh
+from rigsim.geometry.mesh import Mesh
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.subsurface_radiance import SkinGlow, SurfaceLight, light_skin, light_surface
@@ -251,7 +252,7 @@ class FlashScene:
 
     def exposure(
         self, view_name: str, *, pops: Sequence[Pop], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose a camera once.
 
         Parameters
@@ -371,7 +372,7 @@ class FlashScene:
             if shown
         }
 
-    def resolution_mm(self, view_name: str | None = None) -> NDArray[np.float64]:
+    def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
         glow = self._skin_glow(self._view(view_name))
         return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
@@ -482,10 +483,7 @@ class FlashScene:
             look = self._look(view, self.subject.mesh)
             if isinstance(self.subject, Subject):
                 picture = look.at_skin(
-                    self._caster,
-                    self.subject,
-                    self.state,
-                    self._skin_glow(view),
+                    self._caster, self.subject, self.state, self._skin_glow(view)
                 )
             else:
                 picture = look.at_target(self._caster, self.subject)
@@ -493,7 +491,7 @@ class FlashScene:
         return self._pictures[view.name]
 
 
-def _light_weights(rig: Rig) -> NDArray[np.float64]:
+def _light_weights(rig: Rig) -> Float64Array:
     """Return each light's energy over the sum that a plate at the origin gets, mm^2."""
     energy, share = [], []
     view_axis = np.asarray(rig.views[0].axes[2])

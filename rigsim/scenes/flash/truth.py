@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import BoolArray, Float32Array
 from rigsim.render import Caster
 from rigsim.scenes.flash.image import Look, Picture
 from rigsim.subject import Subject
@@ -85,11 +85,7 @@ def maps_at_rest(
         Textures of the moved face, see `Look.blurred_maps`: light spreads on that, wherever the
         skin is then looked for. None: light does not spread.
     """
-    layers = {
-        "melanin": rest.melanin,
-        "hemoglobin": rest.hemoglobin(state),
-        "hair": rest.hair,
-    }
+    layers = {"melanin": rest.melanin, "hemoglobin": rest.hemoglobin(state), "hair": rest.hair}
     if spread is not None:
         layers |= {name: spread[name] for name in SPREAD_FRACTIONS}
     picture = look.at_maps(caster, rest, layers)
@@ -105,7 +101,7 @@ def unmoved_maps(maps: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[n
     return {f"{name}_at_rest": maps[name] for name in (*FRACTIONS, *SPREAD_FRACTIONS, "mask")}
 
 
-def whole_skin(picture: Picture) -> NDArray[np.bool_]:
+def whole_skin(picture: Picture) -> BoolArray:
     """Return the pixels, (H, W), that are wholly on skin, and get light from there alone."""
     whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - LENS_LIMIT)
     return whole & (picture.maps["hair"] < HAIR_LIMIT)

@@ -12,11 +12,10 @@ from typing import Final
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
 from rigsim import shading
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.lobe_moments import MomentTable, Surface, build_table, direct_moments
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.light.self_shadow import horizon_tangent
@@ -24,10 +23,6 @@ from rigsim.light.shadowed_lights import remove_hidden
 from rigsim.scenes.gradient.patch import PatchSurface
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
-
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
-
 
 BLOCK_ROWS: Final = 128
 """Rows that are looked up at once, which bounds memory."""
@@ -47,9 +42,9 @@ class Lighting:
     """LEDs in the table; with shadows only those above the patch's plane."""
     sectors: int
     """Directions whose horizons are found; between them they are interpolated. 0: no shadows."""
-    sigmas_mm: FloatArray
+    sigmas_mm: Float64Array
     """Widths of the lateral kernel of light in skin; none: light leaves where it entered."""
-    weights: FloatArray
+    weights: Float64Array
     """Their shares, sum 1."""
     furrow_sectors: int = 0
     """Directions in which the sky is looked for, for light from furrow to furrow; 0: none."""
@@ -87,9 +82,13 @@ class Lighting:
         entering = self._spread(packed[12:], patch.skin, 1e-3 * pitch_um)
         if self.furrow_sectors:
             hidden = hidden_share(
-                height_um, patch.normals, margin=margin, pixel_um=pitch_um,
-                sectors=self.furrow_sectors, boundaries=True,
-            )  # fmt: skip
+                height_um,
+                patch.normals,
+                margin=margin,
+                pixel_um=pitch_um,
+                sectors=self.furrow_sectors,
+                boundaries=True,
+            )
             entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
         right = self.surface.image_right
         eye = np.asarray(self.surface.eye_mm, np.float32)
@@ -160,8 +159,9 @@ class Lighting:
             * patch.skin
         )
         further = 1.0 / (1.0 - float(once[patch.skin].mean()))
-        return self._spread(np.float32(further) * once.astype(np.float32) * entering, patch.skin,
-                            pitch_mm)  # fmt: skip
+        return self._spread(
+            np.float32(further) * once.astype(np.float32) * entering, patch.skin, pitch_mm
+        )
 
     def _spread(self, entering: Float32Array, skin: BoolArray, pitch_mm: float) -> Float32Array:
         """Spread light inside the skin; beyond the picture it goes on mirrored."""

@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import View
-from rigsim.geometry.mesh import Float32Array
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from rigsim.skin_patch.motion import Pose
-
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 JAW_REFLECTANCE: Final = 0.03
 """Of the jaws' matt black."""
@@ -75,19 +72,19 @@ class Sampled(Protocol):
     """A relief at points, see `rigsim.skin_patch.stretch.SurfaceSample`."""
 
     @property
-    def height_um(self) -> NDArray[np.floating]:
+    def height_um(self) -> FloatArray:
         """Height, um."""
 
     @property
-    def slope_x(self) -> NDArray[np.floating]:
+    def slope_x(self) -> FloatArray:
         """Slope dh/dx, dimensionless."""
 
     @property
-    def slope_y(self) -> NDArray[np.floating]:
+    def slope_y(self) -> FloatArray:
         """Slope dh/dy, y up."""
 
     @property
-    def albedo(self) -> NDArray[np.floating]:
+    def albedo(self) -> FloatArray:
         """Diffuse reflectance."""
 
     @property
@@ -138,7 +135,7 @@ class PatchSurface:
         return PatchSurface(*cut)
 
 
-def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[FloatArray, FloatArray]:
+def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[Float64Array, Float64Array]:
     """Return x (W s,) and y (H s,) of the camera's samples in the plane z = 0, mm."""
     pitch = view.distance_mm / view.focal_px
     places = []
@@ -149,9 +146,15 @@ def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[FloatArr
 
 
 def stand(
-    relief: Relief, grip: Grip, pose: Pose, x_mm: FloatArray, y_mm: FloatArray, *,
-    eye_mm: float, alpha: float,
-) -> PatchSurface:  # fmt: skip
+    relief: Relief,
+    grip: Grip,
+    pose: Pose,
+    x_mm: Float64Array,
+    y_mm: Float64Array,
+    *,
+    eye_mm: float,
+    alpha: float,
+) -> PatchSurface:
     """Return what the camera's samples meet.
 
     Parameters
@@ -210,8 +213,8 @@ def stand(
 
 
 def bulge(
-    grip: Grip, x_mm: FloatArray, y_mm: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    grip: Grip, x_mm: Float64Array, y_mm: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return how far skin stands out of its plane in mm, and its slopes in x and y.
 
     Skin between jaws bulges, the more the less it is stretched; buckled skin has a fold besides,
@@ -238,7 +241,7 @@ def bulge(
     return height, cosine * d_along - sine * d_across, sine * d_along + cosine * d_across
 
 
-def _hump(x: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
+def _hump(x: Float64Array, half: float) -> tuple[Float64Array, Float64Array]:
     """Return cos^2 that ends at plus and minus ``half``, and its derivative."""
     phase = np.clip(0.5 * np.pi * x / half, -0.5 * np.pi, 0.5 * np.pi)
     return np.cos(phase) ** 2, -0.5 * np.pi / half * np.sin(2.0 * phase)

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from capture.rig import load_rig
 from rigsim import shading
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Films
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
-from rigsim.geometry.mesh import Float32Array, Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.lobe_moments import led_moments
 from rigsim.light.plastic import plastic_scale
 from rigsim.render import Caster, MovedLight, look_at
@@ -28,8 +29,6 @@ from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA
 from rigsim.world.taped_skin import GripState
-
-FloatArray = NDArray[np.float64]
 
 NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
 NO_FILM: Final = Films(1.0 + 1e-9, math.inf, 0.0)
@@ -110,7 +109,7 @@ def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
 
 def traced(
     scene: GradientScene, pixels: NDArray[np.intp], *, subpixels: int = 4
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Sum over LEDs one by one, with a shadow ray to each, in some pixels.
 
     Parameters
@@ -166,7 +165,7 @@ def traced(
     return mean, gone / (mean[:, 0] + gone)
 
 
-def picture(scene: GradientScene, pixels: NDArray[np.intp]) -> FloatArray:
+def picture(scene: GradientScene, pixels: NDArray[np.intp]) -> Float64Array:
     """Return `GradientScene`'s own light in some pixels, as `traced` gives it."""
     light = scene.stokes(NEUTRAL)[:, 0]
     return np.asarray(light.reshape(4, -1)[:, pixels].T, np.float64)
@@ -285,7 +284,7 @@ def rendered(
     return np.asarray(strength * scene.unit * image[..., 0], np.float32), spent
 
 
-def judge(found: FloatArray, reference: FloatArray, seconds: float, *, blocks: int = 40) -> Way:
+def judge(found: Float64Array, reference: Float64Array, seconds: float, *, blocks: int = 40) -> Way:
     """Compare a picture with the reference, both of shape (n,) or (n, k)."""
     difference = found - reference
     error = float(np.sqrt(np.mean(difference**2)) / reference.mean())

@@ -14,17 +14,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from capture.rig import load_rig
+from rigsim.arrays import Float64Array
 from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import Pose
 from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
-
-FloatArray = NDArray[np.float64]
 
 LONG_UM: Final = 240.0
 """Period of waves without lens and pixels that give the scale of the others."""
@@ -80,9 +79,13 @@ class WavyScene(GradientScene):
         self.forget()
 
     def surface(
-        self, grip: Grip, *, subpixels: int = 1, border_px: int = 0,
+        self,
+        grip: Grip,
+        *,
+        subpixels: int = 1,
+        border_px: int = 0,
         jump_mm: tuple[float, float] = (0.0, 0.0),
-    ) -> PatchSurface:  # fmt: skip
+    ) -> PatchSurface:
         """Return the waves at the camera's samples."""
         view = self.rig.views[0]
         x, y = sample_grid(view, subpixels=subpixels, border_px=border_px)
@@ -98,7 +101,7 @@ def wavy_scene(*, optics: bool = True) -> WavyScene:
     return WavyScene(rig, dataclasses.replace(skin, alpha=even), optics=optics, subpixels=2)
 
 
-def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> FloatArray:
+def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float64Array:
     """Return which part of a wave's slope the pictures hold.
 
     Parameters

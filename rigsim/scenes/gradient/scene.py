@@ -17,13 +17,12 @@ from collections.abc import Sequence
 from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, RigError
 from rigsim import shading
+from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Films, films_of
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.lobe_moments import Surface
 from rigsim.needs.effects import Noise, SceneNeeds
 from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS
@@ -284,8 +283,10 @@ class GradientScene:
         reach = border if any(drift) else 0
         part = slice(border - reach, wide.shape[1] - border + reach)
         column = slice(border - reach, wide.shape[2] - border + reach)
-        stokes = np.zeros((3, wide.shape[1] - 2 * (border - reach),
-                           wide.shape[2] - 2 * (border - reach)), np.float32)  # fmt: skip
+        stokes = np.zeros(
+            (3, wide.shape[1] - 2 * (border - reach), wide.shape[2] - 2 * (border - reach)),
+            np.float32,
+        )
         for m in np.flatnonzero(weights):
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
         image = self._analysed(stokes, analyser_deg, border_px=reach)
@@ -303,7 +304,7 @@ class GradientScene:
         exposure_s: float,
         seed: int,
         grip: Grip | None = None,
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose the camera once.
 
         Parameters
@@ -347,18 +348,27 @@ class GradientScene:
     # truth --------------------------------------------------------------------------------------
 
     def surface(
-        self, grip: Grip, *, subpixels: int = 1, border_px: int = 0,
+        self,
+        grip: Grip,
+        *,
+        subpixels: int = 1,
+        border_px: int = 0,
         jump_mm: tuple[float, float] = (0.0, 0.0),
-    ) -> PatchSurface:  # fmt: skip
+    ) -> PatchSurface:
         """Return what stands at the camera's samples in a state, without drift."""
         skin = self.skin
         x, y = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
         pose = self.pose(grip)
         moved = Pose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.turn_rad)
         return stand(
-            self.relief(grip), grip, moved, x, y,
-            eye_mm=self._view.distance_mm, alpha=float(np.median(skin.alpha)),
-        )  # fmt: skip
+            self.relief(grip),
+            grip,
+            moved,
+            x,
+            y,
+            eye_mm=self._view.distance_mm,
+            alpha=float(np.median(skin.alpha)),
+        )
 
     def relief(self, grip: Grip) -> StretchedSkin:
         """Return the skin in a state, in its own frame."""

@@ -6,20 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import UNITS, SkinAppearance, SkinMap
 from rigsim import shading
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
-from rigsim.geometry.mesh import Float32Array
 from rigsim.light.lobe_moments import Surface, led_moments
 from rigsim.render.lens_blur import blur
 from rigsim.scenes.gradient.patch import Grip, PatchSurface
 
 if TYPE_CHECKING:
     from rigsim.scenes.gradient.scene import GradientScene
-
-FloatArray = NDArray[np.float64]
 
 
 def state_name(angle_deg: float, step: int) -> str:
@@ -112,15 +109,11 @@ def appearance(scene: GradientScene, grips: Sequence[Grip]) -> SkinAppearance:
         "drift_um": 0.0 if scene.motion is None else scene.motion.drift_um,
     }
     return SkinAppearance(
-        maps,
-        "simulated",
-        parameters=parameters,
-        left_out=tuple(scene.left_out),
-        seed=scene.seed,
+        maps, "simulated", parameters=parameters, left_out=tuple(scene.left_out), seed=scene.seed
     )
 
 
-def _placement(scene: GradientScene, grip: Grip) -> FloatArray:
+def _placement(scene: GradientScene, grip: Grip) -> Float64Array:
     """Return the gradient of the map from relaxed skin to the rig, turn included, (2, 2)."""
     turn = scene.pose(grip).turn_rad
     c, s = np.cos(turn), np.sin(turn)
@@ -190,7 +183,7 @@ def lights(sphere: BuiltSphere, surface: Surface) -> list[dict[str, object]]:
     return out
 
 
-def _through(stokes: Float32Array, eye: FloatArray, surface: Surface) -> tuple[float, float]:
+def _through(stokes: Float32Array, eye: Float64Array, surface: Surface) -> tuple[float, float]:
     right = np.array(surface.image_right)
     up = np.cross(eye, right)
     parallel, crossed = (

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig
 from model import spectra
+from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
 from rigsim.fiber.probe_profile import Profile, Profiles
 from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
@@ -31,8 +31,6 @@ from rigsim.world.suction import HeadState
 if TYPE_CHECKING:
     pass
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
 """Full scales per second in a spot's middle per R_f in 1/mm^2."""
@@ -153,7 +151,7 @@ class ProbeScene:
         except TissueError as error:
             raise SceneError(str(error)) from error
 
-    def fibre_light(self, head: HeadState, *, fibre: int | None = None) -> FloatArray:
+    def fibre_light(self, head: HeadState, *, fibre: int | None = None) -> Float64Array:
         """Return `through_fibres` of what the head touches; nothing where it is in the air."""
         profile = self.profile(head)
         if profile is None:
@@ -161,8 +159,8 @@ class ProbeScene:
         return self.through_fibres(profile.reflectance_per_mm2, fibre=fibre)
 
     def through_fibres(
-        self, reflectance_per_mm2: FloatArray, *, fibre: int | None = None
-    ) -> FloatArray:
+        self, reflectance_per_mm2: Float64Array, *, fibre: int | None = None
+    ) -> Float64Array:
         """Return the light that comes out of the fibres, in full scales per second at level 1.
 
         Parameters
@@ -193,7 +191,7 @@ class ProbeScene:
         taken = (open_share * self.build.gain)[:, None] * reflectance_per_mm2
         return np.asarray(METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
 
-    def image(self, fibre_light: FloatArray) -> Float32Array:
+    def image(self, fibre_light: Float64Array) -> Float32Array:
         """Return the light on the sensor, shape (H, W, 3), of what comes out of the fibres."""
         height, width = self._view.height_px, self._view.width_px
         light = self._images @ np.asarray(fibre_light, np.float32)
@@ -207,7 +205,7 @@ class ProbeScene:
         exposure_s: float,
         seed: int,
         head: HeadState,
-    ) -> NDArray[np.uint16]:
+    ) -> UInt16Array:
         """Expose the camera once.
 
         Parameters

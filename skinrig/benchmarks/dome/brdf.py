@@ -8,7 +8,6 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from model.brdf import microfacet
@@ -16,6 +15,7 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
 from reconstruction.diffuse_albedo import estimation as diffuse_albedo
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.dome import brdf_truth
 from skinrig.benchmarks.measurement import (
     BandError,
@@ -26,8 +26,6 @@ from skinrig.benchmarks.measurement import (
     measure,
     once,
 )
-
-FloatArray = NDArray[np.float64]
 
 ALBEDO_ERROR = 3.0
 HELD_OUT_ERROR = 5.0
@@ -61,9 +59,15 @@ def albedo(*, toy: bool) -> StageBenchmark:
                         p: brdf_truth.Points = p, method: diffuse_albedo.Method = method
                     ) -> diffuse_albedo.DiffuseAlbedo:
                         return diffuse_albedo.estimate(
-                            p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance,
-                            valid=p.valid, method=method,
-                        )  # fmt: skip
+                            p.f,
+                            p.light,
+                            p.view,
+                            p.normals,
+                            eta=ETA,
+                            variance=p.variance,
+                            valid=p.valid,
+                            method=method,
+                        )
 
                     timing = measure(run, repeats=1, memory=False)
                     relative = 100.0 * (run().r_d / p.r_d - 1.0)
@@ -72,8 +76,11 @@ def albedo(*, toy: bool) -> StageBenchmark:
                     bias = float(np.median(relative[:, channel]))
                     spread = float(np.std(relative[:, channel]))
                     knobs = {
-                        "skin": skin, "noise": noise, "samples": p.f.shape[1], "method": method,
-                    }  # fmt: skip
+                        "skin": skin,
+                        "noise": noise,
+                        "samples": p.f.shape[1],
+                        "method": method,
+                    }
                     also = {"bias_percent": round(bias, 2), "spread_percent": round(spread, 2)}
                     # 68 % interval of a median of `count` errors of this spread
                     half = 1.2533 * float(np.std(np.abs(relative[:, channel]))) / np.sqrt(count)
@@ -83,9 +90,14 @@ def albedo(*, toy: bool) -> StageBenchmark:
                     if method == "envelope" and noise == 0.02 and (toy or samples == 900):
                         bands[skin] = BandError(error, interval)
                         limits.append(
-                            Limit(f"median error of R_d, worst channel, {skin} skin", error,
-                                  ALBEDO_ERROR, "<=", "%")
-                        )  # fmt: skip
+                            Limit(
+                                f"median error of R_d, worst channel, {skin} skin",
+                                error,
+                                ALBEDO_ERROR,
+                                "<=",
+                                "%",
+                            )
+                        )
     return StageBenchmark(
         "diffuse-albedo",
         "median error of R_d, worst channel, %",
@@ -110,9 +122,15 @@ def surface(*, toy: bool) -> StageBenchmark:
         p, out, given, diffuse = _given(SKINS["light"], count, samples, rng)
 
         def point(
-            name: str, timing: Timing, lobe: FloatArray, *, rank: int = 0,
-            p: brdf_truth.Points = p, out: NDArray[np.bool_] = out, diffuse: FloatArray = diffuse,
-        ) -> Point:  # fmt: skip
+            name: str,
+            timing: Timing,
+            lobe: Float64Array,
+            *,
+            rank: int = 0,
+            p: brdf_truth.Points = p,
+            out: BoolArray = out,
+            diffuse: Float64Array = diffuse,
+        ) -> Point:
             return _judged(name, timing, lobe, p, out, diffuse, rank, rng)
 
         ways: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
@@ -149,11 +167,15 @@ def surface(*, toy: bool) -> StageBenchmark:
     faster, excess = _beside_scipy(basis, toy=toy)
     limits = (
         Limit("median error of all light under lights left out", error, HELD_OUT_ERROR, "<=", "%"),
-        Limit("times faster on 2 cores than a loop of SciPy's nnls, 5,000 x 900 x 59, matrices "
-              "included",
-              faster, TIMES_FASTER, ">="),
+        Limit(
+            "times faster on 2 cores than a loop of SciPy's nnls, 5,000 x 900 x 59, matrices "
+            "included",
+            faster,
+            TIMES_FASTER,
+            ">=",
+        ),
         Limit("largest residual above SciPy's", 100.0 * excess, RESIDUAL, "<=", "%"),
-    )  # fmt: skip
+    )
     return StageBenchmark(
         "brdf",
         "median error of all light under lights left out, %",
@@ -169,7 +191,7 @@ def surface(*, toy: bool) -> StageBenchmark:
 
 def _given(
     r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
-) -> tuple[brdf_truth.Points, NDArray[np.bool_], brdf_basis.SurfaceSamples, FloatArray]:
+) -> tuple[brdf_truth.Points, BoolArray, brdf_basis.SurfaceSamples, Float64Array]:
     """Return points, their samples left out, what is fitted, and the diffuse part taken off."""
     p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
     out = _left_out(p, rng)
@@ -178,19 +200,25 @@ def _given(
         p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=p.valid & ~out
     )
     given = brdf_basis.surface_samples(
-        p.f, p.light, p.view, p.normals, found.r_d, eta=ETA, variance=p.variance,
+        p.f,
+        p.light,
+        p.view,
+        p.normals,
+        found.r_d,
+        eta=ETA,
+        variance=p.variance,
         valid=p.valid & ~out,
-    )  # fmt: skip
+    )
     return p, out, given, _diffuse(p, found.r_d)
 
 
-def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> BoolArray:
     """Return the samples of a fifth of the lights."""
     lights, which = np.unique(p.light.round(6).reshape(-1, 3), axis=0, return_inverse=True)
     return np.asarray((rng.random(len(lights)) < 0.2)[which].reshape(p.valid.shape))
 
 
-def _diffuse(p: brdf_truth.Points, r_d: FloatArray) -> FloatArray:
+def _diffuse(p: brdf_truth.Points, r_d: Float64Array) -> Float64Array:
     """Return the green diffuse BRDF by the convention, (P, M)."""
     zero = np.zeros_like(p.f)
     s = brdf_basis.surface_samples(zero, p.light, p.view, p.normals, r_d, eta=ETA, valid=p.valid)
@@ -199,17 +227,25 @@ def _diffuse(p: brdf_truth.Points, r_d: FloatArray) -> FloatArray:
     return np.asarray(mean * (r_d[:, 1] / r_d.mean(axis=1))[:, None])
 
 
-def _lobes(weights: FloatArray, basis: BrdfBasis, p: brdf_truth.Points) -> FloatArray:
-    return np.stack([
-        brdf_basis.evaluate(x, basis, to, at, n)
-        for x, to, at, n in zip(weights, p.light, p.view, p.normals, strict=True)
-    ])  # fmt: skip
+def _lobes(weights: Float64Array, basis: BrdfBasis, p: brdf_truth.Points) -> Float64Array:
+    return np.stack(
+        [
+            brdf_basis.evaluate(x, basis, to, at, n)
+            for x, to, at, n in zip(weights, p.light, p.view, p.normals, strict=True)
+        ]
+    )
 
 
 def _judged(
-    name: str, timing: Timing, lobe: FloatArray, p: brdf_truth.Points, out: NDArray[np.bool_],
-    diffuse: FloatArray, rank: int, rng: np.random.Generator,
-) -> Point:  # fmt: skip
+    name: str,
+    timing: Timing,
+    lobe: Float64Array,
+    p: brdf_truth.Points,
+    out: BoolArray,
+    diffuse: Float64Array,
+    rank: int,
+    rng: np.random.Generator,
+) -> Point:
     at = p.valid & out
     true_diffuse = _diffuse(p, p.r_d)
     relative = 100.0 * np.abs((lobe + diffuse) / (p.surface + true_diffuse + 1e-12) - 1.0)
@@ -220,27 +256,30 @@ def _judged(
     root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
     bright = at & (p.surface > 0.5 * true_diffuse)
     knobs: dict[str, str | int | float | bool] = {
-        "way": name, "samples": p.f.shape[1], "points": len(p.f),
-    }  # fmt: skip
+        "way": name,
+        "samples": p.f.shape[1],
+        "points": len(p.f),
+    }
     also = {
-        "highlight_error_percent": round(float(np.median(
-            np.abs(lobe[bright] / p.surface[bright] - 1.0))) * 100.0, 2),
+        "highlight_error_percent": round(
+            float(np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))) * 100.0, 2
+        ),
         "cube_root_rms": round(float(root), 4),
-    }  # fmt: skip
+    }
     if rank:
         knobs["rank"] = rank
     error = float(np.median(by_point))
     return Point(knobs, timing, error, (float(low), float(high)), also=also)
 
 
-def _cosines(p: brdf_truth.Points, point: int) -> tuple[FloatArray, ...]:
+def _cosines(p: brdf_truth.Points, point: int) -> tuple[Float64Array, ...]:
     to, at, n = p.light[point], p.view[point], p.normals[point]
     mu_l, mu_v = to @ n, at @ n
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + np.sum(to * at, axis=-1)), 0.0, 1.0))
     return mu_l, mu_v, np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0), cos_d
 
 
-def _ggx(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples) -> FloatArray:
+def _ggx(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples) -> Float64Array:
     """Fit strength and roughness of one GGX lobe a point: the best of 60 roughnesses."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
@@ -259,7 +298,7 @@ def _ggx(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples) -> FloatArray:
     return lobes
 
 
-def _rooted(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples, basis: BrdfBasis) -> FloatArray:
+def _rooted(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples, basis: BrdfBasis) -> Float64Array:
     """Fit cube roots of the matrix' elements to cube roots of the samples, the paper's words."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
@@ -283,9 +322,11 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
         p.f, p.light, p.view, p.normals, p.r_d, eta=ETA, variance=p.variance, valid=p.valid
     )
     many = brdf_basis.SurfaceSamples(
-        *(np.tile(getattr(s, f.name), (copies, *[1] * (getattr(s, f.name).ndim - 1)))
-          for f in dataclasses.fields(s))
-    )  # fmt: skip
+        *(
+            np.tile(getattr(s, f.name), (copies, *[1] * (getattr(s, f.name).ndim - 1)))
+            for f in dataclasses.fields(s)
+        )
+    )
     brdf_basis.fit_weights(s, basis, compress="none")
     problems = []
     for point in range(subset):

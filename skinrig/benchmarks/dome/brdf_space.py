@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from reconstruction.brdf_basis import space as brdf_space
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.arrays import Float64Array, Int64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
@@ -40,9 +40,9 @@ def space(*, toy: bool) -> StageBenchmark:
                 def run(
                     rank: int = rank,
                     method: Literal["shares", "brdf"] = method,
-                    trained: brdf_space.FloatArray = trained,
-                    tried: brdf_space.FloatArray = tried,
-                    whose: NDArray[np.int64] | None = whose,
+                    trained: Float64Array = trained,
+                    tried: Float64Array = tried,
+                    whose: Int64Array | None = whose,
                 ) -> brdf_space.SpaceCurve:
                     return brdf_space.curve(
                         trained, basis, ranks=(rank,), held_out=tried, groups=whose, method=method
@@ -53,12 +53,15 @@ def space(*, toy: bool) -> StageBenchmark:
                 inside, error = float(found.error[0]), float(found.held_out[0])
                 half = float(found.held_out_stderr[0])
                 knobs: dict[str, str | int | float | bool] = {
-                    "set": data.name, "way": method, "rank": rank, "points": found.points,
-                }  # fmt: skip
+                    "set": data.name,
+                    "way": method,
+                    "rank": rank,
+                    "points": found.points,
+                }
                 also = {
                     "own_points_error_percent": round(100.0 * inside, 3),
                     "noise_percent": round(100.0 * data.noise, 1),
-                }  # fmt: skip
+                }
                 interval = (100.0 * max(error - half, 0.0), 100.0 * (error + half))
                 points.append(Point(knobs, timing, 100.0 * error, interval, also=also))
                 if method == "shares" and rank == NOISE_RANK:
@@ -76,12 +79,19 @@ def space(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit("largest rise of the error from a rank to the next, way brdf", 100.0 * steepest,
-                  0.0, "<=", "%"),
-            Limit("error of way brdf over that of scikit-learn's NMF alone, worst", excess,
-                  1.0, "<="),
-            Limit(f"error at rank {NOISE_RANK} over what noise leaves, worst set", beyond,
-                  1.0, "<="),
+            Limit(
+                "largest rise of the error from a rank to the next, way brdf",
+                100.0 * steepest,
+                0.0,
+                "<=",
+                "%",
+            ),
+            Limit(
+                "error of way brdf over that of scikit-learn's NMF alone, worst", excess, 1.0, "<="
+            ),
+            Limit(
+                f"error at rank {NOISE_RANK} over what noise leaves, worst set", beyond, 1.0, "<="
+            ),
         ),
         left_out=(
             ("all points of figure 15", "`skinrig analyse brdf --out analysis` has them"),
@@ -90,7 +100,7 @@ def space(*, toy: bool) -> StageBenchmark:
         condition=("set",),
         interval_of="points left out",
         no_bands="mixtures of the surface term, which pigment does not enter",
-    )  # fmt: skip
+    )
 
 
 def _datasets(*, toy: bool) -> tuple[Dataset, ...]:

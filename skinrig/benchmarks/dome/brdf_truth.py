@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from skinrig.arrays import BoolArray, Float64Array
 
 LIGHTS, VIEWS = 150, 16
 LIGHT_SKIN = (0.62, 0.42, 0.32)
@@ -19,18 +18,18 @@ DARK_SKIN = (0.16, 0.085, 0.055)
 class Points:
     """P points under a dome's lights, with what is true of them."""
 
-    f: FloatArray
+    f: Float64Array
     """BRDF samples with noise, (P, M, 3), 1/sr."""
-    variance: FloatArray
+    variance: Float64Array
     """Of `f`."""
-    light: FloatArray
-    view: FloatArray
-    normals: FloatArray
-    valid: NDArray[np.bool_]
+    light: Float64Array
+    view: Float64Array
+    normals: Float64Array
+    valid: BoolArray
     """(P, M)."""
-    r_d: FloatArray
+    r_d: Float64Array
     """(P, 3)."""
-    surface: FloatArray
+    surface: Float64Array
     """Surface BRDF without noise, (P, M), 1/sr."""
 
 
@@ -107,7 +106,7 @@ def dome(
     return Points(f, sigma**2, light, view, normals, valid, albedo, surface)
 
 
-def _slopes(tan_h: FloatArray, m: FloatArray, tail: str) -> FloatArray:
+def _slopes(tan_h: Float64Array, m: Float64Array, tail: str) -> Float64Array:
     """Return the density of slopes; its integral over the plane of slopes is 1."""
     q = tan_h / m
     if tail == "light":
@@ -115,11 +114,11 @@ def _slopes(tan_h: FloatArray, m: FloatArray, tail: str) -> FloatArray:
     return np.asarray(1.2 / (np.pi * m**2) * (1.0 + q**2) ** -2.2)
 
 
-def _unit(v: FloatArray) -> FloatArray:
+def _unit(v: Float64Array) -> Float64Array:
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
-def _fresnel(c: FloatArray, eta: float) -> FloatArray:
+def _fresnel(c: Float64Array, eta: float) -> Float64Array:
     """Return unpolarized reflectance by the angles of Snell's law."""
     inside = np.arcsin(np.sqrt(1.0 - c**2) / eta)
     outside = np.arccos(c)

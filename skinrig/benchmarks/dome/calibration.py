@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.geometry import CameraPose, bundle, nominal_cameras
 from capture.calibration.geometry.board import Board, Sighting, find_board
@@ -15,6 +14,7 @@ from capture.calibration.lights import mirror_lights, mirror_sphere
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import Rig, load_rig
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 if TYPE_CHECKING:
@@ -78,11 +78,14 @@ def geometry(*, toy: bool) -> StageBenchmark:
         "the simulated dome as built",
         0.0,
         tuple(points),
-        (Limit("worst camera's mean reprojection of the truth", worst, REPROJECTION_PX, "<=",
-               "px"),),
+        (
+            Limit(
+                "worst camera's mean reprojection of the truth", worst, REPROJECTION_PX, "<=", "px"
+            ),
+        ),
         interval_of="cameras",
         no_bands="a calibration by targets: no skin is in the pictures",
-    )  # fmt: skip
+    )
 
 
 def lights(*, toy: bool) -> StageBenchmark:
@@ -170,16 +173,19 @@ def _frame(
     pops = [_Pulse(k, level, 0.0, exposure_s) for k in lit]
     cfa = scene.exposure(name, pops=pops, exposure_s=exposure_s, seed=seed)
     return RawFrame(
-        cfa=cfa, pattern=view.cfa, black=(float(view.black_level),) * 4, white=view.white_level,
+        cfa=cfa,
+        pattern=view.cfa,
+        black=(float(view.black_level),) * 4,
+        white=view.white_level,
         noise_profile=sensor_of(view).noise_profile(exposure_s),
-    )  # fmt: skip
+    )
 
 
 def _point(
     knobs: dict[str, str | int | float | bool],
     call: Callable[[], Any],
-    squares: NDArray[np.float64],
-    variances: NDArray[np.float64],
+    squares: Float64Array,
+    variances: Float64Array,
 ) -> Point:
     """Return a point with a bootstrap interval of the error and the bound that errors state."""
     rng = np.random.default_rng(0)

@@ -8,10 +8,10 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population.population import Member, table_1
+from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.editing import albedo as editing_albedo
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -19,8 +19,6 @@ from skinrig.fitting import traits
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
-
-Floats = NDArray[np.float64]
 
 TAN: Final = 1.5
 """Factor of melanin."""
@@ -48,9 +46,10 @@ def editing(*, toy: bool) -> StageBenchmark:
     points, returns, kept = [], [], {}
     bands: dict[str, BandError] = {}
     settings: list[tuple[VectorKind, int, float]] = [
-        ("quantiles", 5, editing_albedo.NOISE), ("quantiles", 5, 0.0),
+        ("quantiles", 5, editing_albedo.NOISE),
+        ("quantiles", 5, 0.0),
         ("histograms", 5, editing_albedo.NOISE),
-    ]  # fmt: skip
+    ]
     settings += [("quantiles", n, editing_albedo.NOISE) for n in ((1,) if toy else (1, 2, 10))]
     spaces: dict[str, AlbedoTraits] = {}
     for kind, iterations, noise in settings:
@@ -66,9 +65,10 @@ def editing(*, toy: bool) -> StageBenchmark:
             errors.append(100 * float(np.median(np.abs(new / truth.r_d - 1)[good])))
             back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[good] ** 2))))
         timing = measure(
-            partial(call, before[0].r_d, before[0].valid, 1.0), repeats=1 if toy else 3,
+            partial(call, before[0].r_d, before[0].valid, 1.0),
+            repeats=1 if toy else 3,
             memory=not toy,
-        )  # fmt: skip
+        )
         if not bands:
             bands = {
                 name: _on_skin(call, faces, band.melanin, people[0])
@@ -109,7 +109,7 @@ def editing(*, toy: bool) -> StageBenchmark:
 
 
 def _on_skin(
-    edit: Callable[..., NDArray[np.float32]], faces: CommonFaces, melanin: float, person: Member
+    edit: Callable[..., Float32Array], faces: CommonFaces, melanin: float, person: Member
 ) -> BandError:
     """Return the error of a tan put on one face of so much melanin, %."""
     here = dataclasses.replace(person, melanin=melanin)
@@ -142,17 +142,25 @@ def _edit(
     space: AlbedoTraits,
     iterations: int,
     noise: float,
-    r_d: NDArray[np.floating],
-    valid: NDArray[np.bool_],
+    r_d: FloatArray,
+    valid: BoolArray,
     amount: float,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Edit a map that lies in the common map already."""
     size = len(r_d)
     place = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     on = np.ones((size, size), np.bool_)
     chart = Chart(size, place, on, on, np.zeros((size, size), np.float32))
     found = editing_albedo.edit_albedo(
-        r_d, valid, chart, space, {"tan": amount}, region=on, share=np.ones((size, size)),
-        iterations=iterations, noise=noise, rng=np.random.default_rng(int(amount < 0)),
-    )  # fmt: skip
+        r_d,
+        valid,
+        chart,
+        space,
+        {"tan": amount},
+        region=on,
+        share=np.ones((size, size)),
+        iterations=iterations,
+        noise=noise,
+        rng=np.random.default_rng(int(amount < 0)),
+    )
     return found.apply(r_d)[0]

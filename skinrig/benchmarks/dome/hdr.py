@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture import hdr
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
 
 GAIN, READ_NOISE, BLACK, WHITE = 2.0, 8.0, 512.0, 16383.0
@@ -18,7 +18,7 @@ ABOVE_BOUND = 1.05
 FRAMES, SIDE = 23, 1024
 SPAN_S = (1e-3, 1.0)
 
-Frames = list[NDArray[np.uint16]]
+Frames = list[UInt16Array]
 
 
 def merging(*, toy: bool) -> StageBenchmark:
@@ -70,23 +70,17 @@ def merging(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _merge(
-    frames: Frames, times: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _merge(frames: Frames, times: Float64Array) -> tuple[Float32Array, Float32Array, BoolArray]:
     return hdr.merge(frames, times, gain=GAIN, read_noise=READ_NOISE, black=BLACK, white=WHITE)
 
 
-def _expose(
-    scene: NDArray[np.float64], time_s: float, rng: np.random.Generator
-) -> NDArray[np.uint16]:
+def _expose(scene: Float64Array, time_s: float, rng: np.random.Generator) -> UInt16Array:
     electrons = rng.poisson(np.minimum(scene * time_s * GAIN, 1e6)).astype(np.float32)
     electrons += READ_NOISE * rng.standard_normal(scene.shape, np.float32)
     return np.clip(np.rint(electrons / GAIN + BLACK), 0, WHITE).astype(np.uint16)
 
 
-def _bound(
-    scene: NDArray[np.float64], times: Sequence[float] | NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _bound(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
     """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
     information = np.zeros_like(scene)
     for t in times:
@@ -96,7 +90,7 @@ def _bound(
 
 
 def _beside_opencv(
-    frames: Frames, times: NDArray[np.float64], *, rounds: int
+    frames: Frames, times: Float64Array, *, rounds: int
 ) -> tuple[Timing, float, float]:
     """Time both in turn, so that both meet the same machine; return the ratio of the fastest."""
     import cv2

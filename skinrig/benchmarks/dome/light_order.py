@@ -42,16 +42,24 @@ def light_order(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit("flashes in the worst second", chosen.flashes_per_s,
-                  limits.max_flashes_per_s - 0.5, "<="),
+            Limit(
+                "flashes in the worst second",
+                chosen.flashes_per_s,
+                limits.max_flashes_per_s - 0.5,
+                "<=",
+            ),
             Limit("rms of the chosen order", chosen.rms, limits.max_flicker_rms, "<="),
-            Limit("times less flicker than a spiral with dark gaps", worst.rms / chosen.rms,
-                  LESS_FLICKER, ">="),
+            Limit(
+                "times less flicker than a spiral with dark gaps",
+                worst.rms / chosen.rms,
+                LESS_FLICKER,
+                ">=",
+            ),
         ),
         condition=("gaps",),
         interval_of="nothing: an order's flicker is computed exactly",
         no_bands="light at the eyes: no skin enters",
-    )  # fmt: skip
+    )
 
 
 def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:

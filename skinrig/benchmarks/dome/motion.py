@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reconstruction.registration import head_motion
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 EXPOSURE_S = 0.03
 
@@ -24,11 +22,11 @@ class _Superpixels:
     sensor: head_motion.Camera
 
     @property
-    def center_mm(self) -> Floats:
+    def center_mm(self) -> Float64Array:
         """Centre of projection, (3,)."""
         return self.sensor.center_mm
 
-    def project(self, points_mm: Floats) -> Floats:
+    def project(self, points_mm: Float64Array) -> Float64Array:
         """Return column and row (N, 2)."""
         return (self.sensor.project(points_mm) - 0.5) / 2
 
@@ -37,16 +35,16 @@ class _Superpixels:
 class Drift:
     """Tracking frames of one capture, with where the head was."""
 
-    frames: Sequence[Sequence[Floats]]
+    frames: Sequence[Sequence[Float64Array]]
     cameras: Sequence[_Superpixels]
-    points_mm: Floats
-    normals: Floats
-    times_s: Floats
-    poses: Sequence[tuple[Floats, Floats]]
-    twitch: Floats
+    points_mm: Float64Array
+    normals: Float64Array
+    times_s: Float64Array
+    poses: Sequence[tuple[Float64Array, Float64Array]]
+    twitch: Float64Array
     """How far the twitch of the mouth has gone, 0 to 1."""
 
-    def errors_mm(self, found: head_motion.HeadMotion) -> Floats:
+    def errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
         """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
         turns = head_motion.rotation_matrix(found.rotation_rad)
         out = []
@@ -57,7 +55,7 @@ class Drift:
             out.append(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
         return np.array(out)
 
-    def moved_mm(self) -> Floats:
+    def moved_mm(self) -> Float64Array:
         """Return how far the points moved in truth, RMS, (T - 1,)."""
         out = []
         for rotation, shift in self.poses[1:]:
@@ -173,9 +171,13 @@ def motion(*, toy: bool) -> StageBenchmark:
 def _point(seen: Drift, drift_mm: float, tracks: int, *, toy: bool) -> Point:
     def run() -> head_motion.HeadMotion:
         return head_motion.estimate(
-            seen.frames, seen.cameras, seen.points_mm, seen.normals, seen.times_s,
+            seen.frames,
+            seen.cameras,
+            seen.points_mm,
+            seen.normals,
+            seen.times_s,
             tracks_per_camera=tracks,
-        )  # fmt: skip
+        )
 
     timing = measure(run, repeats=1 if toy else 3)
     errors = seen.errors_mm(run())

@@ -6,16 +6,13 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 SECONDS = 3.0
 TIMES_FASTER = 100.0
@@ -29,16 +26,16 @@ NOISE = 0.005
 class Scene:
     """A glossy ball under many lights, with things between it and them."""
 
-    images: Float32
+    images: Float32Array
     """(N, H, W)."""
-    lights: Floats
+    lights: Float64Array
     """(N, 3)."""
-    normals: Float32
+    normals: Float32Array
     """(H, W, 3)."""
-    inside: NDArray[np.bool_]
-    matte: NDArray[np.bool_]
+    inside: BoolArray
+    matte: BoolArray
     """(N, H, W): samples that are lit, not shadowed and without a highlight above the noise."""
-    albedo: Float32
+    albedo: Float32Array
 
 
 def glossy_ball(
@@ -89,8 +86,13 @@ def glossy_ball(
 
 
 def numpy_irls_l1(
-    samples: Floats, lights: Floats, *, shadow: float = 0.1, steps: int = 100, tiny: float = 1e-6
-) -> Floats:
+    samples: Float64Array,
+    lights: Float64Array,
+    *,
+    shadow: float = 0.1,
+    steps: int = 100,
+    tiny: float = 1e-6,
+) -> Float64Array:
     """Fit pixels one by one by least absolute deviations, in plain NumPy.
 
     Iteratively reweighted least squares with weights 1 / max(|r|, tiny) from the least-squares
@@ -158,9 +160,9 @@ def normals(*, toy: bool) -> StageBenchmark:
     side = 40 if toy else 192
     points = []
 
-    def add(scene: Scene, noise: float, knobs: dict[str, str | int | float], **options: object) -> (
-        None
-    ):  # fmt: skip
+    def add(
+        scene: Scene, noise: float, knobs: dict[str, str | int | float], **options: object
+    ) -> None:
         def run() -> NormalMaps:
             return estimate_normals(scene.images, scene.lights, **options)  # type: ignore[arg-type]
 
@@ -170,12 +172,19 @@ def normals(*, toy: bool) -> StageBenchmark:
         points.append(Point({"noise": noise} | knobs, timing, error, interval, bound))
 
     for lights in (30, 12) if toy else (150, 75, 30, 12):
-        add(glossy_ball(side, lights, noise=NOISE, rng=rng), NOISE,
-            {"lights": lights, "fit": "robust"})  # fmt: skip
+        add(
+            glossy_ball(side, lights, noise=NOISE, rng=rng),
+            NOISE,
+            {"lights": lights, "fit": "robust"},
+        )
     dense = glossy_ball(side, 30 if toy else 150, noise=NOISE, rng=rng)
     for steps in (0, 4) if toy else (0, 2, 4, 8):
-        add(dense, NOISE, {"lights": len(dense.lights), "fit": "robust", "L1 steps": steps},
-            robustness=Robustness(l1_iterations=steps))  # fmt: skip
+        add(
+            dense,
+            NOISE,
+            {"lights": len(dense.lights), "fit": "robust", "L1 steps": steps},
+            robustness=Robustness(l1_iterations=steps),
+        )
     add(dense, NOISE, {"lights": len(dense.lights), "fit": "least squares"}, robust=False)
     for noise in (0.02,) if toy else (0.001, 0.02):
         scene = glossy_ball(side, len(dense.lights), noise=noise, rng=rng)
@@ -224,10 +233,19 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     error = np.degrees(angular_error_rad(ours.normals[both], truth[both])).mean()
     peer_error = np.degrees(angular_error_rad(theirs[both], truth[both])).mean()
     return (
-        Limit("processor seconds on each of 2 cores for 1024 x 1024 x 150", ours_s, SECONDS,
-              "<=", "s"),
-        Limit("times less processor time than NumPy IRLS-L1, 300 pixels extrapolated",
-              peer_s / (CORES * ours_s), TIMES_FASTER, ">="),
-        Limit("mean error over that of NumPy IRLS-L1, same pixels", float(error / peer_error),
-              1.0, "<="),
-    )  # fmt: skip
+        Limit(
+            "processor seconds on each of 2 cores for 1024 x 1024 x 150", ours_s, SECONDS, "<=", "s"
+        ),
+        Limit(
+            "times less processor time than NumPy IRLS-L1, 300 pixels extrapolated",
+            peer_s / (CORES * ours_s),
+            TIMES_FASTER,
+            ">=",
+        ),
+        Limit(
+            "mean error over that of NumPy IRLS-L1, same pixels",
+            float(error / peer_error),
+            1.0,
+            "<=",
+        ),
+    )

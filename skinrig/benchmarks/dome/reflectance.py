@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import load_rig
 from model import skin_reflectance
@@ -15,12 +14,11 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import SurfaceSamples
+from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.benchmarks.dome import texture as bench_texture
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.photographs.errors import LIMIT, luminance
-
-FloatArray = NDArray[np.float64]
 
 RANKS: Final = (1, 2, 4, 8, 24)
 USUAL_RANK: Final = 4
@@ -56,15 +54,15 @@ class FacePoints:
         (P, M, 3) true reflection, 1/sr.
     """
 
-    f: FloatArray
-    variance: FloatArray
-    light: FloatArray
-    view: FloatArray
-    normals: FloatArray
-    seen: NDArray[np.bool_]
-    left_out: NDArray[np.bool_]
-    surface: FloatArray
-    total: FloatArray
+    f: Float64Array
+    variance: Float64Array
+    light: Float64Array
+    view: Float64Array
+    normals: Float64Array
+    seen: BoolArray
+    left_out: BoolArray
+    surface: Float64Array
+    total: Float64Array
 
 
 def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
@@ -101,16 +99,25 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     seen = (cosines[0] > LEAST_COSINE) & (cosines[1] > LEAST_COSINE)
     count = pair.shape[1]
     total, specular = surface_brdf.evaluate(
-        np.repeat(packed, count, axis=0), np.repeat(normals, count, axis=0).astype(np.float32),
-        to[0].reshape(-1, 3), to[1].reshape(-1, 3),
-    )  # fmt: skip
+        np.repeat(packed, count, axis=0),
+        np.repeat(normals, count, axis=0).astype(np.float32),
+        to[0].reshape(-1, 3),
+        to[1].reshape(-1, 3),
+    )
     clean = np.asarray(total, np.float64).reshape(len(chosen), count, 3)
     sigma = NOISE * (clean + 0.02 / np.pi / np.maximum(cosines[0], LEAST_COSINE)[..., None])
     held = rng.random(len(ends[0])) < LEFT_OUT
     return FacePoints(
-        clean + sigma * rng.standard_normal(clean.shape), sigma**2, to[0], to[1], normals, seen,
-        held[which[0]], np.asarray(specular, np.float64).reshape(len(chosen), count), clean,
-    )  # fmt: skip
+        clean + sigma * rng.standard_normal(clean.shape),
+        sigma**2,
+        to[0],
+        to[1],
+        normals,
+        seen,
+        held[which[0]],
+        np.asarray(specular, np.float64).reshape(len(chosen), count),
+        clean,
+    )
 
 
 def model(*, toy: bool) -> StageBenchmark:
@@ -139,7 +146,7 @@ def model(*, toy: bool) -> StageBenchmark:
                 rank: int = rank,
                 given: SurfaceSamples = given,
                 full: brdf_basis.BasisWeights = full,
-            ) -> tuple[BrdfBasis, FloatArray]:
+            ) -> tuple[BrdfBasis, Float64Array]:
                 mix = brdf_basis.reduce(full, rank, basis=materials)[1]
                 lobes = materials.mixed(mix)
                 return lobes, brdf_basis.fit_weights(given, lobes).weights
@@ -152,9 +159,12 @@ def model(*, toy: bool) -> StageBenchmark:
             error = float(np.median(surface))
             total = float(np.median(everything))
             knobs: dict[str, str | int | float | bool] = {
-                "part": "lobes", "rank": rank, "subject": subject, "points": len(surface),
+                "part": "lobes",
+                "rank": rank,
+                "subject": subject,
+                "points": len(surface),
                 "samples": samples,
-            }  # fmt: skip
+            }
             also = {"all_light_error_percent": round(total, 3)}
             points.append(Point(knobs, timing, error, (low, high), also=also))
             if rank == USUAL_RANK:
@@ -188,8 +198,8 @@ def model(*, toy: bool) -> StageBenchmark:
 
 
 def _errors(
-    p: FacePoints, lobes: BrdfBasis, weights: FloatArray, r_d: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    p: FacePoints, lobes: BrdfBasis, weights: Float64Array, r_d: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return of each point the surface term's error over its sum, and that of all light, %."""
     known = np.asarray(np.isfinite(r_d).all(axis=1))
     at = p.seen & p.left_out & known[:, None]
@@ -210,8 +220,8 @@ def _errors(
 
 
 def _above(
-    pairs: NDArray[np.int64], ends: list[FloatArray], place: FloatArray, normals: FloatArray
-) -> NDArray[np.int64]:
+    pairs: Int64Array, ends: list[Float64Array], place: Float64Array, normals: Float64Array
+) -> Int64Array:
     """Return the pairs of each point with those above its horizon first, in their order."""
     up = [
         np.einsum("pmk,pk->pm", _unit(end[None] - place[:, None]), normals) > LEAST_COSINE
@@ -224,5 +234,5 @@ def _above(
     return np.take_along_axis(pairs, order, axis=1)
 
 
-def _unit(v: FloatArray) -> FloatArray:
+def _unit(v: Float64Array) -> Float64Array:
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

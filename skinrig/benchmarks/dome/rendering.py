@@ -7,13 +7,13 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.geometry import CameraPose
 from capture.rig import Rig, load_rig
 from rigsim.render import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
+from skinrig.arrays import FloatArray
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -53,13 +53,23 @@ def model(*, toy: bool) -> StageBenchmark:
     laid = {k: FittedSurface.of(true_model(scene, VIEW, binning=k), face.mesh) for k in binnings}
 
     def shown(
-        on: FittedSurface, way: Subsurface = "local", interior: Interior | None = None,
-        subpixels: int = 2, tolerance: float = 0.01,
-    ) -> Rendering:  # fmt: skip
+        on: FittedSurface,
+        way: Subsurface = "local",
+        interior: Interior | None = None,
+        subpixels: int = 2,
+        tolerance: float = 0.01,
+    ) -> Rendering:
         return render(
-            on.model, on, camera, light, subsurface=way, subpixels=subpixels, caster=caster,
-            interior=interior, tolerance=tolerance,
-        )  # fmt: skip
+            on.model,
+            on,
+            camera,
+            light,
+            subsurface=way,
+            subpixels=subpixels,
+            caster=caster,
+            interior=interior,
+            tolerance=tolerance,
+        )
 
     for subpixels in rays:
         timing = measure(lambda k=subpixels: shown(laid[1], subpixels=k), repeats=2, memory=None)  # type: ignore[misc]
@@ -76,15 +86,18 @@ def model(*, toy: bool) -> StageBenchmark:
     for tolerance in (0.1, 0.01) if toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         timing = measure(
             lambda t=tolerance: shown(skin, "dipole", interior, 1, t),  # type: ignore[misc]
-            repeats=1, memory=None,
-        )  # fmt: skip
+            repeats=1,
+            memory=None,
+        )
         error = _relative(shown(skin, "dipole", interior, 1, tolerance).diffuse, best)
         points.append(_point({"vary": "spreading", "tolerance": tolerance}, timing, error))
     seen = shown(laid[1])
     lit = seen.lit & seen.covered & (true.mean(axis=-1) > 0.0)
     gap = np.abs(seen.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
-    two = [dataclasses.replace(light, name=n, intensity=_part(light.intensity, w))
-           for n, w in (("a", 0.3), ("b", 0.7))]  # fmt: skip
+    two = [
+        dataclasses.replace(light, name=n, intensity=_part(light.intensity, w))
+        for n, w in (("a", 0.3), ("b", 0.7))
+    ]
     both = render(skin.model, laid[1], camera, two, subpixels=2, caster=caster).radiance
     bands = {
         name: _on_skin(band.preset, rig, size=128 if toy else 256, fine=fine)
@@ -98,10 +111,20 @@ def model(*, toy: bool) -> StageBenchmark:
         points[len(rays) - 1].error * rays[-1] / fine,
         tuple(points),
         (
-            Limit("median relative error of true maps on lit pixels", 100.0 * float(np.median(gap)),
-                  MEDIAN_ERROR, "<=", "%"),
-            Limit("two lights of 0.3 and 0.7 beside one of 1", _relative(both, seen.radiance)[0],
-                  SUM_ERROR, "<=", "%"),
+            Limit(
+                "median relative error of true maps on lit pixels",
+                100.0 * float(np.median(gap)),
+                MEDIAN_ERROR,
+                "<=",
+                "%",
+            ),
+            Limit(
+                "two lights of 0.3 and 0.7 beside one of 1",
+                _relative(both, seen.radiance)[0],
+                SUM_ERROR,
+                "<=",
+                "%",
+            ),
         ),
         left_out=(
             ("a peer that renders these maps", "no renderer at hand reads tabulated mixtures"),
@@ -109,7 +132,7 @@ def model(*, toy: bool) -> StageBenchmark:
         condition=("vary",),
         by_band=bands,
         interval_of="tiles of the picture",
-    )  # fmt: skip
+    )
 
 
 def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
@@ -130,9 +153,7 @@ def _part(color: tuple[float, float, float], share: float) -> tuple[float, float
     return color[0] * share, color[1] * share, color[2] * share
 
 
-def _relative(
-    found: NDArray[np.floating], true: NDArray[np.floating]
-) -> tuple[float, tuple[float, float]]:
+def _relative(found: FloatArray, true: FloatArray) -> tuple[float, tuple[float, float]]:
     """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 tiles."""
     skin = true.mean(axis=-1) > 0.0
     to_percent = 100.0 / float(true[skin].mean())

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from capture.calibration.geometry import CameraPose
@@ -20,6 +19,7 @@ from reconstruction.lumitexels import Surface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
+from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
 
@@ -123,7 +123,7 @@ def filling(*, toy: bool) -> StageBenchmark:
     for share in (0.05, 0.15, 0.35, 0.75):
         weight = (rng.random((side, side)) < share).astype(np.float32)
         weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
-        ways: dict[str, Callable[[], NDArray[np.floating]]] = {
+        ways: dict[str, Callable[[], FloatArray]] = {
             "push-pull": lambda w=weight: texture_fill.push_pull(truth, w).values,  # type: ignore[misc]
             "nearest texel": lambda w=weight: _nearest(truth, w),  # type: ignore[misc]
         }
@@ -146,13 +146,13 @@ def filling(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _nearest(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+def _nearest(values: Float32Array, weight: Float32Array) -> Float32Array:
     """Return a texture whose unknown texels have the value of the nearest known one."""
     rows, columns = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
     return np.asarray(values[rows, columns])
 
 
-def _seen(camera: CameraPose) -> NDArray[np.float64]:
+def _seen(camera: CameraPose) -> Float64Array:
     """Return where the pixels of a camera meet the sphere, NaN elsewhere."""
     width, height = camera.image_size
     row, column = np.mgrid[0:height, 0:width]
@@ -163,7 +163,7 @@ def _seen(camera: CameraPose) -> NDArray[np.float64]:
     return np.asarray(camera.center_mm + (-along - root)[..., None] * ways)
 
 
-def _image(seen: NDArray[np.float64], lights: LightTable, light: int) -> NDArray[np.float32]:
+def _image(seen: Float64Array, lights: LightTable, light: int) -> Float32Array:
     """Return the sphere under one light, written out here."""
     way = lights.position_mm[light] - seen
     distance = np.linalg.norm(way, axis=-1, keepdims=True)

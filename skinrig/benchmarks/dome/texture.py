@@ -8,15 +8,13 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.texture_statistics import describe, match, steerable_pyramid
 from model.texture_statistics.histograms import distance
 from model.texture_statistics.space import TextureSpace
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 TIMES_FASTER = 10.0
 SAME_DISTANCE = 1.05
@@ -29,7 +27,7 @@ _COLOR = np.array([0.55, 0.38, 0.28])
 _TINTS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
 
-def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32:
+def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
     """Make a periodic texture: blotches, fine streaks and dark spots of their own colors.
 
     Parameters
@@ -48,7 +46,7 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
     """
     fy, fx = np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side)[None, :]
 
-    def smooth(field: Floats, up_px: float, across_px: float) -> Floats:
+    def smooth(field: Float64Array, up_px: float, across_px: float) -> Float64Array:
         falloff = np.exp(-2.0 * np.pi**2 * ((up_px * fy) ** 2 + (across_px * fx) ** 2))
         return np.asarray(np.fft.ifft2(np.fft.fft2(field) * falloff).real)
 
@@ -64,7 +62,7 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
     return (_COLOR * np.exp(-density)).astype(np.float32)
 
 
-def _error(images: list[Any], target: Floats, space: TextureSpace) -> tuple[float, Any]:
+def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> tuple[float, Any]:
     """Return the mean distance of images from a vector, and its interval over the images."""
     wanted = space.histograms(target)
     off = [
@@ -95,9 +93,14 @@ def _point(
 
     def run(source: Any) -> Any:
         return match(
-            source, vector, space=used, iterations=iterations, noise=0.05, start=start,
+            source,
+            vector,
+            space=used,
+            iterations=iterations,
+            noise=0.05,
+            start=start,
             rng=np.random.default_rng(1),
-        ).image  # fmt: skip
+        ).image
 
     timing = measure(lambda: run(sources[0]), repeats=repeats)
     error, interval = _error([run(s) for s in sources], describe(target, space=full), full)
@@ -108,10 +111,14 @@ def points(toy: bool) -> tuple[Point, ...]:
     """Measure pyramid depth and iterations (error: `matching`'s)."""
     side, repeats = (48, 1) if toy else (256, 3)
     depths, counts = ((1, 7), (0, 2)) if toy else ((1, 3, 5, 7), (0, 1, 2, 5, 10, 20))
-    found = [_point(side, {"levels": n, "iterations": 5}, repeats=repeats, levels=n)
-             for n in depths]  # fmt: skip
-    found += [_point(side, {"levels": 7, "iterations": n}, repeats=repeats, iterations=n)
-              for n in counts if n != 5]  # fmt: skip
+    found = [
+        _point(side, {"levels": n, "iterations": 5}, repeats=repeats, levels=n) for n in depths
+    ]
+    found += [
+        _point(side, {"levels": 7, "iterations": n}, repeats=repeats, iterations=n)
+        for n in counts
+        if n != 5
+    ]
     return tuple(found)
 
 
@@ -120,13 +127,18 @@ def matching(*, toy: bool) -> StageBenchmark:
     side, repeats = (48, 1) if toy else (256, 3)
     found = list(points(toy))
     found.append(
-        _point(side, {"levels": 7, "iterations": 5, "precision": "float64"}, repeats=repeats,
-               dtype=np.float64)
-    )  # fmt: skip
+        _point(
+            side,
+            {"levels": 7, "iterations": 5, "precision": "float64"},
+            repeats=repeats,
+            dtype=np.float64,
+        )
+    )
     found.append(
-        _point(side, {"levels": 7, "iterations": 5, "start": "noise"}, repeats=repeats,
-               start="noise")
-    )  # fmt: skip
+        _point(
+            side, {"levels": 7, "iterations": 5, "start": "noise"}, repeats=repeats, start="noise"
+        )
+    )
     for other in (32,) if toy else (128, 512):
         found.append(_point(other, {"levels": 7, "iterations": 5}, repeats=repeats))
     limits, left_out = ((), ()) if toy else against_peer()
@@ -153,7 +165,9 @@ def _same_texture(side: int) -> float:
     return _error(textures[1:], describe(textures[0], space=space), space)[0]
 
 
-def peer_iterations(image: ArrayLike, target: ArrayLike, iterations: int) -> Callable[[], Floats]:
+def peer_iterations(
+    image: ArrayLike, target: ArrayLike, iterations: int
+) -> Callable[[], Float64Array]:
     """Return Heeger and Bergen's matching of one channel out of pyrtools and scikit-image.
 
     The pyramid of the target is made here and not timed, as ours is given its vector.
@@ -174,7 +188,7 @@ def peer_iterations(image: ArrayLike, target: ArrayLike, iterations: int) -> Cal
     )
     goals = pyramid(wanted).pyr_coeffs
 
-    def run() -> Floats:
+    def run() -> Float64Array:
         now = start
         for _ in range(iterations):
             built = pyramid(now)
@@ -186,7 +200,7 @@ def peer_iterations(image: ArrayLike, target: ArrayLike, iterations: int) -> Cal
     return run
 
 
-def peer_responses(image: ArrayLike) -> list[Floats]:
+def peer_responses(image: ArrayLike) -> list[Float64Array]:
     """Return pyrtools's responses in the order and unit of ours; its levels grow by 4 each."""
     from pyrtools.pyramids import SteerablePyramidFreq
 
@@ -198,9 +212,7 @@ def peer_responses(image: ArrayLike) -> list[Floats]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def against_peer(
-    side: int = FULL_SIDE,
-) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
+def against_peer(side: int = FULL_SIDE) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
     """Match one channel by turns with the peer; return limits, or what is left out and why."""
     try:
         peer_responses(np.zeros((512, 512)))
@@ -226,10 +238,15 @@ def against_peer(
     wall, busy = np.median(ratios, axis=0)
     wanted = space.histograms(vector)
     off = [
-        float(distance(space.histograms(describe(image.astype(np.float32), space=space)), wanted,
-                       space.edges).mean())
+        float(
+            distance(
+                space.histograms(describe(image.astype(np.float32), space=space)),
+                wanted,
+                space.edges,
+            ).mean()
+        )
         for image in (own, peer)
-    ]  # fmt: skip
+    ]
     apart = [
         float(np.abs(a - b).max() / source.max())
         for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
@@ -244,7 +261,7 @@ def against_peer(
     return limits, ()
 
 
-def _spent(call: Callable[[], Any]) -> Floats:
+def _spent(call: Callable[[], Any]) -> Float64Array:
     """Return seconds on the clock and of the processor."""
     begin = time.perf_counter(), time.process_time()
     call()

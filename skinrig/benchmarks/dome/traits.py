@@ -16,6 +16,7 @@ from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
 from rigsim.population.population import Member, shifted, table_1
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
@@ -24,8 +25,6 @@ from skinrig.traits import truth as trait_truth
 from skinrig.traits.albedo_vectors import VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
-
-Floats = NDArray[np.float64]
 
 COSINE = 0.95
 RETURN = 0.1
@@ -78,9 +77,12 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
     bare = [p for p in compared if not p.applied]
     worn = tuple(w for w, p in zip(worn, compared, strict=True) if not p.applied)
     truth = trait_truth.lobe_change(
-        bare, worn, points=4 if toy else 60, pairs=500 if toy else 1000,
+        bare,
+        worn,
+        points=4 if toy else 60,
+        pairs=500 if toy else 1000,
         rng=np.random.default_rng(2),
-    )  # fmt: skip
+    )
 
     def judged(space: TraitSpace) -> float:
         return truth.cosine(space.trait("trait").vector, basis)
@@ -90,12 +92,14 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
     most = 4 if toy else 20
     seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
     for noise, places in ((0.02, 4),) if toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
-        means = np.array([
-            trait_truth.mean_mixture(
-                p[:places], basis, pairs=60 if toy else 160, noise=noise, rng=rng
-            )
-            for p in seen
-        ])  # fmt: skip
+        means = np.array(
+            [
+                trait_truth.mean_mixture(
+                    p[:places], basis, pairs=60 if toy else 160, noise=noise, rng=rng
+                )
+                for p in seen
+            ]
+        )
         for group in (2, 3) if toy else (3, 8, int(label.sum())):
             for kind in SPACES:
                 knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
@@ -109,10 +113,10 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
 
 
 def _fitted(
-    means: Floats,
-    label: NDArray[np.bool_],
+    means: Float64Array,
+    label: BoolArray,
     kind: SpaceKind,
-    metric: Floats,
+    metric: Float64Array,
     basis: brdf_tables.BrdfBasis,
     rows: NDArray[np.intp],
 ) -> TraitSpace:
@@ -125,7 +129,7 @@ def _fitted(
 
 def _drawn(
     fit: Callable[[NDArray[np.intp]], TraitSpace],
-    label: NDArray[np.bool_],
+    label: BoolArray,
     group: int,
     knobs: dict[str, Any],
     judged: Callable[[TraitSpace], float],
@@ -137,11 +141,13 @@ def _drawn(
     rng = np.random.default_rng(5)
     seconds, errors, told, kept = [], [], [], []
     groups = [
-        np.sort(np.concatenate([
-            side if whole else rng.choice(side, most, replace=False) for side in sides
-        ]))
+        np.sort(
+            np.concatenate(
+                [side if whole else rng.choice(side, most, replace=False) for side in sides]
+            )
+        )
         for _ in range(1 if whole else DRAWS)
-    ]  # fmt: skip
+    ]
     with resident_memory.watched() as rise:
         fit(groups[0])
     for rows in groups:
@@ -159,9 +165,7 @@ def _drawn(
         float(np.median(seconds)), (min(seconds), max(seconds)), seconds[0], rise.mb, "resident"
     )
     shown = {**knobs, "people": 2 * most if not whole else len(label)}
-    also = {
-        "components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4),
-    }  # fmt: skip
+    also = {"components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4)}
     return Point(shown, timing, middle, (low, high), also=also)
 
 
@@ -173,7 +177,9 @@ def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp
     return float(np.std(values) * np.sqrt(count - 1))
 
 
-def _false_alarms(what: str, samples: Floats, metric: Floats | None, *, toy: bool) -> Limit:
+def _false_alarms(
+    what: str, samples: Float64Array, metric: Float64Array | None, *, toy: bool
+) -> Limit:
     """Return how often shuffled labels pass for a trait."""
     rng = np.random.default_rng(6)
     passed = []
@@ -182,12 +188,14 @@ def _false_alarms(what: str, samples: Floats, metric: Floats | None, *, toy: boo
         space = TraitSpace.fit(samples, {"none": label}, components=1, metric=metric)
         passed.append(space.trait("none").confidence.p_value < 0.05)
     return Limit(
-        f"shuffled labels of {what} that give a trait at p < 0.05", float(np.mean(passed)),
-        FALSE_ALARMS, "<=",
-    )  # fmt: skip
+        f"shuffled labels of {what} that give a trait at p < 0.05",
+        float(np.mean(passed)),
+        FALSE_ALARMS,
+        "<=",
+    )
 
 
-def _returned(faces: Floats, space: TraitSpace, metric: Floats) -> list[Limit]:
+def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> list[Limit]:
     """Edit the lobes of faces without the trait, and back again."""
     size = float(reduced_spaces.lengths(space.trait("trait").vector, metric))
     rng = np.random.default_rng(7)
@@ -207,11 +215,19 @@ def _returned(faces: Floats, space: TraitSpace, metric: Floats) -> list[Limit]:
         off.append(reduced_spaces.lengths(miss, metric) / (0.6 * size))
     return [
         Limit("largest change of a weight by an edit of amount 0", worst_zero, 1e-12, "<="),
-        Limit("+0.6 lotion, then -0.6: RMS distance from the source over that of the edit",
-              float(np.sqrt(np.mean(np.square(back)))), RETURN, "<="),
-        Limit("+0.6 lotion, texel by texel: RMS distance from what was asked over the edit",
-              float(np.sqrt(np.mean(np.square(off)))), RETURN, "<="),
-    ]  # fmt: skip
+        Limit(
+            "+0.6 lotion, then -0.6: RMS distance from the source over that of the edit",
+            float(np.sqrt(np.mean(np.square(back)))),
+            RETURN,
+            "<=",
+        ),
+        Limit(
+            "+0.6 lotion, texel by texel: RMS distance from what was asked over the edit",
+            float(np.sqrt(np.mean(np.square(off)))),
+            RETURN,
+            "<=",
+        ),
+    ]
 
 
 def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
@@ -243,27 +259,31 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
                 shown: Sequence[albedo_vectors.AlbedoSample],
                 texture: Any = texture,
                 kind: VectorKind = kind,
-            ) -> Floats:
-                return np.array([
-                    albedo_vectors.vector(
-                        one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
-                    )
-                    for one in shown
-                ])  # fmt: skip
+            ) -> Float64Array:
+                return np.array(
+                    [
+                        albedo_vectors.vector(
+                            one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
+                        )
+                        for one in shown
+                    ]
+                )
 
             before, with_it = (vectors(group) for group in clean)
             truth = (with_it - before).mean(axis=0)
             rows = vectors(maps)
 
-            def judged(space: TraitSpace, truth: Floats = truth) -> float:
+            def judged(space: TraitSpace, truth: Float64Array = truth) -> float:
                 return cosine(space.trait("trait").vector, truth)
 
             for group in (2, 3) if toy else (3, 8, int(label.sum())):
                 for components in (None, 1) if toy else (None, 1, 4):
                     knobs = {
-                        "trait": "tan", "space": f"pca of {kind}", "noise": noise,
+                        "trait": "tan",
+                        "space": f"pca of {kind}",
+                        "noise": noise,
                         "asked": components or "chosen",
-                    }  # fmt: skip
+                    }
                     fit = partial(_learned, rows, label, components)
                     points.append(_drawn(fit, label, group, knobs, judged))
             # People who are seen without and with the trait; the truth is of others
@@ -275,22 +295,29 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
             pairs = vectors(twice)
             tan = np.arange(len(pairs)) >= len(seen)
             knobs = {
-                "trait": "tan", "space": f"pca of {kind}", "noise": noise, "asked": "seen twice",
-            }  # fmt: skip
+                "trait": "tan",
+                "space": f"pca of {kind}",
+                "noise": noise,
+                "asked": "seen twice",
+            }
             points.append(
                 _drawn(partial(_learned, pairs, tan, None), tan, len(pairs), knobs, judged)
             )
             # Plain histograms are measured, and miss it: their points say by how much
             if noise == 0.01 and kind == "quantiles":
                 limits.append(
-                    Limit(f"cosine of tan with the truth, {kind}, {len(seen)} people seen twice",
-                          1.0 - points[-1].error, COSINE, ">=")
-                )  # fmt: skip
+                    Limit(
+                        f"cosine of tan with the truth, {kind}, {len(seen)} people seen twice",
+                        1.0 - points[-1].error,
+                        COSINE,
+                        ">=",
+                    )
+                )
                 limits.append(_false_alarms("albedo", rows, None, toy=toy))
     return points, limits
 
 
 def _learned(
-    vectors: Floats, label: NDArray[np.bool_], components: int | None, rows: NDArray[np.intp]
+    vectors: Float64Array, label: BoolArray, components: int | None, rows: NDArray[np.intp]
 ) -> TraitSpace:
     return TraitSpace.fit(vectors[rows], {"trait": label[rows]}, components=components)

@@ -14,11 +14,10 @@ from model.facial_color import HemoglobinRig
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
 from rigsim.subject import Subject, make_subject
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Points = dict[str, tuple[float, float]]
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D65"
@@ -26,7 +25,7 @@ CAMERA, LIGHT = "Nikon 5100 (NPL)", "D65"
 
 def smooth_displacement(
     side: int, *, bend_px: float, rms_px: float, rng: np.random.Generator
-) -> Floats:
+) -> Float64Array:
     """Return a smooth random displacement.
 
     Parameters
@@ -73,19 +72,19 @@ class MovedFace:
         The state's blood where the moving picture shows it.
     """
 
-    neutral: NDArray[np.float32]
-    moving: NDArray[np.float32]
-    variance_neutral: NDArray[np.float32]
-    variance_moving: NDArray[np.float32]
-    valid: Bools
-    valid_moving: Bools
-    source_px: Floats
+    neutral: Float32Array
+    moving: Float32Array
+    variance_neutral: Float32Array
+    variance_moving: Float32Array
+    valid: BoolArray
+    valid_moving: BoolArray
+    source_px: Float64Array
     landmarks: Points
     landmarks_moving: Points
-    melanin: NDArray[np.float32]
-    hemoglobin: NDArray[np.float32]
-    hemoglobin_at_rest: NDArray[np.float32]
-    hemoglobin_moving: NDArray[np.float32]
+    melanin: Float32Array
+    hemoglobin: Float32Array
+    hemoglobin_at_rest: Float32Array
+    hemoglobin_moving: Float32Array
 
 
 def table() -> ColorTable:
@@ -93,7 +92,7 @@ def table() -> ColorTable:
     return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
 
 
-def oval(side: int) -> Bools:
+def oval(side: int) -> BoolArray:
     """Return where a texture shows the face."""
     y, x = np.mgrid[:side, :side] / (side - 1.0) - 0.5
     return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
@@ -101,7 +100,7 @@ def oval(side: int) -> Bools:
 
 def moved_face(
     face: Subject,
-    displacement_px: Floats,
+    displacement_px: Float64Array,
     *,
     state: str = "smile",
     noise: float = 0.01,
@@ -140,7 +139,7 @@ def moved_face(
         )
     at = [rows + back[..., 1], columns + back[..., 0]]
 
-    def pulled(image: Floats, order: int = 3) -> Floats:
+    def pulled(image: Float64Array, order: int = 3) -> Float64Array:
         return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
 
     colors = table()
@@ -164,15 +163,23 @@ def moved_face(
         for p in (points.astype(np.float64), gone)
     ]
     return MovedFace(
-        pictures[0], pictures[1], variances[0], variances[1],
-        mask, pulled(mask.astype(np.float64), 1) > 0.99,
+        pictures[0],
+        pictures[1],
+        variances[0],
+        variances[1],
+        mask,
+        pulled(mask.astype(np.float64), 1) > 0.99,
         np.stack([columns, rows], axis=-1) + displacement_px,
-        placed[0], placed[1],
-        face.melanin, face.hemoglobin(), rest, pulled(rest.astype(np.float64)).astype("f4"),
-    )  # fmt: skip
+        placed[0],
+        placed[1],
+        face.melanin,
+        face.hemoglobin(),
+        rest,
+        pulled(rest.astype(np.float64)).astype("f4"),
+    )
 
 
-def spread_points(mask: Bools, count: int) -> NDArray[np.intp]:
+def spread_points(mask: BoolArray, count: int) -> NDArray[np.intp]:
     """Return points (count, 2), column and row, spread over a mask: each farthest from others."""
     inner = distance_transform_edt(mask) > 0.02 * mask.shape[0]
     places = np.argwhere(inner)[:, ::-1]
@@ -199,8 +206,18 @@ def aligned(*, toy: bool) -> StageBenchmark:
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     settings: list[tuple[int, int]] = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not toy:
-        settings = [(8, 0), (8, 2), (24, 0), (24, 1), (24, 2), (24, 4), (48, 0), (48, 2),
-                    (0, 0), (0, 2)]  # fmt: skip
+        settings = [
+            (8, 0),
+            (8, 2),
+            (24, 0),
+            (24, 1),
+            (24, 2),
+            (24, 4),
+            (48, 0),
+            (48, 2),
+            (0, 0),
+            (0, 2),
+        ]
     points = []
     covered = None
     for count, rounds in settings:
@@ -210,11 +227,14 @@ def aligned(*, toy: bool) -> StageBenchmark:
         ) -> expression_alignment.Alignment:
             names = list(pictures.landmarks)[:count]
             return expression_alignment.align(
-                pictures.moving, pictures.neutral, rounds=rounds,
+                pictures.moving,
+                pictures.neutral,
+                rounds=rounds,
                 landmarks_moving={n: pictures.landmarks_moving[n] for n in names} or None,
                 landmarks_neutral={n: pictures.landmarks[n] for n in names} or None,
-                valid_moving=pictures.valid_moving, valid_neutral=pictures.valid,
-            )  # fmt: skip
+                valid_moving=pictures.valid_moving,
+                valid_neutral=pictures.valid,
+            )
 
         timing = measure(run, repeats=1, memory=(count, rounds) == (24, 2))
         found = run()
@@ -223,10 +243,12 @@ def aligned(*, toy: bool) -> StageBenchmark:
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         points.append(
             Point(
-                {"by": found.by, "landmarks": count, "rounds": rounds}, timing, _rms(error),
+                {"by": found.by, "landmarks": count, "rounds": rounds},
+                timing,
+                _rms(error),
                 _rms_interval(error, side),
             )
-        )  # fmt: skip
+        )
     bands = {
         name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
     }
@@ -236,17 +258,37 @@ def aligned(*, toy: bool) -> StageBenchmark:
         false_motion = np.linalg.norm(before.source_px - still.source_px, axis=-1)[before.valid]
         by_setting = {(p.knobs["landmarks"], p.knobs["rounds"]): p.error for p in points}
         limits = (
-            Limit("px (median) of motion seen where blood alone changed",
-                  float(np.median(false_motion)), 0.1, "<=", "px"),
-            Limit("share of pixels within twice the stated error, 24 landmarks",
-                  float(covered or 0.0), 0.95, ">="),
-            Limit("times smaller error by dense flow than by 24 landmarks alone",
-                  by_setting[24, 0] / by_setting[24, 2], 3.0, ">="),
-            Limit("seconds on 512 x 512, 24 landmarks",
-                  next(p.timing.seconds for p in points
-                       if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)),
-                  10.0, "<=", "s"),
-        )  # fmt: skip
+            Limit(
+                "px (median) of motion seen where blood alone changed",
+                float(np.median(false_motion)),
+                0.1,
+                "<=",
+                "px",
+            ),
+            Limit(
+                "share of pixels within twice the stated error, 24 landmarks",
+                float(covered or 0.0),
+                0.95,
+                ">=",
+            ),
+            Limit(
+                "times smaller error by dense flow than by 24 landmarks alone",
+                by_setting[24, 0] / by_setting[24, 2],
+                3.0,
+                ">=",
+            ),
+            Limit(
+                "seconds on 512 x 512, 24 landmarks",
+                next(
+                    p.timing.seconds
+                    for p in points
+                    if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)
+                ),
+                10.0,
+                "<=",
+                "s",
+            ),
+        )
     return StageBenchmark(
         "expression-alignment",
         "root mean square error of a pixel's place, px",
@@ -266,9 +308,14 @@ def _on_skin(preset: str, side: int) -> BandError:
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face_of(preset, side, seed=2), away, state="exercise", rng=rng)
     found = expression_alignment.align(
-        seen.moving, seen.neutral, rounds=2, landmarks_moving=seen.landmarks_moving,
-        landmarks_neutral=seen.landmarks, valid_moving=seen.valid_moving, valid_neutral=seen.valid,
-    )  # fmt: skip
+        seen.moving,
+        seen.neutral,
+        rounds=2,
+        landmarks_moving=seen.landmarks_moving,
+        landmarks_neutral=seen.landmarks,
+        valid_moving=seen.valid_moving,
+        valid_neutral=seen.valid,
+    )
     error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
     return BandError(_rms(error), _rms_interval(error, side))
 
@@ -294,15 +341,17 @@ def misaligned(*, toy: bool) -> StageBenchmark:
         for off_px in MISALIGNED_PX[:3] if toy else MISALIGNED_PX:
             map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
 
-            def interpolated(map_of_state: Floats = map_of_state) -> Floats:
+            def interpolated(map_of_state: Float64Array = map_of_state) -> Float64Array:
                 return neutral + 1.0 * (map_of_state - neutral)
 
             ways = [("interpolated", 0.0, interpolated)]
             for radius in (16.0,) if toy else (8.0, 16.0, 32.0):
 
                 def blended(
-                    map_of_state: Floats = map_of_state, radius: float = radius, name: str = state
-                ) -> Floats:
+                    map_of_state: Float64Array = map_of_state,
+                    radius: float = radius,
+                    name: str = state,
+                ) -> Float64Array:
                     rig = HemoglobinRig.from_maps(
                         neutral, {name: map_of_state}, radius_px=radius, valid=mask
                     )
@@ -321,11 +370,14 @@ def misaligned(*, toy: bool) -> StageBenchmark:
     limits: tuple[Limit, ...] = ()
     if not toy:
         limits = tuple(
-            Limit(f"times larger error of interpolation than of blending, {state}, 2 px off",
-                  errors[f"interpolated 0 {state}", 2.0] / errors[f"blended 16 {state}", 2.0],
-                  2.0, ">=")
+            Limit(
+                f"times larger error of interpolation than of blending, {state}, 2 px off",
+                errors[f"interpolated 0 {state}", 2.0] / errors[f"blended 16 {state}", 2.0],
+                2.0,
+                ">=",
+            )
             for state in ("exercise", "smile")
-        )  # fmt: skip
+        )
     return StageBenchmark(
         "misalignment",
         "root mean square error over that of the state's change",
@@ -340,7 +392,7 @@ def misaligned(*, toy: bool) -> StageBenchmark:
     )
 
 
-def displaced(image: Floats, rms_px: float, *, rng: np.random.Generator) -> Floats:
+def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:
     """Return a map seen at places that are off by a smooth random displacement of so many px."""
     if rms_px == 0.0:
         return image
@@ -351,11 +403,11 @@ def displaced(image: Floats, rms_px: float, *, rng: np.random.Generator) -> Floa
     return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: Float64Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _rms_interval(values: Floats, side: int) -> tuple[float, float]:
+def _rms_interval(values: Float64Array, side: int) -> tuple[float, float]:
     """Return the 68 % interval of a root mean square over pixels that go together in patches."""
     squares = np.square(values)
     patches = max(values.size / (side / 10.0) ** 2, 2.0)

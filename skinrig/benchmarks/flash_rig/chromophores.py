@@ -5,17 +5,15 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model import color_table, metrics
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
+from skinrig.arrays import Float64Array, FloatArray
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 NOISE = 0.01
 LEAST_MELANIN = 0.004
@@ -63,11 +61,13 @@ def inversion(*, toy: bool) -> StageBenchmark:
             peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
             limits = (
-                Limit(f"seconds for {side} x {side}, free shading", timing.seconds, SECONDS, "<=",
-                      "s"),
-                Limit("times faster than SciPy's least squares", peer_s / ours_s, TIMES_FASTER,
-                      ">="),
-            )  # fmt: skip
+                Limit(
+                    f"seconds for {side} x {side}, free shading", timing.seconds, SECONDS, "<=", "s"
+                ),
+                Limit(
+                    "times faster than SciPy's least squares", peer_s / ours_s, TIMES_FASTER, ">="
+                ),
+            )
     return StageBenchmark(
         "chromophores",
         "median error of melanin, %",
@@ -93,9 +93,10 @@ def _by_band(
         color = table.lookup(c_m, c_hd)
         noisy = color * (1 + NOISE * rng.standard_normal(color.shape))
         found = chromophores.invert(
-            noisy.astype(np.float32)[None], table,
+            noisy.astype(np.float32)[None],
+            table,
             variance=(NOISE * color[None]).astype(np.float32) ** 2,
-        )  # fmt: skip
+        )
         valid = found.valid[0]
         off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
         bound = 67.45 * float(np.median((found.stderr_melanin[0] / c_m)[valid]))
@@ -103,12 +104,12 @@ def _by_band(
     return errors
 
 
-def _scipy_seconds(rgb: NDArray[np.floating], table: color_table.ColorTable) -> float:
+def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:
     """Return seconds a pixel of a plain fit of cube roots and log shading."""
     start = time.perf_counter()
     for color in rgb:
 
-        def residual(p: Floats, color: NDArray[np.floating] = color) -> Floats:
+        def residual(p: Float64Array, color: FloatArray = color) -> Float64Array:
             c_m, c_hd = np.clip(p[:2], 1e-3, [0.79, 0.68]) ** 3
             return np.asarray((np.exp(p[2]) * table.lookup(c_m, c_hd) / color - 1) / NOISE)
 

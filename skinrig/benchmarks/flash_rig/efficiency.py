@@ -14,23 +14,21 @@ from functools import partial
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table, fresnel, photon_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
 from reconstruction.photometric_stereo import light_selection
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """An estimator on draws of one subject."""
 
-    squared_errors: Callable[[], Floats]
+    squared_errors: Callable[[], Float64Array]
     """Makes the squared errors of the draws."""
     bound: float
     """Cramér-Rao bound on their mean."""
@@ -41,9 +39,13 @@ class Trial:
 
 
 SUBJECTS: Final = {
-    "palest": (0.005, 0.03), "II": (0.014, 0.05), "III": (0.028, 0.05), "IV": (0.047, 0.05),
-    "V": (0.085, 0.05), "VI": (0.17, 0.05),
-}  # fmt: skip
+    "palest": (0.005, 0.03),
+    "II": (0.014, 0.05),
+    "III": (0.028, 0.05),
+    "IV": (0.047, 0.05),
+    "V": (0.085, 0.05),
+    "VI": (0.17, 0.05),
+}
 """Melanin and hemoglobin of typical skin."""
 MOST = 1.2
 """Mean squared error over the bound that is aimed at."""
@@ -75,8 +77,10 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             ratio = float(squared.mean()) / trial.bound
             spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
             knobs: dict[str, str | float] = {
-                "estimator": name, "subject": subject, "noise_percent": round(100 * trial.noise, 2),
-            }  # fmt: skip
+                "estimator": name,
+                "subject": subject,
+                "noise_percent": round(100 * trial.noise, 2),
+            }
             also = {"judged": trial.clear >= LINEAR}
             points.append(Point(knobs, timing, ratio, (ratio - spread, ratio + spread), 1.0, also))
             if trial.clear >= LINEAR:
@@ -89,9 +93,13 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             spread = float(np.sqrt(np.sum([s**2 for _, s in told]))) / len(told)
             # what so many draws leave open of the ratio counts for the estimator
             limits.append(
-                Limit(f"{name}, {band} skin: mean squared error over the bound",
-                      ratio - 2.0 * spread, MOST, "<=")
-            )  # fmt: skip
+                Limit(
+                    f"{name}, {band} skin: mean squared error over the bound",
+                    ratio - 2.0 * spread,
+                    MOST,
+                    "<=",
+                )
+            )
             if band not in worst or ratio > worst[band].error:
                 worst[band] = BandError(ratio, (ratio - spread, ratio + spread), 1.0)
     return StageBenchmark(
@@ -126,11 +134,15 @@ def _chromophores(
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
     given = "known" if shading == "known" else None
 
-    def squared(noisy: Floats, sigma: Floats, truth: tuple[float, float]) -> Floats:
+    def squared(
+        noisy: Float64Array, sigma: Float64Array, truth: tuple[float, float]
+    ) -> Float64Array:
         found = chromophores.invert(
-            noisy.astype(np.float32), table, shading=given,
+            noisy.astype(np.float32),
+            table,
+            shading=given,
             variance=np.broadcast_to(np.float32(sigma**2), noisy.shape),
-        )  # fmt: skip
+        )
         value = getattr(found, which)
         return np.square(np.asarray(value, np.float64)[found.valid] - truth[index])
 
@@ -172,7 +184,7 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
         tilt = light_selection.predict(told, range(len(lights)), least=3).tilt_rad[0]
         noisy = albedo * lit[:, None] + sigma[:, None] * rng.standard_normal((len(lights), draws))
 
-        def squared(noisy: Floats = noisy, sigma: Floats = sigma) -> Floats:
+        def squared(noisy: Float64Array = noisy, sigma: Float64Array = sigma) -> Float64Array:
             found = photometric_stereo.estimate_normals(
                 noisy, lights, variance=np.broadcast_to((sigma**2)[:, None], noisy.shape)
             )
@@ -198,13 +210,19 @@ def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
         count = draws // 4
         noisy = value[:, None] + sigma[:, None] * rng.standard_normal((count, 60, 1))
 
-        def squared(noisy: Floats = noisy, sigma: Floats = sigma, albedo: float = albedo) -> Floats:
+        def squared(
+            noisy: Float64Array = noisy, sigma: Float64Array = sigma, albedo: float = albedo
+        ) -> Float64Array:
             every = (len(noisy), 60, 3)
             found = diffuse_albedo.estimate(
-                noisy, np.broadcast_to(light, every), np.broadcast_to(view, every),
-                np.broadcast_to(up, (len(noisy), 3)), eta=1.4, normal_stderr_rad=0.0,
+                noisy,
+                np.broadcast_to(light, every),
+                np.broadcast_to(view, every),
+                np.broadcast_to(up, (len(noisy), 3)),
+                eta=1.4,
+                normal_stderr_rad=0.0,
                 variance=np.broadcast_to((sigma**2)[:, None], noisy.shape),
-            )  # fmt: skip
+            )
             return np.square(found.r_d[found.valid, 0] - albedo)
 
         yield subject, Trial(squared, float(bound), ALBEDO_NOISE)
@@ -214,9 +232,12 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
     radius = np.linspace(1.0, 15.0, 28)
     count = draws // 20
     for number, (subject, (sigma_a, sigma_s)) in enumerate(
-        zip(SUBJECTS, ((0.02, 1.4), (0.03, 1.3), (0.05, 1.2), (0.08, 1.2), (0.15, 1.1), (0.3, 1.0)),
-            strict=True)
-    ):  # fmt: skip
+        zip(
+            SUBJECTS,
+            ((0.02, 1.4), (0.03, 1.3), (0.05, 1.2), (0.08, 1.2), (0.15, 1.1), (0.3, 1.0)),
+            strict=True,
+        )
+    ):
         truth = np.array([sigma_a, sigma_s])
         profile = photon_table.reflectance(radius, *truth)
         sigma = READINGS * profile + 1e-3 * profile.max() * READINGS
@@ -226,22 +247,28 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
         rng = np.random.default_rng([4, number])
         noisy = profile + sigma * rng.standard_normal((count, 28))
 
-        def squared(noisy: Floats = noisy, sigma: Floats = sigma, truth: Floats = truth) -> Floats:
+        def squared(
+            noisy: Float64Array = noisy, sigma: Float64Array = sigma, truth: Float64Array = truth
+        ) -> Float64Array:
             fit = subsurface.invert(
-                radius, noisy, variance=np.broadcast_to(sigma**2, noisy.shape), g=0.8,
-                g_error=0.0, model_error=0.0,
-            )  # fmt: skip
+                radius,
+                noisy,
+                variance=np.broadcast_to(sigma**2, noisy.shape),
+                g=0.8,
+                g_error=0.0,
+                model_error=0.0,
+            )
             return np.square(fit.sigma_tr_per_mm[fit.valid] - _sigma_tr(truth))
 
         yield subject, Trial(squared, float(along @ covariance @ along), READINGS)
 
 
-def _sigma_tr(coefficients: Floats) -> float:
+def _sigma_tr(coefficients: Float64Array) -> float:
     sigma_a, sigma_s = coefficients
     return float(np.sqrt(3.0 * sigma_a * (sigma_a + sigma_s)))
 
 
-def _differences(value: Callable[[Floats], Floats], at: Floats) -> Floats:
+def _differences(value: Callable[[Float64Array], Float64Array], at: Float64Array) -> Float64Array:
     """Return derivatives of a vector by each parameter, by central differences."""
     columns = []
     for k in range(len(at)):

@@ -7,16 +7,12 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
+from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
-
-Floats = NDArray[np.float64]
-Single = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -44,7 +40,7 @@ def rig(*, toy: bool) -> StageBenchmark:
 
     def point(
         knobs: dict[str, str | int | float],
-        predict: Callable[[str], NDArray[np.floating]],
+        predict: Callable[[str], FloatArray],
         call: Callable[[], object] | None = None,
     ) -> Point:
         knobs = {"misaligned_px": 0} | knobs
@@ -83,11 +79,15 @@ def rig(*, toy: bool) -> StageBenchmark:
         made = fitted(radius_px, stored, moved_px)
         points.append(
             point(
-                {"method": "scale and bias", "radius_px": radius_px,
-                 "stored": stored or neutral.shape[0], "misaligned_px": moved_px},
+                {
+                    "method": "scale and bias",
+                    "radius_px": radius_px,
+                    "stored": stored or neutral.shape[0],
+                    "misaligned_px": moved_px,
+                },
                 lambda name, made=made: made.blend({name: 1.0}),  # type: ignore[misc]
             )
-        )  # fmt: skip
+        )
     points.append(
         point(
             {"method": "scale and bias, fitted anew", "radius_px": RADIUS_PX},
@@ -100,14 +100,23 @@ def rig(*, toy: bool) -> StageBenchmark:
     for spacing in windows:
         points.append(
             point(
-                {"method": "exact histograms, windows", "radius_px": RADIUS_PX,
-                 "spacing_px": spacing},
-                lambda name, spacing=spacing: histogram_matching.match(  # type: ignore[misc]
-                    neutral, truths[name], RADIUS_PX, valid=covered, valid_target=covered,
-                    spacing_px=spacing,
-                ).hemoglobin,
+                {
+                    "method": "exact histograms, windows",
+                    "radius_px": RADIUS_PX,
+                    "spacing_px": spacing,
+                },
+                lambda name, spacing=spacing: (
+                    histogram_matching.match(  # type: ignore[misc]
+                        neutral,
+                        truths[name],
+                        RADIUS_PX,
+                        valid=covered,
+                        valid_target=covered,
+                        spacing_px=spacing,
+                    ).hemoglobin
+                ),
             )
-        )  # fmt: skip
+        )
     limits = () if toy else (*_round_trip(neutral, covered), *_digits(rng), *_speed(rng))
     return StageBenchmark(
         "facial-color",
@@ -122,7 +131,7 @@ def rig(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _round_trip(neutral: Single, covered: Mask) -> tuple[Limit, ...]:
+def _round_trip(neutral: Float32Array, covered: BoolArray) -> tuple[Limit, ...]:
     """Fit maps that eq. (6) made and make them again."""
     exact = neutral.astype(np.float64)
     states = {"first": 1.3 * exact + 0.004, "second": 0.7 * exact - 0.001}
@@ -184,44 +193,56 @@ def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits += [
-            Limit(f"times faster ({ours_s:.3f} s) than scipy.ndimage.convolve, r = {radius}, a "
-                  f"crop of {CROPS[radius]} x {CROPS[radius]} scaled by pixels",
-                  convolve_s / ours_s, 100.0, ">="),
-            Limit(f"times faster than cv2.filter2D ({opencv_s:.3f} s), r = {radius}",
-                  opencv_s / ours_s, 1.0, ">="),
-            Limit(f"times faster than scipy.fft ({fft_s:.3f} s), r = {radius}",
-                  fft_s / ours_s, 1.0, ">="),
-        ]  # fmt: skip
+            Limit(
+                f"times faster ({ours_s:.3f} s) than scipy.ndimage.convolve, r = {radius}, a "
+                f"crop of {CROPS[radius]} x {CROPS[radius]} scaled by pixels",
+                convolve_s / ours_s,
+                100.0,
+                ">=",
+            ),
+            Limit(
+                f"times faster than cv2.filter2D ({opencv_s:.3f} s), r = {radius}",
+                opencv_s / ours_s,
+                1.0,
+                ">=",
+            ),
+            Limit(
+                f"times faster than scipy.fft ({fft_s:.3f} s), r = {radius}",
+                fft_s / ours_s,
+                1.0,
+                ">=",
+            ),
+        ]
     return tuple(limits)
 
 
-def disc(radius_px: int) -> Single:
+def disc(radius_px: int) -> Float32Array:
     """Return eq. (1)'s kernel."""
     y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
     inside = (y * y + x * x <= radius_px**2).astype(np.float32)
     return np.asarray(inside / inside.sum(), np.float32)
 
 
-def by_convolve(h: Single, kernel: Single) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def by_convolve(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by scipy.ndimage.convolve."""
     mean = ndimage.convolve(h, kernel)
     return mean, np.sqrt(np.maximum(ndimage.convolve(h * h, kernel) - mean * mean, 0.0))
 
 
-def by_opencv(h: Single, kernel: Single) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def by_opencv(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by cv2.filter2D."""
     mean = cv2.filter2D(h, -1, kernel)
     return mean, np.sqrt(np.maximum(cv2.filter2D(h * h, -1, kernel) - mean * mean, 0.0))
 
 
-def by_fft(h: Single, kernel: Single) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def by_fft(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by real float32 transforms."""
     side = kernel.shape[0]
     shape = [fft.next_fast_len(n + side - 1, real=True) for n in h.shape]
     transfer = fft.rfft2(kernel, shape, workers=CORES)
     low, size = side // 2, h.shape
 
-    def convolved(image: Single) -> Single:
+    def convolved(image: Float32Array) -> Float32Array:
         product = fft.rfft2(image, shape, workers=CORES) * transfer
         whole = fft.irfft2(product, shape, workers=CORES)
         return np.asarray(whole[low : low + size[0], low : low + size[1]])

@@ -7,7 +7,6 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import OptimizeWarning, curve_fit
 
 from capture.plan.multiplexed import multiplexed_plan, phases
@@ -17,10 +16,9 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.facial_color.perfusion_curves import FALSE_ALARM, transition
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 PROMPT_S = 5.0
 CYCLE_S = 2 * PROMPT_S
@@ -41,22 +39,25 @@ class Train:
     shot_period_s: float
 
     @property
-    def phase_s(self) -> Floats:
+    def phase_s(self) -> Float64Array:
         """Phases of the shots, s."""
         return np.asarray((np.arange(self.captures) * self.shot_period_s) % CYCLE_S + 0.007)
 
-    def levels(self, constant_s: float, reaction_s: float = REACTION_S) -> Floats:
+    def levels(self, constant_s: float, reaction_s: float = REACTION_S) -> Float64Array:
         """Return the simulated level of the blood at each shot, after cycles of prompts."""
         course = PromptedCourse(
-            "smile", rise_s=constant_s, fall_s=constant_s, reaction_s=reaction_s,
+            "smile",
+            rise_s=constant_s,
+            fall_s=constant_s,
+            reaction_s=reaction_s,
             reaction_spread_s=0.0,
-        )  # fmt: skip
+        )
         for number in range(40):
             course.tell(PROMPT_S * number, "smile" if number % 2 == 0 else "neutral")
         settled_s = 10 * CYCLE_S
         return np.array([course.level(settled_s + phase) for phase in self.phase_s])
 
-    def draw(self, constant_s: float, rng: np.random.Generator) -> Floats:
+    def draw(self, constant_s: float, rng: np.random.Generator) -> Float64Array:
         """Return curves of the five places, (5, captures)."""
         clean = LEVEL + np.outer(GAPS, self.levels(constant_s))
         return np.asarray(clean + NOISE * rng.standard_normal(clean.shape))
@@ -80,10 +81,12 @@ class Train:
         return float(np.sqrt(covariance[0, 0]) / scale[0])
 
 
-def scipy_fit(phase_s: Floats, value: Floats) -> tuple[float, float]:
+def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]:
     """Return time constant and standard error of one curve by scipy's curve_fit, its usual way."""
 
-    def model(phase: Floats, low: float, gap: float, delay: float, constant: float) -> Floats:
+    def model(
+        phase: Float64Array, low: float, gap: float, delay: float, constant: float
+    ) -> Float64Array:
         into = (phase - delay) % CYCLE_S
         down = np.exp(-PROMPT_S / constant)
         begin = down / (1.0 + down)
@@ -113,7 +116,7 @@ def curves(*, toy: bool) -> StageBenchmark:
             rng = np.random.default_rng(0)
             draws = [train.draw(CONSTANT_S, rng) for _ in range(runs)]
 
-            def one(values: Floats, way: str = way, phase: Floats = phase) -> float:
+            def one(values: Float64Array, way: str = way, phase: Float64Array = phase) -> float:
                 if way == "five places":
                     return fit_cycle(phase, values, cycle_s=CYCLE_S).time_constant_s
                 if way == "best place":
@@ -174,15 +177,19 @@ def _on_skin(noisier: float, runs: int) -> BandError:
     """Return the error of five places in 44 captures, with so many times the noise."""
     train, rng = Train(44, 10.25), np.random.default_rng(0)
     clean = LEVEL + np.outer(GAPS, train.levels(CONSTANT_S))
-    off = np.array(
-        [
-            fit_cycle(
-                train.phase_s, clean + noisier * NOISE * rng.standard_normal(clean.shape),
-                cycle_s=CYCLE_S,
-            ).time_constant_s
-            for _ in range(runs)
-        ]
-    ) - CONSTANT_S  # fmt: skip
+    off = (
+        np.array(
+            [
+                fit_cycle(
+                    train.phase_s,
+                    clean + noisier * NOISE * rng.standard_normal(clean.shape),
+                    cycle_s=CYCLE_S,
+                ).time_constant_s
+                for _ in range(runs)
+            ]
+        )
+        - CONSTANT_S
+    )
     error = float(np.sqrt(np.mean(off**2)))
     spread = error / np.sqrt(2 * runs)
     return BandError(error, (error - spread, error + spread), noisier * train.bound_s())
@@ -213,16 +220,35 @@ def _limits(
     return (
         Limit("phases met by 22 captures every 5.5 s", half.distinct, 20, ">="),
         Limit("phases met by 44 captures every 10.25 s", quarter.distinct, 40, ">="),
-        Limit("largest bound of a course of 0.01 s, sampled every 0.5 s",
-              max(fit.interval_s[1] for fit in quick), 0.5, "<=", "s"),
-        Limit("rate of transitions seen where there is none", alarms / runs,
-              FALSE_ALARM + beyond, "<="),
-        Limit("part of 95 % intervals that hold the time constant", held / runs,
-              0.95 - beyond, ">="),
-        Limit("error over the Cramér-Rao bound, 44 captures", errors["five places", 44] / bound_s,
-              1.0 + 3 / float(np.sqrt(2 * runs)), "<="),
-        Limit("error over that of scipy's fit of the best place, 44 captures",
-              errors["five places", 44] / errors["best place, scipy", 44], 1.0, "<="),
-        Limit("processor seconds of a fit of five places, 44 captures", spent_s, SECONDS, "<=",
-              "s"),
-    )  # fmt: skip
+        Limit(
+            "largest bound of a course of 0.01 s, sampled every 0.5 s",
+            max(fit.interval_s[1] for fit in quick),
+            0.5,
+            "<=",
+            "s",
+        ),
+        Limit(
+            "rate of transitions seen where there is none",
+            alarms / runs,
+            FALSE_ALARM + beyond,
+            "<=",
+        ),
+        Limit(
+            "part of 95 % intervals that hold the time constant", held / runs, 0.95 - beyond, ">="
+        ),
+        Limit(
+            "error over the Cramér-Rao bound, 44 captures",
+            errors["five places", 44] / bound_s,
+            1.0 + 3 / float(np.sqrt(2 * runs)),
+            "<=",
+        ),
+        Limit(
+            "error over that of scipy's fit of the best place, 44 captures",
+            errors["five places", 44] / errors["best place, scipy", 44],
+            1.0,
+            "<=",
+        ),
+        Limit(
+            "processor seconds of a fit of five places, 44 captures", spent_s, SECONDS, "<=", "s"
+        ),
+    )

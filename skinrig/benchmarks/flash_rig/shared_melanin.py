@@ -6,19 +6,17 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.color_table import ColorTable
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 STATES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
 NOISE = 0.003
@@ -42,21 +40,30 @@ def inversion(*, toy: bool) -> StageBenchmark:
     valid = np.broadcast_to(mask, blood.shape)
     truth = blood[1] - blood[0]
 
-    def alone() -> Floats:
+    def alone() -> Float64Array:
         each = [
             chromophore_posterior.weigh(
-                rgb[k], colors, prior=prior, variance=variance[k], model_error=covariance,
+                rgb[k],
+                colors,
+                prior=prior,
+                variance=variance[k],
+                model_error=covariance,
                 valid=mask,
             )
             for k in (0, 1)
-        ]  # fmt: skip
+        ]
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
     def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
         return shared_melanin.weigh(
-            rgb[:count], colors, prior=prior, variance=variance[:count], model_error=covariance,
-            valid=valid[:count], shading_window_px=window,
-        )  # fmt: skip
+            rgb[:count],
+            colors,
+            prior=prior,
+            variance=variance[:count],
+            model_error=covariance,
+            valid=valid[:count],
+            shading_window_px=window,
+        )
 
     points = [_point({"way": "each alone", "states": 2}, alone, lambda: alone() - truth, mask)]
     settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
@@ -81,12 +88,16 @@ def inversion(*, toy: bool) -> StageBenchmark:
         error = np.abs(found.change[1] - truth)[mask]
         within = float(np.mean(error < 2.0 * found.stderr_change[1][mask]))
         limits = (
-            Limit("times smaller error of a change of blood than each state alone",
-                  points[0].error / points[4].error, 2.0, ">="),
+            Limit(
+                "times smaller error of a change of blood than each state alone",
+                points[0].error / points[4].error,
+                2.0,
+                ">=",
+            ),
             Limit("share of changes within twice the stated error", within, 0.93, ">="),
             *_melanin_limits(colors, prior),
             _full_size(colors, prior, covariance),
-        )  # fmt: skip
+        )
     return StageBenchmark(
         "shared-melanin",
         "median error of smile's change of blood, volume fraction",
@@ -102,13 +113,13 @@ def inversion(*, toy: bool) -> StageBenchmark:
 
 def pictures(
     colors: ColorTable,
-    melanin: NDArray[np.floating],
-    blood: Floats,
-    covariance: Floats,
+    melanin: FloatArray,
+    blood: Float64Array,
+    covariance: Float64Array,
     *,
     rng: np.random.Generator,
     noise: float = NOISE,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Return colors (S, H, W, 3) of one melanin and S bloods, and their variance.
 
     Each pixel has an error of the model that all its states share, and each state a light that
@@ -129,24 +140,29 @@ def pictures(
 
 
 def _on_skin(
-    preset: str, side: int, colors: ColorTable, prior: ShadingPrior, covariance: Floats
+    preset: str, side: int, colors: ColorTable, prior: ShadingPrior, covariance: Float64Array
 ) -> BandError:
     """Return the error of smile's change of blood on skin of a preset, three states together."""
     face, mask = face_of(preset, side, seed=3), oval(side)
     blood = np.stack([face.hemoglobin(state) for state in STATES[:3]]).astype(np.float64)
     rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
     found = shared_melanin.weigh(
-        rgb, colors, prior=prior, variance=variance, model_error=covariance,
-        valid=np.broadcast_to(mask, blood.shape), shading_window_px=3.0,
-    )  # fmt: skip
+        rgb,
+        colors,
+        prior=prior,
+        variance=variance,
+        model_error=covariance,
+        valid=np.broadcast_to(mask, blood.shape),
+        shading_window_px=3.0,
+    )
     return median_error(np.abs(found.change[1] - (blood[1] - blood[0]))[mask])
 
 
 def _point(
     knobs: dict[str, str | int | float],
     call: Callable[[], object],
-    error: Callable[[], Floats],
-    mask: NDArray[np.bool_],
+    error: Callable[[], Float64Array],
+    mask: BoolArray,
 ) -> Point:
     timing = measure(call, repeats=1, memory=False)
     off = np.abs(error())[mask]
@@ -167,12 +183,16 @@ def _melanin_limits(colors: ColorTable, prior: ShadingPrior) -> tuple[Limit, ...
         found = shared_melanin.weigh(seen, colors, prior=prior, variance=(2e-3 * clean) ** 2)
         variances[count] = float(found.melanin.var())
     return (
-        Limit("times smaller variance of melanin by noise, 7 states against 1",
-              variances[1] / variances[7], 6.0, ">="),
-    )  # fmt: skip
+        Limit(
+            "times smaller variance of melanin by noise, 7 states against 1",
+            variances[1] / variances[7],
+            6.0,
+            ">=",
+        ),
+    )
 
 
-def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Floats) -> Limit:
+def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Float64Array) -> Limit:
     """Time 7 states of a megapixel by a band of it."""
     rng = np.random.default_rng(2)
     band = 96
@@ -183,12 +203,19 @@ def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Floats) -> L
     for _ in range(2):
         begin = time.process_time()
         shared_melanin.weigh(
-            rgb, colors, prior=prior, variance=variance, model_error=covariance,
+            rgb,
+            colors,
+            prior=prior,
+            variance=variance,
+            model_error=covariance,
             shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-        )  # fmt: skip
+        )
         seconds.append(time.process_time() - begin)
     whole = min(seconds) * FULL_SIDE / band / CORES
     return Limit(
         "processor seconds on each of 2 cores, 7 states of 1024 x 1024, by a band of 96 rows",
-        whole, SECONDS_FULL, "<=", "s",
-    )  # fmt: skip
+        whole,
+        SECONDS_FULL,
+        "<=",
+        "s",
+    )

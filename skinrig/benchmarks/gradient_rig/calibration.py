@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.fiber.spot_photometry import Shot, shot
 from capture.calibration.led_sphere.survey import SphereSurvey, survey_sphere
 from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import Rig, load_rig
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
 
 SEED = 7
@@ -97,16 +97,19 @@ def _shots(scene: object, rig: Rig) -> list[Shot]:
             light = PatternLight("full", level, 0.0, EXPOSURE_S, float(reading))
             cfa = scene.exposure(view.name, pops=[light], exposure_s=EXPOSURE_S, seed=len(shots))
             frame = RawFrame(
-                cfa=cfa, pattern=view.cfa, black=(float(view.black_level),),
-                white=view.white_level, noise_profile=sensor.noise_profile(EXPOSURE_S),
-            )  # fmt: skip
+                cfa=cfa,
+                pattern=view.cfa,
+                black=(float(view.black_level),),
+                white=view.white_level,
+                noise_profile=sensor.noise_profile(EXPOSURE_S),
+            )
             shots.append(
                 shot(frame, amount_s=EXPOSURE_S * level, reading_deg=float(reading), flat=flat)
             )
     return shots
 
 
-def _interval(sizes: NDArray[np.float64]) -> tuple[float, float]:
+def _interval(sizes: Float64Array) -> tuple[float, float]:
     """Return a bootstrap interval of a median, 68 %."""
     rng = np.random.default_rng(0)
     again = np.median(sizes[rng.integers(0, len(sizes), (400, len(sizes)))], axis=1)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from threadpoolctl import threadpool_limits
 
@@ -22,11 +21,11 @@ from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
-Floats = NDArray[np.float64]
-Images = Mapping[tuple[str, str], NDArray[np.floating]]
+Images = Mapping[tuple[str, str], FloatArray]
 
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
 EXPOSURE_S = 0.03
@@ -47,11 +46,11 @@ EDGE_PX = 6
 class Patch:
     """Skin in the gradient rig, without noise."""
 
-    images: dict[tuple[str, str], NDArray[np.float32]]
+    images: dict[tuple[str, str], Float32Array]
     """Fractions of full scale."""
-    seen: Floats
+    seen: Float64Array
     """Normals at the lens' resolution, (H, W, 3)."""
-    sharp: Floats
+    sharp: Float64Array
     lights: SphereLights
     geometry: dict[str, Any]
     """View and place of each pixel."""
@@ -65,9 +64,12 @@ def lights_of(sphere: BuiltSphere) -> SphereLights:
     fields = np.cross(sphere.absorbs, ways)
     middle = float(np.median(far))
     return SphereLights(
-        ways, sphere.intensity * (middle / far) ** 2, programmed=sphere.weights[:, 1:],
-        polarizers=fields / np.linalg.norm(fields, axis=1)[:, None], distance_mm=middle,
-    )  # fmt: skip
+        ways,
+        sphere.intensity * (middle / far) ** 2,
+        programmed=sphere.weights[:, 1:],
+        polarizers=fields / np.linalg.norm(fields, axis=1)[:, None],
+        distance_mm=middle,
+    )
 
 
 def pixel_geometry(rig: Rig) -> dict[str, Any]:
@@ -103,13 +105,16 @@ def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
     # as fractions of full scale; a full well is one
     noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)
     return Patch(
-        images, np.asarray(truth["normals_seen_a000_n0"].values, np.float64),
-        np.asarray(truth["normals"].values, np.float64), lights_of(sphere), pixel_geometry(rig),
+        images,
+        np.asarray(truth["normals_seen_a000_n0"].values, np.float64),
+        np.asarray(truth["normals"].values, np.float64),
+        lights_of(sphere),
+        pixel_geometry(rig),
         noise,
-    )  # fmt: skip
+    )
 
 
-def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], NDArray[np.float32]]:
+def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], Float32Array]:
     """Return the pictures with the sensor's noise."""
     read, gain = patch.noise.read_variance, patch.noise.gain
     return {
@@ -120,7 +125,7 @@ def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], NDA
     }
 
 
-def vectors_alone(images: Images) -> Floats:
+def vectors_alone(images: Images) -> Float64Array:
     """Return normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
     s = {
         name: images[name, "parallel"].astype(np.float64) - images[name, "crossed"]
@@ -132,7 +137,7 @@ def vectors_alone(images: Images) -> Floats:
 
 
 def _judged(
-    normals: NDArray[np.floating], valid: NDArray[np.bool_], truth: Floats, seed: int = 0
+    normals: FloatArray, valid: BoolArray, truth: Float64Array, seed: int = 0
 ) -> tuple[float, tuple[float, float]]:
     inner = (slice(EDGE_PX, -EDGE_PX),) * 2
     good = valid[inner]
@@ -187,8 +192,12 @@ def normals(*, toy: bool) -> StageBenchmark:
     add({"patterns": "16", "filter": "none"}, noisy, **plain)
     for sigma in (1.0,) if toy else (0.7, 1.0, 1.5):
         add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smooth_px=sigma, **plain)
-    add({"patterns": "16", "filter": "Wiener", "lights": "ideal"}, noisy, variance=patch.noise,
-        wiener=True)  # fmt: skip
+    add(
+        {"patterns": "16", "filter": "Wiener", "lights": "ideal"},
+        noisy,
+        variance=patch.noise,
+        wiener=True,
+    )
     add({"patterns": "16", "noise": "none"}, patch.images, **told)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
     bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
@@ -220,9 +229,12 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
     }
     seen = replace(patch, images=images)
     found = from_patterns(
-        exposed(seen, np.random.default_rng(0)), lights=patch.lights, variance=patch.noise,
-        wiener=True, **patch.geometry,
-    )  # fmt: skip
+        exposed(seen, np.random.default_rng(0)),
+        lights=patch.lights,
+        variance=patch.noise,
+        wiener=True,
+        **patch.geometry,
+    )
     return BandError(*_judged(found.normals, found.valid, patch.seen))
 
 
@@ -237,9 +249,7 @@ def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
         key: np.tile(image, (16, 16)).astype(np.float32)
         for key, image in exposed(smooth, rng).items()
     }
-    options: dict[str, Any] = {
-        "lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise,
-    }  # fmt: skip
+    options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
     spent = []
     for _ in range(3):
         begin = time.process_time()
@@ -252,14 +262,25 @@ def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
     ours_s = min(spent) / CORES
     return (
         *(
-            Limit(f"mean error without noise on smooth relief, {name}", error, CLEAN_DEG,
-                  "<=", "degrees")
+            Limit(
+                f"mean error without noise on smooth relief, {name}",
+                error,
+                CLEAN_DEG,
+                "<=",
+                "degrees",
+            )
             for name, error in against.items()
         ),
-        Limit("mean error at the demo's noise, lens' resolution", worst, NOISY_DEG, "<=",
-              "degrees"),
-        Limit("processor seconds on each of 2 cores for 2048 x 2048 x 16", ours_s, SECONDS,
-              "<=", "s"),
-        Limit("times the processor time of the formula alone in NumPy", CORES * ours_s / peer_s,
-              TIMES_FORMULA, "<="),
-    )  # fmt: skip
+        Limit(
+            "mean error at the demo's noise, lens' resolution", worst, NOISY_DEG, "<=", "degrees"
+        ),
+        Limit(
+            "processor seconds on each of 2 cores for 2048 x 2048 x 16", ours_s, SECONDS, "<=", "s"
+        ),
+        Limit(
+            "times the processor time of the formula alone in NumPy",
+            CORES * ours_s / peer_s,
+            TIMES_FORMULA,
+            "<=",
+        ),
+    )

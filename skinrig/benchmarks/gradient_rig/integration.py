@@ -14,9 +14,8 @@ from reconstruction.normal_integration import Settings, integrate, integrate_map
 from reconstruction.normal_integration.discontinuities import integrate_broken
 from reconstruction.normal_integration.height_errors import expected_rms
 from reconstruction.normal_integration.height_filters import high_pass
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
-
-Floats = NDArray[np.float64]
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
@@ -31,7 +30,7 @@ RESIDUAL = 1e-5
 ERROR = 0.05
 
 
-def relief(side: int, *, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
     """Make a relief of ridged cells on a bulge, and its normals (y up) without noise.
 
     Periodic, of 90 um to 1 mm wavelength; slopes are exact derivatives of the height's waves.
@@ -62,7 +61,7 @@ def relief(side: int, *, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return height, n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
-def frankot_chellappa(normals: Floats, *, pixel: float) -> Floats:
+def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
     """Integrate slopes of a periodic picture by the Fourier transform.
 
     Frankot and Chellappa 1988, doi 10.1109/34.3909.
@@ -77,8 +76,8 @@ def frankot_chellappa(normals: Floats, *, pixel: float) -> Floats:
 
 
 def sparse_direct(
-    normals: Floats, valid: NDArray[np.bool_], *, pixel: float, order: int = 4
-) -> Floats:
+    normals: Float64Array, valid: BoolArray, *, pixel: float, order: int = 4
+) -> Float64Array:
     """Solve the same normal equations with SciPy's SuperLU; one connected part."""
     ax, ay, dx, dy = slope_fields.edges(
         slope_fields.from_normals(normals, valid=valid), order=order
@@ -117,16 +116,18 @@ def integration(*, toy: bool) -> StageBenchmark:
 
     def add(
         knobs: dict[str, str | int | float],
-        call: Callable[[Floats], NDArray[np.floating]],
-        normals: Floats,
-        valid: NDArray[np.bool_],
+        call: Callable[[Float64Array], FloatArray],
+        normals: Float64Array,
+        valid: BoolArray,
         stderr: float,
     ) -> None:
         timing = measure(lambda: call(normals), repeats=1 if toy else 3)
         error = high_pass(
             np.where(valid, call(normals) - truth, 0.0),
-            pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=valid,
-        )  # fmt: skip
+            pixel=PIXEL_UM,
+            cutoff=CUTOFF_UM,
+            valid=valid,
+        )
         tiles = [float(np.mean(t[m] ** 2)) for t, m in _tiles(error, valid) if m.any()]
         means = np.mean(rng.choice(tiles, (200, len(tiles))), axis=1)
         low, high = np.sqrt(np.quantile(means, [0.16, 0.84]))
@@ -134,46 +135,79 @@ def integration(*, toy: bool) -> StageBenchmark:
         bound = None
         if stderr > 0.0:
             slope = stderr / np.sqrt(2.0)
-            bound = expected_rms(
-                normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM
-            )  # fmt: skip
+            bound = expected_rms(normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM)
         points.append(
             Point(knobs, timing, rms, (min(float(low), rms), max(float(high), rms)), bound)
         )
 
-    def ours(valid: NDArray[np.bool_], **options: object) -> Callable[[Floats], NDArray]:
+    def ours(valid: BoolArray, **options: object) -> Callable[[Float64Array], NDArray]:
         return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
 
     for name, normals, sigma in (("none", clean, 0.0), ("1.5 deg", noisy, NOISE_RAD)):
         base: dict[str, str | int | float] = {"noise": name}
         for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
             settings = Settings(tolerance=tolerance)
-            add({**base, "method": "multigrid", "mask": "disc", "tolerance": tolerance},
-                ours(disc, settings=settings), normals, disc, sigma)  # fmt: skip
-        add({**base, "method": "multigrid", "mask": "disc", "order": 2},
-            ours(disc, settings=Settings(order=2)), normals, disc, sigma)  # fmt: skip
+            add(
+                {**base, "method": "multigrid", "mask": "disc", "tolerance": tolerance},
+                ours(disc, settings=settings),
+                normals,
+                disc,
+                sigma,
+            )
+        add(
+            {**base, "method": "multigrid", "mask": "disc", "order": 2},
+            ours(disc, settings=Settings(order=2)),
+            normals,
+            disc,
+            sigma,
+        )
         add({**base, "method": "cosines", "mask": "none"}, ours(whole), normals, whole, sigma)
-        add({**base, "method": "Frankot-Chellappa", "mask": "none"},
-            lambda n: frankot_chellappa(n, pixel=PIXEL_UM), normals, whole, sigma)  # fmt: skip
-    add({"noise": "1.5 deg", "method": "multigrid", "mask": "disc", "denoise": 1},
-        ours(disc, stderr_rad=NOISE_RAD, denoise=1.0), noisy, disc, NOISE_RAD)  # fmt: skip
-    add({"noise": "1.5 deg", "method": "bilateral", "mask": "disc"},
+        add(
+            {**base, "method": "Frankot-Chellappa", "mask": "none"},
+            lambda n: frankot_chellappa(n, pixel=PIXEL_UM),
+            normals,
+            whole,
+            sigma,
+        )
+    add(
+        {"noise": "1.5 deg", "method": "multigrid", "mask": "disc", "denoise": 1},
+        ours(disc, stderr_rad=NOISE_RAD, denoise=1.0),
+        noisy,
+        disc,
+        NOISE_RAD,
+    )
+    add(
+        {"noise": "1.5 deg", "method": "bilateral", "mask": "disc"},
         lambda n: integrate_broken(n, pixel=PIXEL_UM, valid=disc).height,
-        noisy, disc, NOISE_RAD)  # fmt: skip
-    add({"noise": "none", "method": "sparse direct", "mask": "disc"},
-        lambda n: sparse_direct(n, disc, pixel=PIXEL_UM), clean, disc, 0.0)  # fmt: skip
+        noisy,
+        disc,
+        NOISE_RAD,
+    )
+    add(
+        {"noise": "none", "method": "sparse direct", "mask": "disc"},
+        lambda n: sparse_direct(n, disc, pixel=PIXEL_UM),
+        clean,
+        disc,
+        0.0,
+    )
     limits: tuple[Limit, ...] = ()
     if not toy:
         error = high_pass(
             np.where(disc, integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, 0.0),
-            pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=disc,
-        )  # fmt: skip
+            pixel=PIXEL_UM,
+            cutoff=CUTOFF_UM,
+            valid=disc,
+        )
         kept = high_pass(np.where(disc, truth, 0.0), pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=disc)
         limits = (
-            Limit("RMS error over RMS relief after high-pass, noise of 1.5 degrees",
-                  float(np.std(error[disc]) / np.std(kept[disc])), ERROR, "<="),
+            Limit(
+                "RMS error over RMS relief after high-pass, noise of 1.5 degrees",
+                float(np.std(error[disc]) / np.std(kept[disc])),
+                ERROR,
+                "<=",
+            ),
             *_full_size(rng),
-        )  # fmt: skip
+        )
     return StageBenchmark(
         "normal-integration",
         "RMS error of height after a high-pass of 1 mm, um",
@@ -187,15 +221,13 @@ def integration(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _disc(side: int) -> NDArray[np.bool_]:
+def _disc(side: int) -> BoolArray:
     y, x = np.mgrid[0:side, 0:side] - 0.5 * side
     holes = (x - 0.1 * side) ** 2 + (y + 0.2 * side) ** 2 < (0.05 * side) ** 2
     return np.asarray((x * x + y * y < (0.47 * side) ** 2) & ~holes)
 
 
-def _tiles(
-    error: NDArray[np.floating], valid: NDArray[np.bool_]
-) -> list[tuple[NDArray[np.floating], NDArray[np.bool_]]]:
+def _tiles(error: FloatArray, valid: BoolArray) -> list[tuple[FloatArray, BoolArray]]:
     step = max(1, len(error) // 8)
     places = range(0, len(error), step)
     return [
@@ -238,14 +270,33 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     theirs = sparse_direct(flat, part, pixel=PIXEL_UM)
     peer_s = time.process_time() - begin
     return (
-        Limit("processor seconds on each of 2 cores, 2048 x 2048 with a mask",
-              min(spent) / CORES, SECONDS, "<=", "s"),
-        Limit("relative residual of the same, in float64",
-              found.convergence.residual, RESIDUAL, "<="),
-        Limit("processor seconds on each of 2 cores, bilateral, 1024 x 1024",
-              min(broken) / CORES, BROKEN_SECONDS, "<=", "s"),
-        Limit("times less processor time than SuperLU, 512 x 512 with a mask",
-              peer_s / ours_s, 1.0, ">="),
-        Limit("largest difference to SuperLU over the RMS height",
-              float(np.abs(mine - theirs)[part].max() / np.std(theirs[part])), 1e-3, "<="),
-    )  # fmt: skip
+        Limit(
+            "processor seconds on each of 2 cores, 2048 x 2048 with a mask",
+            min(spent) / CORES,
+            SECONDS,
+            "<=",
+            "s",
+        ),
+        Limit(
+            "relative residual of the same, in float64", found.convergence.residual, RESIDUAL, "<="
+        ),
+        Limit(
+            "processor seconds on each of 2 cores, bilateral, 1024 x 1024",
+            min(broken) / CORES,
+            BROKEN_SECONDS,
+            "<=",
+            "s",
+        ),
+        Limit(
+            "times less processor time than SuperLU, 512 x 512 with a mask",
+            peer_s / ours_s,
+            1.0,
+            ">=",
+        ),
+        Limit(
+            "largest difference to SuperLU over the RMS height",
+            float(np.abs(mine - theirs)[part].max() / np.std(theirs[part])),
+            1e-3,
+            "<=",
+        ),
+    )

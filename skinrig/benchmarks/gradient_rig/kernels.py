@@ -8,7 +8,6 @@ from typing import Literal
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from reconstruction import kernel_fit, normal_histogram
@@ -18,10 +17,9 @@ from reconstruction.kernel_fit import search as kernel_search
 from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import mean_error
-
-Floats = NDArray[np.float64]
 
 PIXEL_UM = 6.0
 STRETCH = 0.88
@@ -34,7 +32,7 @@ PEER_CANDIDATES = 3
 """Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
 
 
-def relief(side: int, *, rng: np.random.Generator) -> Floats:
+def relief(side: int, *, rng: np.random.Generator) -> Float64Array:
     """Return heights of a skin-like relief, um: grain, ridges, and a network of furrows.
 
     Parameters
@@ -45,7 +43,7 @@ def relief(side: int, *, rng: np.random.Generator) -> Floats:
         Draws the relief.
     """
 
-    def field(correlation_px: float) -> Floats:
+    def field(correlation_px: float) -> Float64Array:
         white = rng.standard_normal((side, side), np.float32)
         smooth = gaussian_filter(white, correlation_px, mode="wrap").astype(np.float64)
         return np.asarray(smooth / smooth.std())
@@ -54,7 +52,7 @@ def relief(side: int, *, rng: np.random.Generator) -> Floats:
     return np.asarray(field(2.0) + 5.0 * field(6.0) - 12.0 * furrows + 8.0 * field(25.0))
 
 
-def strained(height: Floats, *, rng: np.random.Generator) -> Floats:
+def strained(height: Float64Array, *, rng: np.random.Generator) -> Float64Array:
     """Return a relief that no kernel makes: furrows deepen more than ridges rise, with noise."""
     about = height - height.mean()
     deeper = 1.12 * height - 0.02 * about**2 * (about < 0)
@@ -62,7 +60,9 @@ def strained(height: Floats, *, rng: np.random.Generator) -> Floats:
     return np.asarray(deeper + 0.5 * grain)
 
 
-def numpy_distance(height: Floats, target: Floats, alpha: float, sigma_um: float) -> float:
+def numpy_distance(
+    height: Float64Array, target: Float64Array, alpha: float, sigma_um: float
+) -> float:
     """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
@@ -105,9 +105,16 @@ def search(*, toy: bool) -> StageBenchmark:
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
     ) -> kernel_outcome.KernelFit:
         return kernel_fit.fit_kernel(
-            height[:part, :part], target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM,
-            search=way, first_sample=first, alphas=alphas[::thin], sigmas_um=sigmas[::thin],
-        )  # fmt: skip
+            height[:part, :part],
+            target,
+            stretch=STRETCH,
+            axis="x",
+            pixel_um=PIXEL_UM,
+            search=way,
+            first_sample=first,
+            alphas=alphas[::thin],
+            sigmas_um=sigmas[::thin],
+        )
 
     best = fit("exhaustive", side, 2)
     whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
@@ -181,7 +188,7 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
                 np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
             )
 
-        def run(target: Floats = target) -> kernel_outcome.KernelFit:
+        def run(target: Float64Array = target) -> kernel_outcome.KernelFit:
             return kernel_fit.fit_kernel(
                 height, target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM
             )
@@ -189,17 +196,35 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / CORES)
     found = run()
     return (
-        Limit("processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
-              default_s[0], HIERARCHICAL_S, "<=", "s"),
+        Limit(
+            "processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
+            default_s[0],
+            HIERARCHICAL_S,
+            "<=",
+            "s",
+        ),
         Limit("the same, relief made by a kernel", default_s[1], HIERARCHICAL_S, "<=", "s"),
-        Limit("steps of alpha from the kernel that made the relief", abs(found.alpha + 0.63) / 0.01,
-              1e-6, "<="),
-        Limit("um of sigma from the kernel that made the relief", abs(found.sigma_um - 17.5), 1e-9,
-              "<=", "um"),
-        Limit("times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
-              peer_s / (ours_s / CORES), TIMES_FASTER, ">="),
+        Limit(
+            "steps of alpha from the kernel that made the relief",
+            abs(found.alpha + 0.63) / 0.01,
+            1e-6,
+            "<=",
+        ),
+        Limit(
+            "um of sigma from the kernel that made the relief",
+            abs(found.sigma_um - 17.5),
+            1e-9,
+            "<=",
+            "um",
+        ),
+        Limit(
+            "times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
+            peer_s / (ours_s / CORES),
+            TIMES_FASTER,
+            ">=",
+        ),
         Limit("difference of distances from NumPy's", mismatch, 1e-3, "<="),
-    )  # fmt: skip
+    )
 
 
 def histograms(*, toy: bool) -> StageBenchmark:
@@ -219,7 +244,7 @@ def histograms(*, toy: bool) -> StageBenchmark:
             ]
 
             def run(
-                height: Floats = patches[0], bins: int = bins
+                height: Float64Array = patches[0], bins: int = bins
             ) -> normal_statistics.NormalStatistics:
                 return normal_statistics.measure(height, pixel=PIXEL_UM, bins=bins)
 
@@ -236,21 +261,25 @@ def histograms(*, toy: bool) -> StageBenchmark:
     dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
     edges = np.linspace(-1.0, 1.0, 65)
 
-    def theirs() -> Floats:
+    def theirs() -> Float64Array:
         w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
         counts = np.histogram2d((-dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
         return np.asarray(counts / counts.sum())
 
-    def ours() -> Floats:
+    def ours() -> Float64Array:
         return normal_histogram.from_slopes(dx, dy)
 
     repeats = 1 if toy else 3
     times = _spent(theirs, repeats) / max(_spent(ours, repeats), 1e-9)
     limits = (
         Limit("times less processor time than numpy.histogram2d, same slopes", times, 3.0, ">="),
-        Limit("distance from numpy.histogram2d's histogram",
-              normal_histogram.distance(ours(), theirs()), 1e-5, "<="),
-    )  # fmt: skip
+        Limit(
+            "distance from numpy.histogram2d's histogram",
+            normal_histogram.distance(ours(), theirs()),
+            1e-5,
+            "<=",
+        ),
+    )
     return StageBenchmark(
         "normal-histogram",
         "distance to the histogram of a larger patch, 0...2",

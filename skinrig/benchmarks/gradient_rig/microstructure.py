@@ -31,10 +31,8 @@ from reconstruction.kernel_fit import table as kernel_table
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
+from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 TEXEL_UM = 10.0
 FITTED_STATES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -43,8 +41,10 @@ JUDGED_STATES = (0.8, 0.9, 1.1, 1.2)
 ALPHAS = np.round(np.arange(-2.0, 1.001, 0.05), 2)
 SIGMAS_UM = np.arange(4.0, 101.0, 4.0)
 ACROSS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
-    (0.0, "none"), (30.0, "none"), (30.0, "volume"),
-)  # fmt: skip
+    (0.0, "none"),
+    (30.0, "none"),
+    (30.0, "volume"),
+)
 """Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
 width, and where it does not, both passes act."""
 CORES = 2
@@ -64,7 +64,7 @@ GRADUAL_ERROR = 2.0
 WAVES = 60
 
 
-def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Floats, Floats]:
+def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Float64Array, Float64Array]:
     """Return slopes along and across the jaws of a relief that goes along with the skin."""
     dx, dy, known = relief_slopes.slopes(height, pixel=TEXEL_UM)
     inverse = np.linalg.inv(state.gradient)
@@ -93,9 +93,14 @@ def fitted_table(
                 settled.height_um, pixel=(TEXEL_UM, TEXEL_UM * settled.stretch_s)
             )
             fit = kernel_fit.fit_kernel(
-                skin.height_um, target, stretch=r, axis="x", pixel_um=TEXEL_UM,
-                alphas=ALPHAS[::every], sigmas_um=SIGMAS_UM[::every],
-            )  # fmt: skip
+                skin.height_um,
+                target,
+                stretch=r,
+                axis="x",
+                pixel_um=TEXEL_UM,
+                alphas=ALPHAS[::every],
+                sigmas_um=SIGMAS_UM[::every],
+            )
             found.append((r, fit.alpha, fit.sigma_um))
     r, alpha, sigma = np.array(found).T
     return kernel_table.fit_table(r, alpha, sigma, source="fitted to settled skin").table
@@ -103,19 +108,24 @@ def fitted_table(
 
 def strained_relief(
     skin: MicroSkin, state: StretchedSkin, table: KernelTable, sampling: Sampling
-) -> Float32:
+) -> Float32Array:
     """Return the relief that a table's kernels make of a neutral one."""
     angle = math.radians(state.angle_deg)
     alpha, sigma_um = kernel_parameters([state.stretch_s, state.stretch_t], table)
     return convolve(
         skin.height_um,
-        (math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle)),  # rows go down
-        alpha[0], sigma_um[0] / TEXEL_UM, alpha[1], sigma_um[1] / TEXEL_UM, sampling=sampling,
-    )  # fmt: skip
+        (math.cos(angle), -math.sin(angle)),
+        (math.sin(angle), math.cos(angle)),  # rows go down
+        alpha[0],
+        sigma_um[0] / TEXEL_UM,
+        alpha[1],
+        sigma_um[1] / TEXEL_UM,
+        sampling=sampling,
+    )
 
 
 def _judged(
-    made: Callable[[MicroSkin, StretchedSkin], Float32],
+    made: Callable[[MicroSkin, StretchedSkin], Float32Array],
     skins: list[MicroSkin],
     settled: list[list[StretchedSkin]],
 ) -> tuple[float, float, float]:
@@ -147,7 +157,7 @@ def truth(*, toy: bool) -> StageBenchmark:
         [make_micro_skin("forehead", seed=1, size_mm=size_mm, texel_um=TEXEL_UM)],
         states,
         every=4 if toy else 1,
-    )  # fmt: skip
+    )
     seeds = (7, 8) if toy else (7, 8, 9)
     skins = [
         make_micro_skin("forehead", seed=seed, size_mm=size_mm, texel_um=TEXEL_UM) for seed in seeds
@@ -157,10 +167,12 @@ def truth(*, toy: bool) -> StageBenchmark:
     variances: dict[tuple[str, str, str], float] = {}
     for angle, across in ACROSS[-1:] if toy else ACROSS:
         settled = [
-            [deform(skin, stretch=r, angle_deg=angle, compensation=across)
-             for r in (JUDGED_STATES[::3] if toy else JUDGED_STATES)]
+            [
+                deform(skin, stretch=r, angle_deg=angle, compensation=across)
+                for r in (JUDGED_STATES[::3] if toy else JUDGED_STATES)
+            ]
             for skin in skins
-        ]  # fmt: skip
+        ]
         ways: list[tuple[str, KernelTable | None, Sampling]] = [
             ("none", None, "cubic"),
             ("the paper's forehead", FOREHEAD, "cubic"),
@@ -172,17 +184,19 @@ def truth(*, toy: bool) -> StageBenchmark:
                 continue
 
             def made(
-                skin: MicroSkin, state: StretchedSkin,
-                kernels: KernelTable | None = kernels, sampling: Sampling = sampling,
-            ) -> Float32:  # fmt: skip
+                skin: MicroSkin,
+                state: StretchedSkin,
+                kernels: KernelTable | None = kernels,
+                sampling: Sampling = sampling,
+            ) -> Float32Array:
                 if kernels is None:
                     return skin.height_um
                 return strained_relief(skin, state, kernels, sampling)
 
             def run(
-                made: Callable[..., Float32] = made,
+                made: Callable[..., Float32Array] = made,
                 settled: list[list[StretchedSkin]] = settled,
-            ) -> list[Float32]:
+            ) -> list[Float32Array]:
                 pairs = zip(skins, settled, strict=True)
                 return [made(skin, state) for skin, own in pairs for state in own]
 
@@ -190,8 +204,11 @@ def truth(*, toy: bool) -> StageBenchmark:
             error, spread, wrong = _judged(made, skins, settled)
             errors[name, across, sampling], variances[name, across, sampling] = error, wrong
             knobs: dict[str, str | int | float] = {
-                "kernels": name, "jaws_deg": angle, "across": across, "sampling": sampling,
-            }  # fmt: skip
+                "kernels": name,
+                "jaws_deg": angle,
+                "across": across,
+                "sampling": sampling,
+            }
             also = {"variance_error_percent": 100.0 * math.expm1(wrong)}
             interval = (error - spread, error + spread)
             points.append(Point(knobs, timing, error, interval, also=also))
@@ -202,16 +219,32 @@ def truth(*, toy: bool) -> StageBenchmark:
     limits: tuple[Limit, ...] = ()
     if not toy:
         limits = (
-            Limit("fitted kernels' distance of normals over the static relief's, width kept",
-                  left(errors, "none"), STATIC_PART, "<="),
-            Limit("their error of slopes' variance along the jaws over the static relief's",
-                  left(variances, "none"), STATIC_PART, "<="),
-            Limit("the same distance where the width changes by volume", left(errors, "volume"),
-                  1.0, "<="),
-            Limit("the same error where the width changes by volume", left(variances, "volume"),
-                  1.0, "<="),
+            Limit(
+                "fitted kernels' distance of normals over the static relief's, width kept",
+                left(errors, "none"),
+                STATIC_PART,
+                "<=",
+            ),
+            Limit(
+                "their error of slopes' variance along the jaws over the static relief's",
+                left(variances, "none"),
+                STATIC_PART,
+                "<=",
+            ),
+            Limit(
+                "the same distance where the width changes by volume",
+                left(errors, "volume"),
+                1.0,
+                "<=",
+            ),
+            Limit(
+                "the same error where the width changes by volume",
+                left(variances, "volume"),
+                1.0,
+                "<=",
+            ),
             *_full_size(),
-        )  # fmt: skip
+        )
     return StageBenchmark(
         "microstructure",
         "distance of normals from those of settled skin, 0...2 (eq. 7)",
@@ -227,7 +260,7 @@ def truth(*, toy: bool) -> StageBenchmark:
 
 def varying_fields(
     side: int, rows: int, *, first_row: int = 0, mean_px: float = 1.5
-) -> tuple[Float32, ...]:
+) -> tuple[Float32Array, ...]:
     """Return axes, strengths and sigmas as a face has them: they turn, blur here, sharpen there.
 
     Parameters
@@ -251,13 +284,17 @@ def varying_fields(
     return tuple(
         np.ascontiguousarray(values, np.float32)
         for values in (
-            np.stack([c, s], -1), np.stack([-s, c], -1), alpha, sigma,
-            np.minimum(-alpha, 1.0), 0.9 * sigma
+            np.stack([c, s], -1),
+            np.stack([-s, c], -1),
+            alpha,
+            sigma,
+            np.minimum(-alpha, 1.0),
+            0.9 * sigma,
         )
-    )  # fmt: skip
+    )
 
 
-def numpy_convolve(height: Float32, fields: tuple[Float32, ...]) -> Float32:
+def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Float32Array:
     """Return eqs. (4)-(6) in vectorised NumPy and SciPy, with bilinear samples."""
     axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t = fields
     y, x = np.mgrid[: height.shape[0], : height.shape[1]].astype(np.float32)
@@ -305,18 +342,32 @@ def _full_size() -> tuple[Limit, ...]:
     raster_s = _spent(_rasterized(FULL_SIDE), 2) / CORES
     tile_s, peak_mb = _tiles_of_16k()
     return (
-        Limit("times faster on 2 cores than NumPy on its one, 4096 x 4096, cubic samples",
-              peer_s / own["cubic"], TIMES_FASTER, ">="),
+        Limit(
+            "times faster on 2 cores than NumPy on its one, 4096 x 4096, cubic samples",
+            peer_s / own["cubic"],
+            TIMES_FASTER,
+            ">=",
+        ),
         Limit("the same, bilinear samples as NumPy's", peer_s / own["linear"], TIMES_FASTER, ">="),
-        Limit("largest difference from NumPy's, bilinear, of heights about 1", float(mismatch),
-              1e-3, "<="),
-        Limit("processor seconds on each of 2 cores, 4096 x 4096, cubic", own["cubic"], 10.0, "<=",
-              "s"),
+        Limit(
+            "largest difference from NumPy's, bilinear, of heights about 1",
+            float(mismatch),
+            1e-3,
+            "<=",
+        ),
+        Limit(
+            "processor seconds on each of 2 cores, 4096 x 4096, cubic",
+            own["cubic"],
+            10.0,
+            "<=",
+            "s",
+        ),
         Limit("the same, strain of 18,432 triangles filled into it", raster_s, 3.0, "<=", "s"),
-        Limit("the same for 16,384 x 16,384 in tiles of 2048, by two of 64", tile_s, 200.0, "<=",
-              "s"),
+        Limit(
+            "the same for 16,384 x 16,384 in tiles of 2048, by two of 64", tile_s, 200.0, "<=", "s"
+        ),
         Limit("arrays held for that", peak_mb, TILED_MB, "<=", "MB"),
-    )  # fmt: skip
+    )
 
 
 def _rasterized(side: int) -> Callable[[], object]:
@@ -352,9 +403,12 @@ def _tiles_of_16k() -> tuple[float, float]:
         source = np.memmap(Path(folder) / "neutral", np.float32, "w+", shape=shape)
         target = np.memmap(Path(folder) / "strained", np.float32, "w+", shape=shape)
         run = partial(
-            convolve_tiled, source, target, fields_at,
+            convolve_tiled,
+            source,
+            target,
+            fields_at,
             finished=[number for number in range(count) if number not in chosen],
-        )  # fmt: skip
+        )
         spent = _spent(run)
         tracemalloc.start()
         try:
@@ -366,7 +420,9 @@ def _tiles_of_16k() -> tuple[float, float]:
     return spent / CORES * count / len(chosen), peak / 1e6
 
 
-def waves(side: int, sigma_px: float, *, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+def waves(
+    side: int, sigma_px: float, *, rng: np.random.Generator
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return wave vectors (N, 2), rad per px, amplitudes and phases of a relief of many waves.
 
     Wavelengths are 4 to 12 sigmas (no shorter than 5 px), where kernels do most.
@@ -387,7 +443,7 @@ def two_passes_error(
     side: int = 160,
     sampling: Sampling = "cubic",
     rng: np.random.Generator,
-) -> tuple[float, Callable[[], NDArray[np.floating]]]:
+) -> tuple[float, Callable[[], FloatArray]]:
     """Return how far two passes are from the true convolution whose kernel varies, and the call.
 
     The true one (eqs. 1 and 2, with the kernel of the pixel it is written to) is known exactly of
@@ -434,7 +490,7 @@ def two_passes_error(
     inner = slice(margin, -margin), slice(margin, -margin)
     stored = height.astype(np.float32)
 
-    def call() -> NDArray[np.floating]:
+    def call() -> FloatArray:
         return convolve(stored, axis_s, axis_t, alpha[0], sigma, alpha[1], sigma, sampling=sampling)
 
     off = (call() - expected)[inner]
@@ -457,31 +513,55 @@ def passes(*, toy: bool) -> StageBenchmark:
                 found = []
                 for seed in range(draws):
                     error, call = two_passes_error(
-                        turn=turn, growth=growth, sigma_px=sigma_px, sampling=sampling,
-                        side=48 if toy else 160, rng=np.random.default_rng(seed),
-                    )  # fmt: skip
+                        turn=turn,
+                        growth=growth,
+                        sigma_px=sigma_px,
+                        sampling=sampling,
+                        side=48 if toy else 160,
+                        rng=np.random.default_rng(seed),
+                    )
                     found.append(100.0 * error)
                 mean = float(np.mean(found))
                 spread = float(np.std(found, ddof=1) / math.sqrt(draws)) if draws > 1 else 0.0
                 errors[sigma_px, sampling, turn, growth] = mean
                 points.append(
                     Point(
-                        {"turn_rad_per_sigma": turn, "growth_per_sigma": growth,
-                         "sigma_px": sigma_px, "sampling": sampling},
-                        measure(call, repeats=1, memory=False), mean,
+                        {
+                            "turn_rad_per_sigma": turn,
+                            "growth_per_sigma": growth,
+                            "sigma_px": sigma_px,
+                            "sampling": sampling,
+                        },
+                        measure(call, repeats=1, memory=False),
+                        mean,
                         (mean - spread, mean + spread),
                     )
-                )  # fmt: skip
+                )
     limits: tuple[Limit, ...] = ()
     if not toy:
         limits = (
-            Limit("error where nothing varies, sigma 3 px", errors[3.0, "cubic", 0.0, 0.0], 1.0,
-                  "<=", "%"),
-            Limit("error where axes turn gradually, sigma 3 px",
-                  errors[3.0, "cubic", GRADUAL, 0.0], GRADUAL_ERROR, "<=", "%"),
-            Limit("error where sigma grows gradually, sigma 3 px",
-                  errors[3.0, "cubic", 0.0, GRADUAL], GRADUAL_ERROR, "<=", "%"),
-        )  # fmt: skip
+            Limit(
+                "error where nothing varies, sigma 3 px",
+                errors[3.0, "cubic", 0.0, 0.0],
+                1.0,
+                "<=",
+                "%",
+            ),
+            Limit(
+                "error where axes turn gradually, sigma 3 px",
+                errors[3.0, "cubic", GRADUAL, 0.0],
+                GRADUAL_ERROR,
+                "<=",
+                "%",
+            ),
+            Limit(
+                "error where sigma grows gradually, sigma 3 px",
+                errors[3.0, "cubic", 0.0, GRADUAL],
+                GRADUAL_ERROR,
+                "<=",
+                "%",
+            ),
+        )
     return StageBenchmark(
         "microstructure-passes",
         "error of two passes, % of the change",

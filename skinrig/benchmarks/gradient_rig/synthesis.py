@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtri
 
@@ -14,10 +13,8 @@ from model.displacement_synthesis import growth as displacement_synthesis
 from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
-
-Float32Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384
@@ -82,14 +79,14 @@ def blended(
     return quantile.astype(np.float32)
 
 
-def slope_histogram(heights: Sequence[Float32Array]) -> Floats:
+def slope_histogram(heights: Sequence[Float32Array]) -> Float64Array:
     """Return the mean 64 x 64 histogram of normals of several maps."""
     return np.asarray(
         np.mean([normal_histogram.histogram(h, pixel=PIXEL_UM) for h in heights], axis=0)
     )
 
 
-def autocorrelation(height: Float32Array, *, reach_px: int = 64) -> Floats:
+def autocorrelation(height: Float32Array, *, reach_px: int = 64) -> Float64Array:
     """Return the autocorrelation of a map's slopes along y at distances up to a reach."""
     slope = np.gradient(height.astype(np.float64), axis=0)
     rows, columns = (fft.next_fast_len(n + reach_px) for n in slope.shape)
@@ -123,9 +120,17 @@ def growth(*, toy: bool) -> StageBenchmark:
     knobs = (
         ((24, 8, 4), (32, 12, 4), (40, 16, 4))
         if toy
-        else ((64, 32, 16), (96, 32, 16), (128, 64, 16), (192, 64, 1), (192, 64, 16),
-              (192, 64, 64), (256, 64, 16), (256, 128, 16))
-    )  # fmt: skip
+        else (
+            (64, 32, 16),
+            (96, 32, 16),
+            (128, 64, 16),
+            (192, 64, 1),
+            (192, 64, 16),
+            (192, 64, 64),
+            (256, 64, 16),
+            (256, 128, 16),
+        )
+    )
     points = []
     for cell, overlap, tried in knobs:
         made: list[Float32Array] = []
@@ -138,15 +143,22 @@ def growth(*, toy: bool) -> StageBenchmark:
         ) -> None:
             made[:] = [
                 displacement_synthesis.grow(
-                    patches, side, rng=np.random.default_rng(1), cell_px=cell,
-                    overlap_px=overlap, candidates=tried,
+                    patches,
+                    side,
+                    rng=np.random.default_rng(1),
+                    cell_px=cell,
+                    overlap_px=overlap,
+                    candidates=tried,
                 )
-            ]  # fmt: skip
+            ]
 
         timing = measure(run, repeats=1, memory=(cell, tried) == (knobs[-1][0], knobs[-1][2]))
         about: dict[str, str | int | float | bool] = {
-            "method": "cut", "cell": cell, "overlap": overlap, "candidates": tried,
-        }  # fmt: skip
+            "method": "cut",
+            "cell": cell,
+            "overlap": overlap,
+            "candidates": tried,
+        }
         points.append(_point(about, timing, made[0], truth))
     edge = 40 if toy else 128
 
@@ -174,16 +186,20 @@ def _point(
     knobs: Mapping[str, str | int | float | bool],
     timing: Timing,
     height: Float32Array,
-    truth: Floats,
+    truth: Float64Array,
 ) -> Point:
     """Return a point with the spread of its quarters as the error's interval."""
     error = normal_histogram.halved_distance(slope_histogram([height]), truth)
     half = height.shape[0] // 2
     quarters = [
         normal_histogram.histogram(part, pixel=PIXEL_UM)
-        for part in (height[:half, :half], height[:half, half:], height[half:, :half],
-                     height[half:, half:])
-    ]  # fmt: skip
+        for part in (
+            height[:half, :half],
+            height[:half, half:],
+            height[half:, :half],
+            height[half:, half:],
+        )
+    ]
     left_out = [
         normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
     ]
@@ -192,7 +208,7 @@ def _point(
 
 
 def _judged(
-    patches: Sequence[Float32Array], truth: Floats, theirs: Float32Array
+    patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array
 ) -> tuple[Limit, ...]:
     """Lay out the largest map, draw a band of its tiles, and judge them."""
     begin = time.process_time()
@@ -222,17 +238,40 @@ def _judged(
     apart = [float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, theirs)]
     blend = normal_histogram.halved_distance(slope_histogram([theirs]), truth)
     return (
-        Limit("half the sum of differences of 64 x 64 buckets from the patches'", ours, CLOSE,
-              "<="),
-        Limit("rms slope at cuts over that elsewhere",
-              float(np.sqrt(square[cuts].mean() / square[~cuts].mean())), 1.1, "<="),
-        Limit("memory of 16,384 x 16,384 on 2 threads with the map held in memory", memory_gb,
-              MEMORY_GB, "<=", "GB"),
-        Limit("processor minutes of 16,384 x 16,384, by one tile", (laid_s + tiles * tile_s) / 60.0,
-              10.0, "<=", "min"),
+        Limit(
+            "half the sum of differences of 64 x 64 buckets from the patches'", ours, CLOSE, "<="
+        ),
+        Limit(
+            "rms slope at cuts over that elsewhere",
+            float(np.sqrt(square[cuts].mean() / square[~cuts].mean())),
+            1.1,
+            "<=",
+        ),
+        Limit(
+            "memory of 16,384 x 16,384 on 2 threads with the map held in memory",
+            memory_gb,
+            MEMORY_GB,
+            "<=",
+            "GB",
+        ),
+        Limit(
+            "processor minutes of 16,384 x 16,384, by one tile",
+            (laid_s + tiles * tile_s) / 60.0,
+            10.0,
+            "<=",
+            "min",
+        ),
         Limit("times nearer to the patches' slopes than blended tiles", blend / ours, 1.0, ">="),
-        Limit("times nearer in the skewness of curvature (furrows) than blended tiles",
-              abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9), 2.0, ">="),
-        Limit("rms error of the autocorrelation of slopes within 64 px, over the blended tiles'",
-              apart[0] / apart[1], 1.0, "<="),
-    )  # fmt: skip
+        Limit(
+            "times nearer in the skewness of curvature (furrows) than blended tiles",
+            abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9),
+            2.0,
+            ">=",
+        ),
+        Limit(
+            "rms error of the autocorrelation of slopes within 64 px, over the blended tiles'",
+            apart[0] / apart[1],
+            1.0,
+            "<=",
+        ),
+    )

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import metrics, wrinkles
@@ -19,12 +18,19 @@ from model.wrinkles import storage as wrinkle_storage
 from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
+from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
 
-Floats = NDArray[np.float64]
-
-CENTRES = ((0.3, 0.12), (0.7, 0.12), (0.3, 0.3), (0.7, 0.3),
-           (0.25, 0.5), (0.75, 0.5), (0.5, 0.65), (0.5, 0.88))  # fmt: skip
+CENTRES = (
+    (0.3, 0.12),
+    (0.7, 0.12),
+    (0.3, 0.3),
+    (0.7, 0.3),
+    (0.25, 0.5),
+    (0.75, 0.5),
+    (0.5, 0.65),
+    (0.5, 0.88),
+)
 REACH = 0.12
 PERIODS = 16
 """Furrows over the height of the face, if it had them everywhere."""
@@ -34,7 +40,7 @@ TIMES_FASTER = 5.0
 NOISE_RAD = 0.02
 
 
-def zone_masks(side: int) -> Floats:
+def zone_masks(side: int) -> Float64Array:
     """Return eight soft zones on a face's texture, (8, side, side), with sums of at most 1."""
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     masks = np.stack(
@@ -43,7 +49,9 @@ def zone_masks(side: int) -> Floats:
     return np.asarray(masks / np.maximum(masks.sum(axis=0), 1.0))
 
 
-def furrowed_face(side: int, *, rng: np.random.Generator) -> tuple[Floats, dict[str, Floats]]:
+def furrowed_face(
+    side: int, *, rng: np.random.Generator
+) -> tuple[Float64Array, dict[str, Float64Array]]:
     """Return normals of a face at rest and in the six expressions, made of heights.
 
     Furrows rise with an expression by a law that no weight times one map follows: they deepen
@@ -69,7 +77,7 @@ def furrowed_face(side: int, *, rng: np.random.Generator) -> tuple[Floats, dict[
     masks = zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
 
-    def furrows(row: Floats) -> Floats:
+    def furrows(row: Float64Array) -> Float64Array:
         rise = np.maximum(rest + np.tensordot(row, masks, axes=1), 0.0)
         sharp = 1.0 + 3.0 * rise
         return np.asarray(-(rise**0.8) * np.exp(sharp * (np.cos(phase) - 1.0)))
@@ -78,7 +86,7 @@ def furrowed_face(side: int, *, rng: np.random.Generator) -> tuple[Floats, dict[
     deep = {name: furrows(row) for name, row in rows.items()}
     scale = STEEPEST / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
 
-    def normals(height: Floats) -> Floats:
+    def normals(height: Float64Array) -> Float64Array:
         dy, dx = np.gradient(scale * height)
         relief_y, relief_x = np.gradient(grain)
         rough = 0.08 / float(relief_x.std())
@@ -90,12 +98,12 @@ def furrowed_face(side: int, *, rng: np.random.Generator) -> tuple[Floats, dict[
 
 
 def numpy_combine(
-    base: NDArray[np.float32], wrinkle: Floats, masks: Floats, sums: Floats
-) -> Floats:
+    base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
+) -> Float64Array:
     """Return listing 1.1's normals in vectorised NumPy and SciPy: each texture sampled, summed."""
     height, width = base.shape[:2]
 
-    def sampled(texture: Floats) -> Floats:
+    def sampled(texture: Float64Array) -> Float64Array:
         h, w = texture.shape
         y = (np.arange(height) + 0.5) * h / height - 0.5
         x = (np.arange(width) + 0.5) * w / width - 0.5
@@ -111,14 +119,14 @@ def numpy_combine(
 
 
 def opencv_combine(
-    base: NDArray[np.float32], wrinkle: Floats, masks: Floats, sums: Floats
-) -> NDArray[np.float32]:
+    base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
+) -> Float32Array:
     """Return the same with OpenCV's resize for the sampler and NumPy for the sums, float32."""
     import cv2
 
     size = (base.shape[1], base.shape[0])
 
-    def sampled(texture: NDArray[np.floating]) -> NDArray[np.float32]:
+    def sampled(texture: FloatArray) -> Float32Array:
         return np.asarray(cv2.resize(texture.astype(np.float32), size))  # bilinear
 
     strength = np.zeros(base.shape[:2], np.float32)
@@ -131,9 +139,7 @@ def opencv_combine(
     return out
 
 
-def _error(
-    normals: NDArray[np.floating], truth: NDArray[np.floating]
-) -> tuple[float, tuple[float, float]]:
+def _error(normals: FloatArray, truth: FloatArray) -> tuple[float, tuple[float, float]]:
     """Return the mean angle, degrees, and its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
     cut = max(angle.shape[0] // 8, 1)
@@ -146,7 +152,7 @@ def _error(
     return mean, (mean - scatter, mean + scatter)
 
 
-def _mean_error(model: Any, states: dict[str, Floats]) -> tuple[float, tuple[float, float]]:
+def _mean_error(model: Any, states: dict[str, Float64Array]) -> tuple[float, tuple[float, float]]:
     errors = [_error(model.evaluate({name: 1.0}).normals, n) for name, n in states.items()]
     mean = float(np.mean([one for one, _ in errors]))
     low, high = (float(np.mean([both[i] for _, both in errors])) for i in (0, 1))
@@ -158,13 +164,15 @@ def fitting(*, toy: bool) -> StageBenchmark:
     side = 64 if toy else 512
     neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
     points = []
-    sizes = ((64, 16), (32, 16), (16, 16), (32, 8)) if toy else (
-        (512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16)
-    )  # fmt: skip
+    sizes = (
+        ((64, 16), (32, 16), (16, 16), (32, 8))
+        if toy
+        else ((512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16))
+    )
     for map_side, mask_side in sizes:
         masks = zone_masks(mask_side)
 
-        def run(map_side: int = map_side, masks: Floats = masks) -> wrinkle_fit.WrinkleFit:
+        def run(map_side: int = map_side, masks: Float64Array = masks) -> wrinkle_fit.WrinkleFit:
             return wrinkle_fit.fit(
                 neutral, states, masks, size=(map_side, map_side), clamp="signed"
             )
@@ -175,8 +183,10 @@ def fitting(*, toy: bool) -> StageBenchmark:
         error, interval = _mean_error(model, states)
         size = wrinkle_storage.footprint((map_side, map_side), (mask_side, mask_side))
         knobs: dict[str, str | int | float] = {
-            "map": map_side, "masks": mask_side, "KB as BC5 and BC3": size.total_bytes / 1024
-        }  # fmt: skip
+            "map": map_side,
+            "masks": mask_side,
+            "KB as BC5 and BC3": size.total_bytes / 1024,
+        }
         points.append(Point(knobs, timing, error, interval))
     rest = float(np.mean([_error(neutral, n)[0] for n in states.values()]))
     best = min(point.error for point in points)
@@ -186,13 +196,13 @@ def fitting(*, toy: bool) -> StageBenchmark:
         "normals of heights whose furrows deepen and narrow by a law that is not the model's",
         0.0,
         tuple(points),
-        () if toy else (
-            Limit("of the neutral face's error, with the best map", best / rest, 0.6, "<="),
-        ),
+        ()
+        if toy
+        else (Limit("of the neutral face's error, with the best map", best / rest, 0.6, "<="),),
         left_out=(("masks from the data", "see tests of reconstruction.wrinkles.zones"),),
         interval_of="squares of the face",
         no_bands="shape alone: no color of skin enters",
-    )  # fmt: skip
+    )
 
 
 def summing(*, toy: bool) -> StageBenchmark:
@@ -212,13 +222,13 @@ def summing(*, toy: bool) -> StageBenchmark:
         wrinkles.decode(low.astype(np.float64)), wrinkles.decode(low + wrinkle)
     )
 
-    def by_derivatives() -> NDArray[np.floating]:
+    def by_derivatives() -> FloatArray:
         return wrinkles.combine(base, wrinkle, masks, row)
 
-    def by_differences(renormalize: bool = True) -> NDArray[np.floating]:
+    def by_differences(renormalize: bool = True) -> FloatArray:
         return wrinkle_differences.combine(neutral, difference, masks, row, renormalize=renormalize)
 
-    ways: dict[str, Callable[[], NDArray[np.floating]]] = {
+    ways: dict[str, Callable[[], FloatArray]] = {
         "derivatives": by_derivatives,
         "differences": by_differences,
         "differences, not renormalized": lambda: by_differences(False),
@@ -236,15 +246,27 @@ def summing(*, toy: bool) -> StageBenchmark:
         library_s = _spent(ways["OpenCV and NumPy"], 5)
         apart = float(np.abs(by_derivatives() - truth).max())
         limits = (
-            Limit("times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
-                  peer_s / own_s, TIMES_FASTER, ">="),
+            Limit(
+                "times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
+                peer_s / own_s,
+                TIMES_FASTER,
+                ">=",
+            ),
             Limit("the same, than OpenCV and NumPy", library_s / own_s, 2.0, ">="),
             Limit("largest difference from NumPy's normals", apart, 1e-6, "<="),
-            Limit("of the error of differences of normals", points[0].error / points[1].error,
-                  0.1, "<="),
-            Limit("KB of the paper's textures",
-                  wrinkle_storage.paper_footprint().total_bytes / 1024, 96.0, "<="),
-        )  # fmt: skip
+            Limit(
+                "of the error of differences of normals",
+                points[0].error / points[1].error,
+                0.1,
+                "<=",
+            ),
+            Limit(
+                "KB of the paper's textures",
+                wrinkle_storage.paper_footprint().total_bytes / 1024,
+                96.0,
+                "<=",
+            ),
+        )
     return StageBenchmark(
         "wrinkle-sum",
         "mean angle to the normals of the summed relief at half weight, deg",
@@ -282,9 +304,12 @@ def storing(*, toy: bool) -> StageBenchmark:
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
     points = []
     encodings: tuple[tuple[Any, Any], ...] = (
-        ("float32", "float32"), ("float16", "float16"), ("unit8", "unit8"), ("bc5", "bc3"),
+        ("float32", "float32"),
+        ("float16", "float16"),
+        ("unit8", "unit8"),
+        ("bc5", "bc3"),
         ("bc5", "unit8"),
-    )  # fmt: skip
+    )
     for at in (64, 32) if toy else (512, 256, 128, 64):
         small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
         for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
@@ -294,7 +319,7 @@ def storing(*, toy: bool) -> StageBenchmark:
                 table,
             )
 
-            def run(layer: Layer = layer) -> NDArray[np.floating]:
+            def run(layer: Layer = layer) -> FloatArray:
                 return wrinkles.combine_layers(base, [layer], weights)
 
             timing = measure(run, repeats=3, memory=False)
@@ -304,11 +329,17 @@ def storing(*, toy: bool) -> StageBenchmark:
             )
             points.append(
                 Point(
-                    {"map": at, "as": maps_as, "masks as": masks_as,
-                     "KB": round(size.total_bytes / 1024, 3)},
-                    timing, error, interval,
+                    {
+                        "map": at,
+                        "as": maps_as,
+                        "masks as": masks_as,
+                        "KB": round(size.total_bytes / 1024, 3),
+                    },
+                    timing,
+                    error,
+                    interval,
                 )
-            )  # fmt: skip
+            )
     return StageBenchmark(
         "wrinkle-storage",
         "mean angle to the normals with the map at full size in 32 bits, deg",
@@ -338,9 +369,12 @@ def weighing(*, toy: bool) -> StageBenchmark:
             misses = []
 
             def run(
-                seed: int = 0, clean: NDArray[np.floating] = clean, stderr: Floats = stderr,
-                layer: Layer = layer, neutral: Any = neutral,
-            ) -> wrinkle_weights.ZoneWeights:  # fmt: skip
+                seed: int = 0,
+                clean: FloatArray = clean,
+                stderr: Float64Array = stderr,
+                layer: Layer = layer,
+                neutral: Any = neutral,
+            ) -> wrinkle_weights.ZoneWeights:
                 noisy = _disturbed(clean, stderr, np.random.default_rng(seed))
                 measured = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr)
                 return wrinkle_fit.fit_weights(layer, neutral, measured, clamp="signed")
@@ -353,9 +387,14 @@ def weighing(*, toy: bool) -> StageBenchmark:
             scatter = error / np.sqrt(2 * miss.size)
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
             points.append(
-                Point({"side": side, "noise, mrad": 1e3 * noise}, timing, error,
-                      (error - scatter, error + scatter), float(np.sqrt(np.mean(bound**2))))
-            )  # fmt: skip
+                Point(
+                    {"side": side, "noise, mrad": 1e3 * noise},
+                    timing,
+                    error,
+                    (error - scatter, error + scatter),
+                    float(np.sqrt(np.mean(bound**2))),
+                )
+            )
     # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
     limits = (Limit("times the Cramér-Rao bound, on average", float(np.mean(ratios)), 1.1, "<="),)
     return StageBenchmark(
@@ -372,8 +411,8 @@ def weighing(*, toy: bool) -> StageBenchmark:
 
 
 def _disturbed(
-    normals: NDArray[np.floating], stderr_rad: Floats, rng: np.random.Generator
-) -> Floats:
+    normals: FloatArray, stderr_rad: Float64Array, rng: np.random.Generator
+) -> Float64Array:
     """Return normals turned by independent angles along two directions of the surface."""
     aside = np.where(np.abs(normals[..., :1]) < 0.5, [1.0, 0, 0], [0, 1.0, 0])
     u = np.cross(normals, aside)
@@ -383,7 +422,7 @@ def _disturbed(
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def _bound(layer: Layer, clean: NDArray[np.floating], stderr_rad: Floats) -> Floats:
+def _bound(layer: Layer, clean: FloatArray, stderr_rad: Float64Array) -> Float64Array:
     """Return the least standard error of each weight: information of all normals at once.
 
     In the normal's own two directions the errors are independent; derivatives of the normal by

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from skinrig.arrays import Float64Array
 
 LEVELS: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
 """Nominal coverage, %, and the range that a stage's coverage is to lie in."""
@@ -35,7 +34,7 @@ class Trial:
     """Preset or medium, and its seed."""
     band: str
     """Band of skin color (`skinrig.evaluating.skin_bands`); "any" where the quantity needs none."""
-    deviation: Floats
+    deviation: Float64Array
     """|estimate - truth| over the half width of the stated 68 % interval, (n,)."""
     width: float
     """Median half width of the 68 % interval, in `unit`."""
@@ -118,7 +117,7 @@ def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> 
     )
 
 
-def _interval(shares: Floats, truths: Floats, confidence: float) -> tuple[float, float]:
+def _interval(shares: Float64Array, truths: Float64Array, confidence: float) -> tuple[float, float]:
     """Return the interval of the mean share, no narrower than if truths had nothing in common.
 
     Subjects with a truth or two each may agree by chance: their scatter alone tells nothing then.

@@ -34,10 +34,15 @@ FALSE_ALARM: Final = 0.05
 PRESETS: Final = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
 SITES: Final = ("forehead", "cheek", "chin")
 MEDIA: Final = (
-    "homogeneous:0.02,1.0,0.8", "homogeneous:0.1,1.5,0.86", "homogeneous:0.3,2.0,0.73",
-    "homogeneous:0.05,1.2,0.8", "homogeneous:0.2,1.3,0.85", "homogeneous:0.04,2.2,0.76",
-    "homogeneous:0.5,1.8,0.82", "homogeneous:0.08,0.9,0.9",
-)  # fmt: skip
+    "homogeneous:0.02,1.0,0.8",
+    "homogeneous:0.1,1.5,0.86",
+    "homogeneous:0.3,2.0,0.73",
+    "homogeneous:0.05,1.2,0.8",
+    "homogeneous:0.2,1.3,0.85",
+    "homogeneous:0.04,2.2,0.76",
+    "homogeneous:0.5,1.8,0.82",
+    "homogeneous:0.08,0.9,0.9",
+)
 """Fractions in 1/mm of absorption and reduced scattering, and g."""
 SKIN: Final = ("II", "IV", "VI", "I", "III", "V")
 """Presets under the probe: a band of melanin each, twice."""
@@ -138,17 +143,20 @@ def _point(row: Covered, timing: Timing) -> Point:
     least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     return Point(
         {
-            "quantity": row.quantity, "skin": row.band, "nominal %": row.level,
+            "quantity": row.quantity,
+            "skin": row.band,
+            "nominal %": row.level,
             "covered %": round(100.0 * row.share, 1),
             "at least %": round(100.0 * row.interval[0], 1),
             "at most %": round(100.0 * row.interval[1], 1),
-            "subjects": row.subjects, "half width": f"{row.width:.3g} {row.unit}",
+            "subjects": row.subjects,
+            "half width": f"{row.width:.3g} {row.unit}",
             "verdict": row.verdict,
         },
         timing,
         off,
         (min(off, least), max(off, abs(low), abs(high))),
-    )  # fmt: skip
+    )
 
 
 def _limits(row: Covered) -> tuple[Limit, Limit]:

@@ -8,21 +8,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import metrics, store
 from model.skin import SkinAppearance
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.dome.stages import WEIGHTS
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import (
-    Floats,
-    forget,
-    of_map,
-    of_normals,
-    truth_of,
-    valid_of,
-)
+from skinrig.benchmarks.intervals.trials import forget, of_map, of_normals, truth_of, valid_of
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection, skin_bands
 from skinrig.evaluating import surface as surface_evaluation
@@ -33,8 +26,9 @@ FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface":
 types I to V that are not judged (R_d: of seeds 1 to 3, types V, I and II): tails are heavier than a
 Gaussian's where one point in twenty is not like the others."""
 NORMALS: Final[Mapping[str, str]] = {
-    "normals": "normals of the dome", "normals_refined": "refined normals of the dome"
-}  # fmt: skip
+    "normals": "normals of the dome",
+    "normals_refined": "refined normals of the dome",
+}
 COLORS: Final = ("red", "green", "blue")
 
 
@@ -56,9 +50,11 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
             "dome", folder / "session-subject", subject=preset, seed=seed, width_px=width_px
         )
         pipeline.reconstruct(
-            done.session, want=[*NORMALS, "r_d", *WEIGHTS], out=folder / "maps",
+            done.session,
+            want=[*NORMALS, "r_d", *WEIGHTS],
+            out=folder / "maps",
             calibration=calibration,
-        )  # fmt: skip
+        )
         yield from of_face(
             store.read(folder / "maps"), store.read(truth_of(done)), f"{preset} {seed}"
         )
@@ -93,9 +89,11 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
             yield of_normals(
                 quantity,
                 metrics.angular_error_rad(normals.values[at], true_normals[good]),
-                normals.stderr[at][:, 0].astype(np.float64), subject=subject, band=band,
+                normals.stderr[at][:, 0].astype(np.float64),
+                subject=subject,
+                band=band,
                 factor_95=FACTORS_95["normals"],
-            )  # fmt: skip
+            )
     albedo = found.maps["r_d"]
     shape = valid_of(albedo).shape
     true = np.zeros((*shape, 3))
@@ -103,17 +101,32 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
     told = np.zeros(shape, bool)
     told[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(COLORS):
-        yield of_map(f"R_d, {color}", albedo, true, told, subject=subject, band=band,
-                      channel=channel, factor_95=FACTORS_95["R_d"])  # fmt: skip
+        yield of_map(
+            f"R_d, {color}",
+            albedo,
+            true,
+            told,
+            subject=subject,
+            band=band,
+            channel=channel,
+            factor_95=FACTORS_95["R_d"],
+        )
     off, stderr = lobe_strength(found, truth)
     width = float(100.0 * np.median(stderr)) if stderr.size else float("nan")
-    yield Trial("light from the surface, dome", subject, band, np.abs(off) / stderr, width, "%",
-                FACTORS_95["surface"])  # fmt: skip
+    yield Trial(
+        "light from the surface, dome",
+        subject,
+        band,
+        np.abs(off) / stderr,
+        width,
+        "%",
+        FACTORS_95["surface"],
+    )
 
 
 def lobe_strength(
     found: SkinAppearance, truth: SkinAppearance
-) -> tuple[Floats, NDArray[np.float64]]:
+) -> tuple[Float64Array, Float64Array]:
     """Return by how much fitted lobes are off in the light that a surface gives off, relative.
 
     Single weights are not determined where lobes resemble each other; how much light all of them

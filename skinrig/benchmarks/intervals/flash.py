@@ -82,20 +82,34 @@ def flash(
         state = BLOOD_STATES[seed % len(BLOOD_STATES)]
         name = f"{preset} {seed}"
         done = simulate_session(
-            "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
-            states=("neutral", state) if moving else ("neutral",), nearer_mm=nearer_mm(seed),
-        )  # fmt: skip
+            "flash",
+            folder / "session-subject",
+            subject=preset,
+            seed=seed,
+            width_px=width_px,
+            states=("neutral", state) if moving else ("neutral",),
+            nearer_mm=nearer_mm(seed),
+        )
         pipeline.reconstruct(
-            done.session, want=["melanin", "hemoglobin"], out=folder / "maps",
+            done.session,
+            want=["melanin", "hemoglobin"],
+            out=folder / "maps",
             calibration=folder / "calibration",
-        )  # fmt: skip
+        )
         found, truth = store.read(folder / "maps"), store.read(truth_of(done))
         skin = truth.maps["mask"].values > 0.5
         band = band_of(truth, "reflectance_blurred", skin)
         for quantity in ("melanin", "hemoglobin"):
             true = truth.maps[f"{quantity}_blurred"].values
-            yield of_map(f"{quantity}{resolution}", found.maps[quantity], true, skin, subject=name,
-                         band=band, factor_95=FACTOR_95)  # fmt: skip
+            yield of_map(
+                f"{quantity}{resolution}",
+                found.maps[quantity],
+                true,
+                skin,
+                subject=name,
+                band=band,
+                factor_95=FACTOR_95,
+            )
         if moving:
             yield from _of_rig(done, folder, state, subject=name, band=band)
         forget(folder, done)
@@ -123,7 +137,15 @@ def _of_rig(
         return
     both = valid_of(rest) & valid_of(moved) & (moved.values > 0)
     change = moved.values.astype(np.float64) - rest.values
-    yield of_map("hemoglobin of the rig", blood, moved.values, both, subject=subject, band=band,
-                 factor_95=FACTOR_95)  # fmt: skip
-    yield of_map("change of hemoglobin", found, change, both, subject=subject, band=band,
-                 over=rest.values)  # fmt: skip
+    yield of_map(
+        "hemoglobin of the rig",
+        blood,
+        moved.values,
+        both,
+        subject=subject,
+        band=band,
+        factor_95=FACTOR_95,
+    )
+    yield of_map(
+        "change of hemoglobin", found, change, both, subject=subject, band=band, over=rest.values
+    )

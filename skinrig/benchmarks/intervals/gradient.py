@@ -31,11 +31,7 @@ from skinrig.benchmarks.intervals.trials import ANY_BAND, forget, of_normals, tr
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.simulating.simulation import simulate_session
 
-FACTORS_95: Final[Mapping[str, float]] = {
-    "normals": 1.9,
-    "height": 2.1,
-    "stretch": GAUSSIAN_95,
-}
+FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
 13 that are not judged: tails are heavier than a Gaussian's. Kernels state both half widths."""
 
@@ -63,13 +59,20 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
         for kind in ("lights", "polarization"):
             calibrate(kind, [ball], calibration)
         done = simulate_session(
-            "gradient", folder / "session-subject", site=site, seed=seed, width_px=width_px,
-            angles=(0.0,), steps=(-STRETCH_STEP, STRETCH_STEP),
-        )  # fmt: skip
+            "gradient",
+            folder / "session-subject",
+            site=site,
+            seed=seed,
+            width_px=width_px,
+            angles=(0.0,),
+            steps=(-STRETCH_STEP, STRETCH_STEP),
+        )
         pipeline.reconstruct(
-            done.session, want=["normals", "height", "strain", "kernels"], out=folder / "maps",
+            done.session,
+            want=["normals", "height", "strain", "kernels"],
+            out=folder / "maps",
             calibration=calibration,
-        )  # fmt: skip
+        )
         found, truth = store.read(folder / "maps"), store.read(truth_of(done))
         state = next(
             key.removeprefix("normals_")
@@ -81,25 +84,34 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
         if normals.stderr is not None:
             angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
             yield of_normals(
-                "normals of the gradient sphere", angle,
-                normals.stderr[good][:, 0].astype(np.float64), subject=name,
+                "normals of the gradient sphere",
+                angle,
+                normals.stderr[good][:, 0].astype(np.float64),
+                subject=name,
                 factor_95=FACTORS_95["normals"],
-            )  # fmt: skip
+            )
         height = found.maps[f"height_{state}"]
         relief = true_relief(found, truth, state)
         good = valid_of(height) & valid_of(truth.maps[f"height_{state}"])
         if height.stderr is not None:
             stderr = height.stderr[good].astype(np.float64)
             off = np.abs(height.values.astype(np.float64)[good] - relief[good]) / stderr
-            yield Trial("height", name, ANY_BAND, off, float(np.median(stderr)), "um",
-                        FACTORS_95["height"])  # fmt: skip
+            yield Trial(
+                "height", name, ANY_BAND, off, float(np.median(stderr)), "um", FACTORS_95["height"]
+            )
         # the neutral state is what stretch is told against: exact by definition
         rows = [row for row in compare_stretch(found, truth) if row.state != state]
         spread = np.array([row.stderr for row in rows])
         width = float(100.0 * np.median(spread)) if rows else float("nan")
-        yield Trial("stretch ratio", name, ANY_BAND,
-                    np.array([abs(row.error) for row in rows]) / spread, width, "%",
-                    FACTORS_95["stretch"])  # fmt: skip
+        yield Trial(
+            "stretch ratio",
+            name,
+            ANY_BAND,
+            np.array([abs(row.error) for row in rows]) / spread,
+            width,
+            "%",
+            FACTORS_95["stretch"],
+        )
         yield from _kernels(found, truth, site=site, seed=seed)
         forget(folder, done)
         for place in (ball, calibration):
@@ -136,8 +148,15 @@ def _kernels(
             widths[key].append(float(fit[likely]))
     for key, unit in (("alpha", ""), ("sigma", "um")):
         width = float(np.median(widths[key])) if widths[key] else float("nan")
-        yield Trial(f"{key} of kernels", f"{site} {seed}", ANY_BAND, np.array(off[key]), width,
-                    unit, GAUSSIAN_95)  # fmt: skip
+        yield Trial(
+            f"{key} of kernels",
+            f"{site} {seed}",
+            ANY_BAND,
+            np.array(off[key]),
+            width,
+            unit,
+            GAUSSIAN_95,
+        )
 
 
 def deviation(error: float, half: float, half_95: float) -> float:
@@ -186,8 +205,13 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
         shown.append(high_pass(height, pixel=pixel_um, cutoff=CUTOFF_UM))
     target = measure(shown[1], pixel=pixel_um)
     return fit_kernel(
-        shown[0], target.histogram, stretch=float(strained.gradient[0, 0]),
-        stretch_across=float(strained.gradient[1, 1]), axis="x", pixel_um=pixel_um,
-        alphas=ALPHAS[::COARSER], sigmas_um=SIGMAS_UM[::COARSER],
+        shown[0],
+        target.histogram,
+        stretch=float(strained.gradient[0, 0]),
+        stretch_across=float(strained.gradient[1, 1]),
+        axis="x",
+        pixel_um=pixel_um,
+        alphas=ALPHAS[::COARSER],
+        sigmas_um=SIGMAS_UM[::COARSER],
         target_samples=target.effective_samples,
-    )  # fmt: skip
+    )

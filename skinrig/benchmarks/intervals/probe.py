@@ -15,8 +15,9 @@ from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import ANY_BAND, Floats, forget, truth_of
+from skinrig.benchmarks.intervals.trials import ANY_BAND, forget, truth_of
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
@@ -31,8 +32,9 @@ BLOCKS: Final = 90_000
 DIRECTIONS: Final = 8
 """Of the head on tissue that scatters by direction."""
 COEFFICIENTS: Final[Mapping[str, str]] = {
-    "sigma_a": "sigma_a of media", "sigma_s_prime": "sigma_s' of media"
-}  # fmt: skip
+    "sigma_a": "sigma_a of media",
+    "sigma_s_prime": "sigma_s' of media",
+}
 
 
 def probe(
@@ -184,9 +186,14 @@ def of_coefficient(
             stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
     spread = np.array(stderr)
     return Trial(
-        COEFFICIENTS[name], subject, ANY_BAND, np.array(off) / spread, _width(spread), "%",
+        COEFFICIENTS[name],
+        subject,
+        ANY_BAND,
+        np.array(off) / spread,
+        _width(spread),
+        "%",
         GAUSSIAN_95,
-    )  # fmt: skip
+    )
 
 
 def of_directions(
@@ -216,16 +223,26 @@ def of_directions(
     turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
     stderr = np.array([row["axis_stderr_deg"] for row in rows])
     yield Trial(
-        "axis of anisotropy", subject, ANY_BAND, turn / stderr,
-        float(np.median(stderr)) if len(rows) else float("nan"), "degrees", GAUSSIAN_95,
-    )  # fmt: skip
+        "axis of anisotropy",
+        subject,
+        ANY_BAND,
+        turn / stderr,
+        float(np.median(stderr)) if len(rows) else float("nan"),
+        "degrees",
+        GAUSSIAN_95,
+    )
     ratio = np.array([true.ratio[CHANNELS.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
     spread = np.array([row["ratio_stderr"] for row in rows])
     yield Trial(
-        "ratio of anisotropy", subject, ANY_BAND, off / spread, _width(spread / ratio), "%",
+        "ratio of anisotropy",
+        subject,
+        ANY_BAND,
+        off / spread,
+        _width(spread / ratio),
+        "%",
         GAUSSIAN_95,
-    )  # fmt: skip
+    )
 
 
 def _maps(folder: Path, done: Simulated, want: str) -> tuple[SkinAppearance, SkinAppearance]:
@@ -241,5 +258,5 @@ def _farthest_deg(medium: str) -> float:
     return axis_deg if strength < 0.0 else axis_deg + 90.0
 
 
-def _width(relative: Floats) -> float:
+def _width(relative: Float64Array) -> float:
     return float(100.0 * np.median(relative)) if relative.size else float("nan")

@@ -54,14 +54,22 @@ def sequences(
     for seed, preset in subjects.items():
         constant_s = CONSTANTS_S[state][seed % len(CONSTANTS_S[state])]
         done = simulate_session(
-            "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
-            sequence=order_of(state, seed), relaxation_s=constant_s,
-        )  # fmt: skip
+            "flash",
+            folder / "session-subject",
+            subject=preset,
+            seed=seed,
+            width_px=width_px,
+            sequence=order_of(state, seed),
+            relaxation_s=constant_s,
+        )
         truth = truth_of(done)
         pipeline.reconstruct(
-            done.session, want=["perfusion_curves"], out=folder / "maps",
-            calibration=folder / "calibration", landmarks=truth / "landmarks.csv",
-        )  # fmt: skip
+            done.session,
+            want=["perfusion_curves"],
+            out=folder / "maps",
+            calibration=folder / "calibration",
+            landmarks=truth / "landmarks.csv",
+        )
         told = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
         subject, band = f"{preset} {seed}", _band(truth)
         fits = list(told["fits"].values())
@@ -69,9 +77,13 @@ def sequences(
         course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
         if "reaction_s" in course:
             yield of_fits(
-                f"delay of {state}", fits, course["reaction_s"],
-                subject=subject, band=band, delay=True,
-            )  # fmt: skip
+                f"delay of {state}",
+                fits,
+                course["reaction_s"],
+                subject=subject,
+                band=band,
+                delay=True,
+            )
         forget(folder, done)
 
 

@@ -13,17 +13,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, RAYLEIGH_95, Trial
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.simulating.orders import Simulated
 from skinrig.simulating.simulation import simulate_session
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 ANY_BAND: Final = "any"
 """Band of quantities that do not depend on the color of the skin."""
@@ -31,7 +28,7 @@ RAYLEIGH_68: Final = float(np.sqrt(-2.0 * np.log(1.0 - 0.6827)))
 """Of an error with the same deviation in two directions, the length that 68.27 % stay below."""
 
 
-def band_of(truth: SkinAppearance, name: str, skin: Bools) -> str:
+def band_of(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
     """Return the band of the median color of a subject's skin.
 
     Parameters
@@ -47,17 +44,24 @@ def band_of(truth: SkinAppearance, name: str, skin: Bools) -> str:
     return str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(color))))
 
 
-def valid_of(skin_map: SkinMap) -> Bools:
+def valid_of(skin_map: SkinMap) -> BoolArray:
     """Return where a map means something, (H, W)."""
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def of_map(
-    quantity: str, estimate: SkinMap, true: NDArray[np.floating], skin: Bools, *, subject: str,
-    band: str, channel: int | None = None, factor_95: float = GAUSSIAN_95,
-    over: NDArray[np.floating] | None = None,
-) -> Trial:  # fmt: skip
+    quantity: str,
+    estimate: SkinMap,
+    true: FloatArray,
+    skin: BoolArray,
+    *,
+    subject: str,
+    band: str,
+    channel: int | None = None,
+    factor_95: float = GAUSSIAN_95,
+    over: FloatArray | None = None,
+) -> Trial:
     """Compare a map of numbers with the truth, where it is valid; widths are relative.
 
     Parameters
@@ -96,9 +100,14 @@ def of_map(
 
 
 def of_normals(
-    quantity: str, angle_rad: Floats, stderr_rad: Floats, *, subject: str, band: str = ANY_BAND,
+    quantity: str,
+    angle_rad: Float64Array,
+    stderr_rad: Float64Array,
+    *,
+    subject: str,
+    band: str = ANY_BAND,
     factor_95: float = RAYLEIGH_95,
-) -> Trial:  # fmt: skip
+) -> Trial:
     """Compare directions: the 68 % region is a cone about the estimate.
 
     Parameters

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
 from capture.calibration.fiber.merge import color_masks
@@ -14,6 +13,7 @@ from capture.calibration.fiber.readings import FibreReadings, read_fibres
 from capture.calibration.fiber.spots import FibreSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
+from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 SEED = 5
@@ -26,8 +26,7 @@ WORST_PERCENT = 1.0
 ABOVE_BOUND = 1.15
 COVERAGE = (60.0, 76.0)
 
-FloatArray = NDArray[np.float64]
-Frames = list[NDArray[np.uint16]]
+Frames = list[UInt16Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +35,13 @@ class _Bench:
 
     frames: list[Frames]
     """Of each draw, all exposures."""
-    times: FloatArray
+    times: Float64Array
     spots: FibreSpots
     darks: DarkModel
     noise: CameraNoise
-    rate: FloatArray
+    rate: Float64Array
     """Light of each pixel, full scales per second, (H, W)."""
-    truth: FloatArray
+    truth: Float64Array
     """Of each fibre and color, summed over its aperture, (F, 3)."""
 
 
@@ -50,9 +49,9 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
     bench = _bench(draws=2 if toy else DRAWS)
     points = []
-    away: FloatArray = np.zeros(0)
-    relative: FloatArray = np.zeros(0)
-    bound: FloatArray = np.ones(1)
+    away: Float64Array = np.zeros(0)
+    relative: Float64Array = np.zeros(0)
+    bound: Float64Array = np.ones(1)
     for count in (1, 3, 8, 23) if toy else COUNTS:
         chosen = _spread(len(bench.times), count)
 
@@ -76,10 +75,12 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
                 (100 * low, 100 * high),
                 # the median of a normal distribution's size is 0.674 of its deviation
                 67.4 * float(np.median(np.where(known, bound, 1 / 0.674))),
-                {"exposed_s": round(float(bench.times[chosen].sum()), 1),
-                 "measured_percent": round(100 * float(valid.mean()), 1)},
+                {
+                    "exposed_s": round(float(bench.times[chosen].sum()), 1),
+                    "measured_percent": round(100 * float(valid.mean()), 1),
+                },
             )
-        )  # fmt: skip
+        )
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
     near = bench.truth.ravel() > 1e-5 * bench.truth.max()
@@ -93,8 +94,13 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit("largest RMS error within five decades, 23 exposures", worst, WORST_PERCENT,
-                  "<=", "%"),
+            Limit(
+                "largest RMS error within five decades, 23 exposures",
+                worst,
+                WORST_PERCENT,
+                "<=",
+                "%",
+            ),
             Limit("RMS error over the Cramér-Rao bound, 23 exposures", ratio, ABOVE_BOUND, "<="),
             Limit("68 % intervals that hold", inside, COVERAGE[0], ">=", "%"),
             Limit("68 % intervals that hold, at most", inside, COVERAGE[1], "<=", "%"),
@@ -102,7 +108,7 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
         (("steadiness of the source", "steady here; see `test_readings.py` of its calibration"),),
         interval_of="fibres and colors",
         no_bands="light of fibres over seven decades, whatever sends it",
-    )  # fmt: skip
+    )
 
 
 def _bench(*, draws: int) -> _Bench:
@@ -128,9 +134,15 @@ def _bench(*, draws: int) -> _Bench:
     names = tuple(fibre.name for fibre in rig.probe.fibres) if rig.probe else ()
     count = np.full(len(names), 1.0)
     spots = FibreSpots(
-        names, build.spot_px, np.zeros((len(names), 2)), build.radius_px, 0 * count,
-        build.edge_px * count, count > 0, float(build.radius_px.mean() + 3.0),
-    )  # fmt: skip
+        names,
+        build.spot_px,
+        np.zeros((len(names), 2)),
+        build.radius_px,
+        0 * count,
+        build.edge_px * count,
+        count > 0,
+        float(build.radius_px.mean() + 3.0),
+    )
     truth = np.array(
         [
             [
@@ -160,7 +172,7 @@ def _read(bench: _Bench, chosen: Sequence[int], draw: int) -> FibreReadings:
     )
 
 
-def _bound(bench: _Bench, chosen: Sequence[int]) -> FloatArray:
+def _bound(bench: _Bench, chosen: Sequence[int]) -> Float64Array:
     """Return the least variance of each fibre's light, infinite where a pixel is saturated.
 
     Of all pixels' light known from the frames that are not saturated, the dark signal known.
@@ -191,7 +203,7 @@ def _spread(total: int, count: int) -> list[int]:
     return [round(k) for k in np.linspace(0, total - 1, count)]
 
 
-def _interval(sizes: FloatArray) -> tuple[float, float]:
+def _interval(sizes: Float64Array) -> tuple[float, float]:
     """Return a bootstrap interval over fibres of the median of all draws (draws, F), 68 %."""
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, sizes.shape[1], (400, sizes.shape[1]))

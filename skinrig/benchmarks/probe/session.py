@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.stages import METHODS
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
@@ -59,11 +59,16 @@ def session(*, toy: bool) -> StageBenchmark:
             sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
             points.append(
                 Point(
-                    {"method": method, "channel": channel,
-                     "media": len({row.name for row in rows})},
-                    timing, 100 * float(np.median(sizes)), _interval(sizes),
+                    {
+                        "method": method,
+                        "channel": channel,
+                        "media": len({row.name for row in rows}),
+                    },
+                    timing,
+                    100 * float(np.median(sizes)),
+                    _interval(sizes),
                 )
-            )  # fmt: skip
+            )
     return StageBenchmark(
         "probe-session",
         "median error of sigma_tr, %",
@@ -101,30 +106,37 @@ def medium(seed: int) -> tuple[float, float, float]:
 def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitError]:
     out = folder / f"appearance-{name or session.name}"
     pipeline.reconstruct(
-        session, want=("profiles", "subsurface"), out=out, calibration=folder / "calibration",
+        session,
+        want=("profiles", "subsurface"),
+        out=out,
+        calibration=folder / "calibration",
         truth=truth_folder(session).name,
-    )  # fmt: skip
+    )
     return evaluation.compare_fits(store.read(out), store.read(truth_folder(session)))
 
 
 def _limits(by_method: Mapping[str, evaluation.MethodError]) -> tuple[Limit, ...]:
     best, dipole = by_method[METHODS[0]], by_method["dipole"]
     return (
-        Limit("sigma_tr, median error", 100 * best.median, 100 * evaluation.MEDIAN_LIMIT, "<=",
-              "%"),
+        Limit(
+            "sigma_tr, median error", 100 * best.median, 100 * evaluation.MEDIAN_LIMIT, "<=", "%"
+        ),
         Limit("sigma_tr, worst error", 100 * best.worst, 100 * evaluation.WORST_LIMIT, "<=", "%"),
         Limit("fits that are valid", best.fits, 3.0 * MEDIA, ">="),
         Limit("the dipole's median error", 100 * dipole.median, 100 * DIPOLE_BIAS, ">=", "%"),
-    )  # fmt: skip
+    )
 
 
 def _captured(folder: Path, name: str, coefficients: tuple[float, float, float], seed: int) -> Path:
     """Return a session of a medium by its sigma_a, sigma_s' and g."""
     sigma_a, sigma_s_prime, g = coefficients
     simulate_session(
-        "probe", folder / f"session-{name}", sites=("cheek",), seed=seed,
+        "probe",
+        folder / f"session-{name}",
+        sites=("cheek",),
+        seed=seed,
         subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
-    )  # fmt: skip
+    )
     return folder / f"session-{name}"
 
 
@@ -137,7 +149,7 @@ def _best(rows: list[evaluation.FitError]) -> BandError:
 def _interval(sizes: list[float]) -> tuple[float, float]:
     """Return a bootstrap interval of a median in percent, 68 %."""
     rng = np.random.default_rng(0)
-    values: NDArray[np.float64] = np.array(sizes)
+    values: Float64Array = np.array(sizes)
     again = np.median(values[rng.integers(0, len(values), (400, len(values)))], axis=1)
     low, high = np.quantile(again, [0.16, 0.84])
     return 100 * float(low), 100 * float(high)

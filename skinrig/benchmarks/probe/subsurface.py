@@ -8,7 +8,6 @@ from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model.dipole import kienle_patterson as diffusion
@@ -16,11 +15,10 @@ from reconstruction import subsurface
 from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
-
-Floats = NDArray[np.float64]
 
 RADIUS_MM = 0.3 + 0.25 * np.arange(28)
 CORE_MM = 0.2
@@ -35,7 +33,7 @@ PEERS = 60
 """SciPy fits that are timed; their time is extrapolated to the batch."""
 
 
-def transport_profiles(*, toy: bool) -> tuple[Floats, Floats, Floats]:
+def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return true sigma_tr (N,), profiles in fibres and their errors (N, 28) by Monte Carlo.
 
     sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn; then the three bands of skin.
@@ -51,10 +49,13 @@ def transport_profiles(*, toy: bool) -> tuple[Floats, Floats, Floats]:
     for n, (a, s) in enumerate(media):
         g = (0.8, 0.73, 0.9)[n % 3]
         found = fibre_profile(
-            LayerStack((Layer(inf, a, s / (1.0 - g), g, 1.4),)), radii_mm=RADIUS_MM,
-            photons=3_000 if toy else 100_000, rng=np.random.default_rng(n), core_mm=CORE_MM,
+            LayerStack((Layer(inf, a, s / (1.0 - g), g, 1.4),)),
+            radii_mm=RADIUS_MM,
+            photons=3_000 if toy else 100_000,
+            rng=np.random.default_rng(n),
+            core_mm=CORE_MM,
             source_core_mm=CORE_MM,
-        )  # fmt: skip
+        )
         profiles[n], errors[n] = found.reflectance_per_mm2, found.stderr
     return sigma_tr, profiles, errors
 
@@ -72,19 +73,28 @@ def tiers(*, toy: bool) -> StageBenchmark:
     noisy += FLOOR_PER_MM2 * rng.standard_normal(shape)
     variance = (FIBRE_ERROR * profiles) ** 2 + errors**2 + FLOOR_PER_MM2**2
     chosen: list[tuple[Method, slice]] = [
-        ("photon_table", slice(None)), ("diffusion", slice(None)), ("dipole", slice(None)),
-        ("photon_table", slice(0, None, 2)), ("photon_table", slice(4, None)),
-        ("photon_table", slice(0, 14)), ("photon_table", slice(0, None, 4)),
-    ]  # fmt: skip
+        ("photon_table", slice(None)),
+        ("diffusion", slice(None)),
+        ("dipole", slice(None)),
+        ("photon_table", slice(0, None, 2)),
+        ("photon_table", slice(4, None)),
+        ("photon_table", slice(0, 14)),
+        ("photon_table", slice(0, None, 4)),
+    ]
     points, limits = [], []
     for method, part in chosen:
 
         def fit(method: Method = method, part: slice = part) -> subsurface.SubsurfaceFit:
             return subsurface.invert(
-                RADIUS_MM[part], noisy[..., part], variance=variance[..., part], method=method,
-                collection="fibre", core_mm=CORE_MM, source_core_mm=CORE_MM,
+                RADIUS_MM[part],
+                noisy[..., part],
+                variance=variance[..., part],
+                method=method,
+                collection="fibre",
+                core_mm=CORE_MM,
+                source_core_mm=CORE_MM,
                 common_error=COMMON_ERROR,
-            )  # fmt: skip
+            )
 
         timing = measure(fit, repeats=1 if toy else 3)
         found = fit()
@@ -99,9 +109,11 @@ def tiers(*, toy: bool) -> StageBenchmark:
         interval = _over_media(error)
         radius = RADIUS_MM[part]
         knobs: dict[str, str | int | float] = {
-            "model": method, "fibres": radius.size, "from mm": float(radius[0]),
+            "model": method,
+            "fibres": radius.size,
+            "from mm": float(radius[0]),
             "to mm": float(radius[-1]),
-        }  # fmt: skip
+        }
         points.append(Point(knobs, timing, float(np.median(error)), interval))
         if part != slice(None):
             continue
@@ -113,22 +125,38 @@ def tiers(*, toy: bool) -> StageBenchmark:
         share = float(inside.mean())
         if method == "photon_table":
             limits += [
-                Limit("median error of sigma_tr, 0.3...3.0 per mm, photon table",
-                      float(np.median(error)), MEDIAN_LIMIT, "<="),
-                Limit("worst of the media's median errors, photon table",
-                      float(np.median(error, axis=0).max()), WORST_LIMIT, "<="),
+                Limit(
+                    "median error of sigma_tr, 0.3...3.0 per mm, photon table",
+                    float(np.median(error)),
+                    MEDIAN_LIMIT,
+                    "<=",
+                ),
+                Limit(
+                    "worst of the media's median errors, photon table",
+                    float(np.median(error, axis=0).max()),
+                    WORST_LIMIT,
+                    "<=",
+                ),
                 Limit("share of 68 % intervals that hold the truth, at least", share, 0.55, ">="),
                 Limit("share of 68 % intervals that hold the truth, at most", share, 0.81, "<="),
-            ]  # fmt: skip
+            ]
             best = float(np.median(np.abs(bias)))
         elif method == "dipole":
             limits += [
-                Limit("least bias of the dipole's sigma_tr (it is too small)",
-                      float(bias.max()), -0.02, "<="),
+                Limit(
+                    "least bias of the dipole's sigma_tr (it is too small)",
+                    float(bias.max()),
+                    -0.02,
+                    "<=",
+                ),
                 Limit("greatest bias of the dipole's sigma_tr", float(bias.min()), -0.12, "<="),
-                Limit("median bias of the dipole over that of the photon table",
-                      float(np.median(np.abs(bias))) / max(best, 1e-9), 5.0, ">="),
-            ]  # fmt: skip
+                Limit(
+                    "median bias of the dipole over that of the photon table",
+                    float(np.median(np.abs(bias))) / max(best, 1e-9),
+                    5.0,
+                    ">=",
+                ),
+            ]
     return StageBenchmark(
         "subsurface-fit",
         "relative error of sigma_tr, median",
@@ -141,7 +169,7 @@ def tiers(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _over_media(error: Floats) -> tuple[float, float]:
+def _over_media(error: Float64Array) -> tuple[float, float]:
     """Return a 68 % interval of the median of errors (draws, media), of other media."""
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, error.shape[1], (200, error.shape[1]))
@@ -159,7 +187,9 @@ def _spent(call: Callable[[], Any], repeats: int) -> float:
     return min(seconds)
 
 
-def _least_error(sigma_a: Floats, sigma_s: Floats, variance: Floats) -> Floats:
+def _least_error(
+    sigma_a: Float64Array, sigma_s: Float64Array, variance: Float64Array
+) -> Float64Array:
     """Return the Cramér-Rao bound of each profile's relative error of sigma_tr, (N,)."""
     step = 1e-4
     slopes = [
@@ -176,7 +206,7 @@ def _least_error(sigma_a: Floats, sigma_s: Floats, variance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", along_tr, covariance, along_tr)))
 
 
-def _absorbs_like(sigma_a: Floats, band: MelaninBand) -> NDArray[np.bool_]:
+def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
     """Return which media absorb within a factor of two of a band's skin."""
     return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
@@ -194,9 +224,8 @@ def batches(*, toy: bool) -> StageBenchmark:
 
     def ours(n: int = count, model_error: float | None = 0.0) -> subsurface.SubsurfaceFit:
         return subsurface.invert(
-            RADIUS_MM, noisy[:n], variance=variance[:n], method="diffusion",
-            model_error=model_error,
-        )  # fmt: skip
+            RADIUS_MM, noisy[:n], variance=variance[:n], method="diffusion", model_error=model_error
+        )
 
     points = []
     bands: dict[str, BandError] = {}
@@ -228,7 +257,7 @@ def batches(*, toy: bool) -> StageBenchmark:
         def peer(n: int) -> Any:
             deviation = np.sqrt(variance[n])
 
-            def residual(pair: Floats) -> Floats:
+            def residual(pair: Float64Array) -> Float64Array:
                 sigma_a, sigma_s = np.exp(pair)
                 value = diffusion.reflectance(RADIUS_MM, sigma_a, sigma_s, 1.4)
                 return np.asarray((value - noisy[n]) / deviation)
@@ -243,12 +272,20 @@ def batches(*, toy: bool) -> StageBenchmark:
         theirs_s = _spent(lambda: [peer(n) for n in range(PEERS)], 2) * count / PEERS
         ours_s = _spent(ours, 3)
         limits = (
-            Limit(f"times less processor time than SciPy's loop, 30,000 fits ({PEERS} timed)",
-                  theirs_s / ours_s, TIMES_FASTER, ">="),
+            Limit(
+                f"times less processor time than SciPy's loop, 30,000 fits ({PEERS} timed)",
+                theirs_s / ours_s,
+                TIMES_FASTER,
+                ">=",
+            ),
             Limit("chi2 above SciPy's, relative, worst", float(max(above)), 1e-6, "<="),
-            Limit("logarithms of the coefficients apart from SciPy's, median",
-                  float(np.median(apart)), 1e-5, "<="),
-        )  # fmt: skip
+            Limit(
+                "logarithms of the coefficients apart from SciPy's, median",
+                float(np.median(apart)),
+                1e-5,
+                "<=",
+            ),
+        )
     return StageBenchmark(
         "subsurface-batch",
         "relative error of sigma_tr, median",

@@ -13,10 +13,9 @@ from model.dipole import direct_sum as dipole_sum
 from model.dipole.direct_sum import Media, exitance_directly
 from model.dipole.gather import TOLERANCE, SourceTree, gather
 from model.fresnel import ETA_SKIN
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 SIDE = 512
 SECONDS = 5.0
@@ -36,11 +35,11 @@ EDGE_MM = np.linspace(-3.0, 3.0, 60)
 class Scene:
     """A face as texels, lit from one side, with a cast shadow."""
 
-    place: Floats
-    area: Floats
-    entered: Floats
-    r_d: Floats
-    translucency_mm: Floats
+    place: Float64Array
+    area: Float64Array
+    entered: Float64Array
+    r_d: Float64Array
+    translucency_mm: Float64Array
 
 
 def face(side: int) -> Scene:
@@ -62,7 +61,7 @@ def face(side: int) -> Scene:
     )
 
 
-def edge_profile(x_mm: Floats, media: Media) -> Floats:
+def edge_profile(x_mm: Float64Array, media: Media) -> Float64Array:
     """Return the share of even light on x < 0 that comes out at x, by a 1-D integral."""
     widest = 40.0 / float(media.sigma_tr_per_mm)
     t = widest * np.linspace(0.0, 1.0, 20_001) ** 3
@@ -98,7 +97,7 @@ def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
         tree = SourceTree.of(scene.place, scene.area)
 
-        def run(tree: SourceTree = tree, tolerance: float = tolerance) -> Floats:
+        def run(tree: SourceTree = tree, tolerance: float = tolerance) -> Float64Array:
             return _gathered(scene, tree, tolerance)
 
         timing = measure(run, repeats=1)
@@ -116,12 +115,16 @@ def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
         Point(
             {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"},
             Timing(
-                direct.seconds * scale, (direct.seconds * scale,) * 2, direct.cold_s, None,
+                direct.seconds * scale,
+                (direct.seconds * scale,) * 2,
+                direct.cold_s,
+                None,
                 no_memory="its seconds are extrapolated from those of 10 points",
             ),
-            0.0, (0.0, 0.0),
+            0.0,
+            (0.0, 0.0),
         )
-    )  # fmt: skip
+    )
     return points
 
 
@@ -132,7 +135,7 @@ def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
     for step in (0.8, 0.4) if toy else (1.6, 0.8, 0.4, 0.2):
         for known in (False, True):
 
-            def run(step: float = step, known: bool = known) -> Floats:
+            def run(step: float = step, known: bool = known) -> Float64Array:
                 return _edge(step, known)
 
             timing = measure(run, repeats=1)
@@ -161,8 +164,8 @@ def _bands(rng: np.random.Generator) -> dict[str, BandError]:
 
 
 def _edge(
-    step_mm: float, known: bool, *, skin: tuple[Floats, Floats] = (R_D, TRANSLUCENCY_MM)
-) -> Floats:
+    step_mm: float, known: bool, *, skin: tuple[Float64Array, Float64Array] = (R_D, TRANSLUCENCY_MM)
+) -> Float64Array:
     """Return the profile of a shadow's edge from sources a step apart, (X, 3).
 
     On skin of a diffuse albedo and a mean free path, mm.
@@ -179,21 +182,25 @@ def _edge(
     return np.asarray(found.exitance / skin[0])
 
 
-def _gathered(scene: Scene, tree: SourceTree, tolerance: float = TOLERANCE) -> Floats:
+def _gathered(scene: Scene, tree: SourceTree, tolerance: float = TOLERANCE) -> Float64Array:
     return gather(
         tree, scene.entered, scene.place, scene.r_d, scene.translucency_mm, tolerance=tolerance
     ).exitance
 
 
-def _directly(scene: Scene, at: NDArray[np.intp]) -> Floats:
+def _directly(scene: Scene, at: NDArray[np.intp]) -> Float64Array:
     with threadpool_limits(1):
         return exitance_directly(
-            scene.place, scene.area, scene.entered, scene.place[at], scene.r_d[at],
+            scene.place,
+            scene.area,
+            scene.entered,
+            scene.place[at],
+            scene.r_d[at],
             scene.translucency_mm[at],
-        )  # fmt: skip
+        )
 
 
-def _rms(error: Floats, rng: np.random.Generator) -> tuple[float, tuple[float, float]]:
+def _rms(error: Float64Array, rng: np.random.Generator) -> tuple[float, tuple[float, float]]:
     """Return the root mean square in percent with its 68 % bootstrap interval over points."""
     square = (error**2).mean(axis=-1)
     means = square[rng.integers(0, len(square), (200, len(square)))].mean(axis=1)
@@ -216,25 +223,57 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     seen = truth > DIM * (scene.r_d * scene.entered.max())[at]
     relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
     even = gather(
-        SourceTree.of(scene.place, scene.area), np.ones_like(scene.entered), scene.place[at],
-        scene.r_d[at], scene.translucency_mm[at],
-    ).exitance  # fmt: skip
+        SourceTree.of(scene.place, scene.area),
+        np.ones_like(scene.entered),
+        scene.place[at],
+        scene.r_d[at],
+        scene.translucency_mm[at],
+    ).exitance
     plane = _plane_level()
     return (
-        Limit(f"processor seconds for {SIDE} x {SIDE} texels and exit points, tree included",
-              min(spent), SECONDS, "<=", "s"),
-        Limit("error over the local exitance, 95th percentile", float(
-              100.0 * np.quantile(relative, 0.95)), ERROR_PERCENT, "<=", "%"),
-        Limit("largest error over the brightest exitance", float(100.0 * np.max(
-              np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))),
-              ERROR_PERCENT, "<=", "%"),
-        Limit("largest relative deviation from R_d under even light", float(np.max(
-              np.abs(even / scene.r_d[at] - 1.0))), 1e-5, "<="),
-        Limit("largest deviation from R_d on an evenly lit plane, not normalized",
-              100.0 * plane, ERROR_PERCENT, "<=", "%"),
-        Limit("times less processor time than the direct sum in NumPy, extrapolated",
-              peer_s / min(spent), TIMES_FASTER, ">="),
-    )  # fmt: skip
+        Limit(
+            f"processor seconds for {SIDE} x {SIDE} texels and exit points, tree included",
+            min(spent),
+            SECONDS,
+            "<=",
+            "s",
+        ),
+        Limit(
+            "error over the local exitance, 95th percentile",
+            float(100.0 * np.quantile(relative, 0.95)),
+            ERROR_PERCENT,
+            "<=",
+            "%",
+        ),
+        Limit(
+            "largest error over the brightest exitance",
+            float(
+                100.0 * np.max(np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))
+            ),
+            ERROR_PERCENT,
+            "<=",
+            "%",
+        ),
+        Limit(
+            "largest relative deviation from R_d under even light",
+            float(np.max(np.abs(even / scene.r_d[at] - 1.0))),
+            1e-5,
+            "<=",
+        ),
+        Limit(
+            "largest deviation from R_d on an evenly lit plane, not normalized",
+            100.0 * plane,
+            ERROR_PERCENT,
+            "<=",
+            "%",
+        ),
+        Limit(
+            "times less processor time than the direct sum in NumPy, extrapolated",
+            peer_s / min(spent),
+            TIMES_FASTER,
+            ">=",
+        ),
+    )
 
 
 def _plane_level() -> float:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table, metrics, spectra
 from model.tissue_optics import layers as tissue_optics
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
-
-Floats = NDArray[np.float64]
 
 USUAL_SIZE = 64
 """Of the table that errors by band are of."""
@@ -38,15 +36,18 @@ def layered_reflectance(*, toy: bool) -> StageBenchmark:
     by_band: dict[str, BandError] = {}
     for knobs in tiers:
 
-        def evaluate(knobs: dict[str, str | float] = knobs) -> Floats:
+        def evaluate(knobs: dict[str, str | float] = knobs) -> Float64Array:
             if knobs["tier"] == "diffusion":
                 return tissue_optics.two_layer_reflectance(
                     truth.wavelength_nm, c_m, c_hd, tier="diffusion"
                 )
             return tissue_optics.two_layer_reflectance(
-                truth.wavelength_nm, c_m, c_hd, anisotropy=float(knobs["g"]),
+                truth.wavelength_nm,
+                c_m,
+                c_hd,
+                anisotropy=float(knobs["g"]),
                 directions=int(knobs["directions"]),
-            )  # fmt: skip
+            )
 
         timing = measure(evaluate, repeats=1 if toy else 3)
         relative = 100 * np.abs(evaluate() / reference - 1)
@@ -110,16 +111,21 @@ def table(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         tuple(
-            Limit(f"smallest table with every Delta E 2000 below 0.5, {between}", size, 128, "<=",
-                  "nodes")
+            Limit(
+                f"smallest table with every Delta E 2000 below 0.5, {between}",
+                size,
+                128,
+                "<=",
+                "nodes",
+            )
             for between, size in smallest.items()
         ),
         interval_of="chromophores: of the largest error of all, by the two largest seen",
         by_band=by_band,
-    )  # fmt: skip
+    )
 
 
-def _largest(difference: Floats) -> tuple[float, float]:
+def _largest(difference: Float64Array) -> tuple[float, float]:
     """Return a 68 % interval of the largest error there is, from the two largest seen.
 
     Robson and Whitlock 1964, Biometrika 51, 33, doi 10.1093/biomet/51.1-2.33.
@@ -128,7 +134,7 @@ def _largest(difference: Floats) -> tuple[float, float]:
     return float(worst), float(worst + 0.68 / 0.32 * (worst - second))
 
 
-def _bilinear(made: color_table.ColorTable, c_m: Floats, c_hd: Floats) -> Floats:
+def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Array) -> Float64Array:
     """Return colors of eq. (7)'s texture with bilinear filtering between texel centres."""
     i = (made.size - 1) * np.cbrt(c_m / made.c_m_max)
     j = (made.size - 1) * np.cbrt(c_hd / made.c_hd_max)
@@ -141,7 +147,7 @@ def _bilinear(made: color_table.ColorTable, c_m: Floats, c_hd: Floats) -> Floats
     )
 
 
-def _lab(linear_srgb: Floats) -> Floats:
+def _lab(linear_srgb: Float64Array) -> Float64Array:
     """CIE Lab under D65 of linear sRGB, (..., 3)."""
     xyz = linear_srgb @ np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).T
     ratio = xyz / np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).sum(axis=1)

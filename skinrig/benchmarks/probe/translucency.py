@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
@@ -18,10 +17,10 @@ from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy import profile_anisotropy
 from reconstruction.subsurface import translucency
 from reconstruction.subsurface.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-Floats = NDArray[np.float64]
 Way = Literal["sigma_tr", "profiles"]
 
 RADIUS_MM = 0.3 + 0.25 * np.arange(28)
@@ -41,13 +40,18 @@ SITE_ERROR = 0.03
 """Relative standard error of sigma_tr at a site."""
 
 
-def _directions(count: int) -> Floats:
+def _directions(count: int) -> Float64Array:
     return np.asarray(np.arange(count) * (math.tau / count))
 
 
 def _profiles(
-    angle: Floats, ratio: float, cases: int, *, medium: Medium = MEDIUM, rng: np.random.Generator
-) -> Floats:
+    angle: Float64Array,
+    ratio: float,
+    cases: int,
+    *,
+    medium: Medium = MEDIUM,
+    rng: np.random.Generator,
+) -> Float64Array:
     """Return readings (N, cases, F) of tissue that scatters less along an axis, heads set down."""
     sigma_tr = np.hypot(np.cos(angle - AXIS_RAD) / ratio, np.sin(angle - AXIS_RAD))
     # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the middle of its extremes
@@ -61,18 +65,29 @@ def _profiles(
 
 
 def _told(
-    way: Way, angle: Floats, profiles: Floats, *, medium: Medium = MEDIUM
+    way: Way, angle: Float64Array, profiles: Float64Array, *, medium: Medium = MEDIUM
 ) -> anisotropy.Anisotropy:
     variance = np.full(profiles.shape, DARK**2)
     if way == "profiles":
         return profile_anisotropy.estimate_from_profiles(
-            angle, RADIUS_MM, profiles, variance, sigma_a_per_mm=medium[0],
-            sigma_s_prime_per_mm=medium[1], eta=ETA, floor=FIBRE,
-        )  # fmt: skip
+            angle,
+            RADIUS_MM,
+            profiles,
+            variance,
+            sigma_a_per_mm=medium[0],
+            sigma_s_prime_per_mm=medium[1],
+            eta=ETA,
+            floor=FIBRE,
+        )
     fits = subsurface.invert(
-        RADIUS_MM, profiles, eta=ETA, variance=variance + (FIBRE * profiles) ** 2,
-        common_error=COUPLING, g_error=0.0, model_error=0.0,
-    )  # fmt: skip
+        RADIUS_MM,
+        profiles,
+        eta=ETA,
+        variance=variance + (FIBRE * profiles) ** 2,
+        common_error=COUPLING,
+        g_error=0.0,
+        model_error=0.0,
+    )
     return anisotropy.estimate(angle, fits.sigma_tr_per_mm, fits.sigma_tr_stderr, valid=fits.valid)
 
 
@@ -120,10 +135,13 @@ def directions(*, toy: bool) -> StageBenchmark:
             spread = error / math.sqrt(2.0 * (cases - 1))
             points.append(
                 Point(
-                    {"way": way, "directions": count}, timing, error,
-                    (error - spread, error + spread), _bound(count),
+                    {"way": way, "directions": count},
+                    timing,
+                    error,
+                    (error - spread, error + spread),
+                    _bound(count),
                 )
-            )  # fmt: skip
+            )
     bands = {
         name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
         for name, band in MELANIN_BANDS.items()
@@ -168,14 +186,22 @@ def _direction_limits(
         limits.append(Limit(f"false alarms of {cases} at a rate of 1 %, {way}", alarms, most, "<="))
     return (
         *limits,
-        Limit("error over the Cramér-Rao bound, profiles of 16 directions",
-              errors["profiles", 16] / _bound(16), 1.2, "<="),
-        Limit("error of sigma_tr's fits over that of profiles, 16 directions",
-              errors["sigma_tr", 16] / errors["profiles", 16], 2.0, ">="),
-    )  # fmt: skip
+        Limit(
+            "error over the Cramér-Rao bound, profiles of 16 directions",
+            errors["profiles", 16] / _bound(16),
+            1.2,
+            "<=",
+        ),
+        Limit(
+            "error of sigma_tr's fits over that of profiles, 16 directions",
+            errors["sigma_tr", 16] / errors["profiles", 16],
+            2.0,
+            ">=",
+        ),
+    )
 
 
-def _root(prior: TranslucencyPrior, uv: Floats) -> Floats:
+def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
     """Return a square root of the prior covariance of log(1/sigma_tr) at places (P, 2)."""
     at = uv * np.array(TEXTURE_MM)
     squared = ((at[:, None] - at[None]) ** 2).sum(axis=-1) / prior.length_mm**2
@@ -197,8 +223,9 @@ def sites(*, toy: bool) -> StageBenchmark:
     more = np.stack(np.meshgrid([0.25, 0.42, 0.58, 0.75], [0.25, 0.45, 0.65, 0.85]), axis=-1)
     layouts = {1: named[:1], 2: named[:2], 3: named[[0, 1, 3]], 4: named, 16: more.reshape(-1, 2)}
     side, faces = (8, 6) if toy else (16, 150)
-    v, u = np.meshgrid(1 - (np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side,
-                       indexing="ij")  # fmt: skip
+    v, u = np.meshgrid(
+        1 - (np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side, indexing="ij"
+    )
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
     points = []
     within = 0.0
@@ -229,9 +256,14 @@ def sites(*, toy: bool) -> StageBenchmark:
         spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
         bound = math.sqrt(float(np.mean(stated)))
         points.append(
-            Point({"sites": count, "side": size}, timing, error,
-                  (error - spread, error + spread), bound)
-        )  # fmt: skip
+            Point(
+                {"sites": count, "side": size},
+                timing,
+                error,
+                (error - spread, error + spread),
+                bound,
+            )
+        )
         if count == 3:
             within = float(np.mean(inside))
             three_sites = error
@@ -243,12 +275,17 @@ def sites(*, toy: bool) -> StageBenchmark:
         limits = (
             Limit("part of the map within its standard error, 3 sites", within, 0.76, "<="),
             Limit("the same", within, 0.60, ">="),
-            Limit("error of 3 sites over that of the population's mean", three_sites / alone, 0.9,
-                  "<="),
-            Limit("times less processor time than scikit-learn, 512 x 512, 4 sites", times, 5.0,
-                  ">="),
+            Limit(
+                "error of 3 sites over that of the population's mean",
+                three_sites / alone,
+                0.9,
+                "<=",
+            ),
+            Limit(
+                "times less processor time than scikit-learn, 512 x 512, 4 sites", times, 5.0, ">="
+            ),
             Limit("difference of log(1/sigma_tr) from scikit-learn", mismatch, 1e-4, "<="),
-        )  # fmt: skip
+        )
     return StageBenchmark(
         "translucency",
         "error of log(1/sigma_tr) over a face",
@@ -272,7 +309,7 @@ def _spent(call: Callable[[], object], repeats: int) -> float:
     return min(seconds)
 
 
-def _beside_scikit_learn(prior: TranslucencyPrior, uv: Floats) -> tuple[float, float]:
+def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
     """Return how many times faster than its Gaussian process, and the largest difference."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
@@ -286,7 +323,7 @@ def _beside_scikit_learn(prior: TranslucencyPrior, uv: Floats) -> tuple[float, f
     u, v = np.meshgrid(center, 1.0 - center)
     places = np.stack([u, v], axis=-1).reshape(-1, 2) * np.array(TEXTURE_MM)
 
-    def theirs() -> tuple[Floats, Floats]:
+    def theirs() -> tuple[Float64Array, Float64Array]:
         process = GaussianProcessRegressor(kernel, alpha=SITE_ERROR**2, optimizer=None)
         process.fit(uv * np.array(TEXTURE_MM), -np.log(sigma[:, 0]) - prior.log_mean[0])
         mean, deviation = process.predict(places, return_std=True)

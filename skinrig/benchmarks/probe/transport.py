@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from capture.rig import load_rig
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-
-Floats = NDArray[np.float64]
 
 RED = (0.04, 1.5)  # sigma_a and sigma_s' in 1/mm, issue of the fibre probe and rigs.md section 4
 G = 0.8
@@ -117,7 +115,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         points.append(_point(knobs | {"photons": photons}, timing, relative))
     for photons in (1000, 2000) if toy else (80_000, 320_000):
 
-        def in_the_cone(photons: int = photons) -> Floats:
+        def in_the_cone(photons: int = photons) -> Float64Array:
             return _in_the_cone(radii, photons)
 
         timing = measure(in_the_cone, repeats=1, memory=None)
@@ -139,9 +137,13 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         error = 100.0 * total.reflectance_stderr / total.reflectance
         spread = error / sqrt(2.0 * (total.batches - 1))
         points.append(
-            Point({"quantity": "all that leaves", "engine": engine, "photons": total.photons},
-                  timing, error, (error - spread, error + spread))
-        )  # fmt: skip
+            Point(
+                {"quantity": "all that leaves", "engine": engine, "photons": total.photons},
+                timing,
+                error,
+                (error - spread, error + spread),
+            )
+        )
     return StageBenchmark(
         "photon-transport",
         "largest relative standard error, %",
@@ -156,7 +158,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _bands(radii: Floats, *, photons: int) -> dict[str, BandError]:
+def _bands(radii: Float64Array, *, photons: int) -> dict[str, BandError]:
     """Return the error of as many photons in skin that absorbs little and much."""
     from rigsim.fiber.profile import fibre_profile
     from rigsim.tissue.tissue_mc import Layer, LayerStack
@@ -165,21 +167,24 @@ def _bands(radii: Floats, *, photons: int) -> dict[str, BandError]:
     for name, band in MELANIN_BANDS.items():
         layer = Layer(inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - G), G, ETA)
         run = fibre_profile(
-            LayerStack((layer,)), radii_mm=radii, photons=photons,
-            rng=np.random.default_rng(1), threads=CORES,
-        )  # fmt: skip
+            LayerStack((layer,)),
+            radii_mm=radii,
+            photons=photons,
+            rng=np.random.default_rng(1),
+            threads=CORES,
+        )
         point = _point({}, None, 100.0 * run.stderr / run.reflectance_per_mm2)
         found[name] = BandError(point.error, point.error_interval)
     return found
 
 
-def _point(knobs: dict[str, str | int | float], timing: Any, relative: Floats) -> Point:
+def _point(knobs: dict[str, str | int | float], timing: Any, relative: Float64Array) -> Point:
     worst = float(np.nan_to_num(relative, nan=100.0, posinf=100.0).max())
     spread = worst / sqrt(2.0 * 19.0)  # of a standard error from 20 batches
     return Point(knobs, timing, worst, (worst - spread, worst + spread))
 
 
-def _in_the_cone(radii: Floats, photons: int) -> Floats:
+def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
     """Return relative standard errors, %, of the plain walk in rings as wide as the fibres."""
     rings = np.zeros((20, 2 * len(radii)))
     edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
@@ -205,7 +210,7 @@ def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
     return min(seconds), value
 
 
-def _one_percent(radii: Floats, stack: Any) -> tuple[Limit, ...]:
+def _one_percent(radii: Float64Array, stack: Any) -> tuple[Limit, ...]:
     from rigsim.fiber.profile import fibre_profile
 
     seconds, run = _spent(
@@ -215,12 +220,17 @@ def _one_percent(radii: Floats, stack: Any) -> tuple[Limit, ...]:
     )
     worst = 100.0 * float((run.stderr / run.reflectance_per_mm2).max())
     return (
-        Limit("processor seconds on each of 2 cores to 1 % at every fibre, red",
-              seconds * worst**2 / CORES, SECONDS_TO_ONE_PERCENT, "<=", "s"),
-    )  # fmt: skip
+        Limit(
+            "processor seconds on each of 2 cores to 1 % at every fibre, red",
+            seconds * worst**2 / CORES,
+            SECONDS_TO_ONE_PERCENT,
+            "<=",
+            "s",
+        ),
+    )
 
 
-def _against_volpath(radii: Floats) -> tuple[Limit, ...]:
+def _against_volpath(radii: Float64Array) -> tuple[Limit, ...]:
     """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
     from rigsim.fiber.profile import fibre_profile
     from rigsim.render import RenderError, radiance
@@ -245,20 +255,28 @@ def _against_volpath(radii: Floats) -> tuple[Limit, ...]:
     stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, 1.0),))
     ours_s, run = _spent(
         lambda: fibre_profile(
-            stack, radii_mm=radii, photons=100_000, rng=np.random.default_rng(4), batches=100,
+            stack,
+            radii_mm=radii,
+            photons=100_000,
+            rng=np.random.default_rng(4),
+            batches=100,
             source_numerical_aperture=1.0,
         )
-    )  # fmt: skip
+    )
     ours = ours_s * float((100.0 * run.stderr / run.reflectance_per_mm2).max()) ** 2
     # As if the peer's samples were shared out among the fibres in the best way.
     peers = peer_s * float((relative**2).mean())
     return (
-        Limit("times less processor time to 1 % than volpath, n = 1, by 1/sqrt(samples)",
-              peers / ours, TIMES_CHEAPER, ">="),
-    )  # fmt: skip
+        Limit(
+            "times less processor time to 1 % than volpath, n = 1, by 1/sqrt(samples)",
+            peers / ours,
+            TIMES_CHEAPER,
+            ">=",
+        ),
+    )
 
 
-def volpath_scene(radii: Floats) -> dict[str, Any]:
+def volpath_scene(radii: Float64Array) -> dict[str, Any]:
     """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fibre.
 
     The radiance times pi is the exitance per source power where the exit is Lambertian.
@@ -270,7 +288,7 @@ def volpath_scene(radii: Floats) -> dict[str, Any]:
     sigma_s = RED[1] / (1.0 - G)
     sigma_t = RED[0] + sigma_s
 
-    def placed(x: float, y: float, z: float, at: float) -> Floats:
+    def placed(x: float, y: float, z: float, at: float) -> Float64Array:
         matrix = np.diag([x, y, z, 1.0])
         matrix[2, 3] = at
         return matrix
@@ -279,17 +297,23 @@ def volpath_scene(radii: Floats) -> dict[str, Any]:
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 2000, "rr_depth": 50},
         "sensor": {
-            "type": "orthographic", "near_clip": 0.01, "far_clip": 100.0,
+            "type": "orthographic",
+            "near_clip": 0.01,
+            "far_clip": 100.0,
             "to_world": look_at([middle, 0, 5], [middle, 0, 0], [0, 1, 0])
             @ np.diag([half, half, 1.0, 1.0]),
             "sampler": {"type": "independent"},
             "film": {
-                "type": "hdrfilm", "width": len(radii), "height": 1, "pixel_format": "luminance",
+                "type": "hdrfilm",
+                "width": len(radii),
+                "height": 1,
+                "pixel_format": "luminance",
                 "rfilter": {"type": "box"},
             },
         },
         "tissue": {
-            "type": "cube", "to_world": placed(100.0, 100.0, 100.0, -100.0),
+            "type": "cube",
+            "to_world": placed(100.0, 100.0, 100.0, -100.0),
             "bsdf": {"type": "null"},
             "interior": {
                 "type": "homogeneous",
@@ -299,13 +323,14 @@ def volpath_scene(radii: Floats) -> dict[str, Any]:
             },
         },
         "light": {
-            "type": "disk", "to_world": placed(0.1, -0.1, -0.1, 0.001),
+            "type": "disk",
+            "to_world": placed(0.1, -0.1, -0.1, 0.001),
             "emitter": {
                 "type": "area",
                 "radiance": {"type": "spectrum", "value": 1.0 / (pi * pi * 0.1**2)},
             },
         },
-    }  # fmt: skip
+    }
 
 
 def _rates(medium: Any) -> tuple[Limit, ...]:
@@ -328,10 +353,22 @@ def _rates(medium: Any) -> tuple[Limit, ...]:
         return ()
     rate = run.photons / ours_s
     return (
-        Limit("times the photons a processor second of a plain numba walk, Dr.Jit",
-              rate / (40_000 / plain_s), TIMES_FASTER, ">="),
-        Limit("the same beside the simulator's own scalar walk",
-              rate / (40_000 / scalar_s), TIMES_FASTER, ">="),
-        Limit("standard errors of R_d from MCML's .3592 (its last digit allowed for)",
-              max(abs(run.reflectance - MCML_R_D) - 5e-4, 0.0) / run.reflectance_stderr, 4.0, "<="),
-    )  # fmt: skip
+        Limit(
+            "times the photons a processor second of a plain numba walk, Dr.Jit",
+            rate / (40_000 / plain_s),
+            TIMES_FASTER,
+            ">=",
+        ),
+        Limit(
+            "the same beside the simulator's own scalar walk",
+            rate / (40_000 / scalar_s),
+            TIMES_FASTER,
+            ">=",
+        ),
+        Limit(
+            "standard errors of R_d from MCML's .3592 (its last digit allowed for)",
+            max(abs(run.reflectance - MCML_R_D) - 5e-4, 0.0) / run.reflectance_stderr,
+            4.0,
+            "<=",
+        ),
+    )

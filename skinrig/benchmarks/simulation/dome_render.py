@@ -31,9 +31,12 @@ def render(*, toy: bool) -> StageBenchmark:
 
     def add(name: str, rays: int, way: Way) -> None:
         timing = Timing(
-            way.seconds, (way.seconds, way.seconds), way.seconds, None,
+            way.seconds,
+            (way.seconds, way.seconds),
+            way.seconds,
+            None,
             no_memory="three ways take turns in one process, each with its scene held",
-        )  # fmt: skip
+        )
         told = _error(way)
         points.append(Point({"way": name, "rays": rays}, timing, told.error, told.error_interval))
 
@@ -55,11 +58,19 @@ def render(*, toy: bool) -> StageBenchmark:
     }
     finest = next(p for p in points if p.knobs == {"way": "ours", "rays": max(efforts) ** 2})
     limits = (
-        Limit("times faster than Mitsuba's path tracer, no noisier", found.speed_up(found.path),
-              PATH_SPEED_UP, ">="),
-        Limit("times faster than Mitsuba's direct integrator, no noisier",
-              found.speed_up(found.direct), DIRECT_SPEED_UP, ">="),
-    )  # fmt: skip
+        Limit(
+            "times faster than Mitsuba's path tracer, no noisier",
+            found.speed_up(found.path),
+            PATH_SPEED_UP,
+            ">=",
+        ),
+        Limit(
+            "times faster than Mitsuba's direct integrator, no noisier",
+            found.speed_up(found.direct),
+            DIRECT_SPEED_UP,
+            ">=",
+        ),
+    )
     return StageBenchmark(
         "render-dome",
         "RMS error over the mean, seconds a light, %",

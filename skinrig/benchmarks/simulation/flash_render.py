@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import tiled_rms
 
@@ -35,10 +35,10 @@ def render(*, toy: bool) -> StageBenchmark:
     ours, theirs = [], []
     for subpixels, samples in efforts:
 
-        def by_closed_forms(subpixels: int = subpixels) -> dict[str, NDArray[np.float32]]:
+        def by_closed_forms(subpixels: int = subpixels) -> dict[str, Float32Array]:
             return closed_forms(rig, view, caster, subpixels=subpixels)
 
-        def by_mitsuba(samples: int = samples) -> dict[str, NDArray[np.float32]]:
+        def by_mitsuba(samples: int = samples) -> dict[str, Float32Array]:
             return {
                 name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
                 for k, name in enumerate(ANALYSER_DEG)
@@ -57,9 +57,10 @@ def render(*, toy: bool) -> StageBenchmark:
         final = polarizer_reference(width_px=width, samples=efforts[-1][1], subpixels=1)
         limits = (
             Limit("times faster than Mitsuba's polarizers", final.speed_up, SPEED_UP, ">="),
-            Limit("times less noisy than Mitsuba's polarizers", final.noise_ratio, NOISE_RATIO,
-                  ">="),
-        )  # fmt: skip
+            Limit(
+                "times less noisy than Mitsuba's polarizers", final.noise_ratio, NOISE_RATIO, ">="
+            ),
+        )
     return StageBenchmark(
         "render-flash",
         "RMS error of the worse image, %",
@@ -73,9 +74,7 @@ def render(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _worse(
-    found: dict[str, NDArray[np.float32]], truth: dict[str, NDArray[np.float32]]
-) -> BandError:
+def _worse(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> BandError:
     """Return the larger of both images' relative errors, %, where the sphere fills pixels."""
     told = []
     for name, true in truth.items():

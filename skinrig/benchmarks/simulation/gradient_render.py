@@ -89,12 +89,14 @@ def render(*, toy: bool) -> StageBenchmark:
         Limit(
             f"times less processor time than {LIT_CONDITIONS} Mitsuba renders at equal error, "
             f"extrapolated from {samples} samples by 1 over their root",
-            at_equal_error / best.seconds, TIMES_FASTER, ">=",
+            at_equal_error / best.seconds,
+            TIMES_FASTER,
+            ">=",
         ),
         Limit("error, 2 samples a pixel's side, of the mean", 100.0 * best.error, 1.0, "<=", "%"),
         Limit("Mitsuba's mean off the reference's, in its standard errors", off, 4.0, "<="),
         Limit("error without shadows over that with", without.error / best.error, 3.0, ">="),
-    )  # fmt: skip
+    )
     return StageBenchmark(
         "render-gradient",
         "RMS error over the mean, processor seconds for all conditions of a state, %",

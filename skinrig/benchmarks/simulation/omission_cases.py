@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32Array = NDArray[np.float32]
+from skinrig.arrays import Float32Array, Float64Array
 
 ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a picture in single precision, after a few sums."""
@@ -101,12 +100,19 @@ def compare(
             both = np.hypot(have.stderr, lack.stderr) / sigma
             error = math.hypot(rounded, float(both[place]))
         yield Omission(
-            rig, subject, effect.name, effect.verdict, effect.over_noise,
-            float(change[place]), error, with_s, without_s,
-        )  # fmt: skip
+            rig,
+            subject,
+            effect.name,
+            effect.verdict,
+            effect.over_noise,
+            float(change[place]),
+            error,
+            with_s,
+            without_s,
+        )
 
 
-def _shown(pictures: Pictures) -> NDArray[np.float64]:
+def _shown(pictures: Pictures) -> Float64Array:
     """Return what a sensor tells of light, which ends at full scale."""
     return np.minimum(pictures.light.astype(np.float64), 1.0)
 
@@ -155,13 +161,20 @@ def flash_face(
     scene.radiance()  # compiles, and traces what all scenes of this face share
     coarser = 2 if scene.needs.builds(FINER) else None
     yield from compare(
-        "flash", name, scene, Noise.of(scene.sensor()), render,
+        "flash",
+        name,
+        scene,
+        Noise.of(scene.sensor()),
+        render,
         {
-            "lateral": (True, False), "interreflections": (True, False),
-            "spectral": (True, False), "spectral_step": (1, coarser), "last_bounce": (1e-7, None),
+            "lateral": (True, False),
+            "interreflections": (True, False),
+            "spectral": (True, False),
+            "spectral_step": (1, coarser),
+            "last_bounce": (1e-7, None),
             "optics": (True, False),
         },
-    )  # fmt: skip
+    )
     if light_deg is not None:
         return
 
@@ -199,12 +212,19 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
         return Pictures(DomeScene(rig, face, **settings).radiance(view) / brightest)
 
     yield from compare(
-        "dome", preset, scene, Noise.of(scene.sensor()), render,
+        "dome",
+        preset,
+        scene,
+        Noise.of(scene.sensor()),
+        render,
         {
-            "subsurface": (True, False), "interreflections": (True, False),
-            "spectral": (True, False), "last_bounce": (1e-7, None), "optics": (True, False),
+            "subsurface": (True, False),
+            "interreflections": (True, False),
+            "spectral": (True, False),
+            "last_bounce": (1e-7, None),
+            "optics": (True, False),
         },
-    )  # fmt: skip
+    )
 
     def look(subject: Any) -> Pictures:
         return Pictures(DomeScene(rig, subject).radiance(view) / brightest)
@@ -231,9 +251,13 @@ def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]
         return Pictures(DomeScene(rig, face, **plain, **settings).radiance(view) / brightest)
 
     yield from compare(
-        "dome", f"{preset}, surprise", scene, Noise.of(scene.sensor()), render,
+        "dome",
+        f"{preset}, surprise",
+        scene,
+        Noise.of(scene.sensor()),
+        render,
         {"relief_shadows": (True, False)},
-    )  # fmt: skip
+    )
 
 
 def _plainer(
@@ -316,9 +340,8 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
 
     names = ("shadows", "lateral", "interreflections", "optics")
     yield from compare(
-        "gradient", site, base, Noise.of(base.sensor()), render,
-        dict.fromkeys(names, (True, False)),
-    )  # fmt: skip
+        "gradient", site, base, Noise.of(base.sensor()), render, dict.fromkeys(names, (True, False))
+    )
 
 
 def flat_targets() -> Iterator[Omission]:
@@ -352,16 +375,27 @@ def flat_targets() -> Iterator[Omission]:
         points, normals = (part[0] for part in bounce.surface())
         begin = time.process_time()
         seen = min(
-            float(visibility(caster, points, normals, light.position_mm,
-                             radius_mm=light.radius_mm, samples=4).min())
-            for light in scene.rig.lights if light.position_mm[2] > light.radius_mm
-        )  # fmt: skip
+            float(
+                visibility(
+                    caster, points, normals, light.position_mm, radius_mm=light.radius_mm, samples=4
+                ).min()
+            )
+            for light in scene.rig.lights
+            if light.position_mm[2] > light.radius_mm
+        )
         shading_s = time.process_time() - begin
         for effect in scene.needs:
             if effect.verdict != "negligible" or not flat:
                 continue
             lost, spent = (got, seconds) if effect.switch else (1.0 - seen, shading_s)
             yield Omission(
-                rig, name, effect.name, effect.verdict, effect.over_noise,
-                noise.share(lost), noise.share(ROUNDING), spent, told_s,
-            )  # fmt: skip
+                rig,
+                name,
+                effect.name,
+                effect.verdict,
+                effect.over_noise,
+                noise.share(lost),
+                noise.share(ROUNDING),
+                spent,
+                told_s,
+            )

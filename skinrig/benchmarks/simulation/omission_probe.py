@@ -24,9 +24,7 @@ def gray_tissue() -> Iterator[Omission]:
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
     bands = tuple(float(nm) for nm in range(400, 701, 10))
-    colored = dataclasses.replace(
-        gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands
-    )  # fmt: skip
+    colored = dataclasses.replace(gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands)
     head = HeadState("forehead", 0.0, True, 0.0, 5.0)
     pictures, seconds = [], []
     scene = ProbeScene(rig, gray)
@@ -43,9 +41,7 @@ def gray_tissue() -> Iterator[Omission]:
     noise = Noise.of(scene.sensor())
     have, lack = (Pictures(part.light / brightest) for part in pictures)
     effect = scene.needs[COLOR]
-    yield changed(
-        "probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1])
-    )  # fmt: skip
+    yield changed("probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1]))
     yield from _probe_build(scene, head, noise)
 
 
@@ -71,9 +67,14 @@ def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     for name, without in plain.items():
         lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
         yield changed(
-            "probe", "gray medium", scene.needs[name], Pictures(have.light / unit),
-            Pictures(lack.light / unit), noise, (with_s, spent),
-        )  # fmt: skip
+            "probe",
+            "gray medium",
+            scene.needs[name],
+            Pictures(have.light / unit),
+            Pictures(lack.light / unit),
+            noise,
+            (with_s, spent),
+        )
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
     begin = time.process_time()

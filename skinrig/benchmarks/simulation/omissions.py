@@ -36,8 +36,11 @@ def omissions(*, toy: bool) -> StageBenchmark:
         spent = one.without_s
         timing = Timing(spent, (spent, spent), spent, None, no_memory=NO_MEMORY)
         knobs: dict[str, str | int | float | bool] = {
-            "rig": one.rig, "subject": one.subject, "effect": one.effect, "verdict": one.verdict,
-        }  # fmt: skip
+            "rig": one.rig,
+            "subject": one.subject,
+            "effect": one.effect,
+            "verdict": one.verdict,
+        }
         also: dict[str, str | int | float | bool] = {"seconds saved": one.with_s - one.without_s}
         if one.told is not None:
             also["told by the rule"] = one.told
@@ -47,18 +50,22 @@ def omissions(*, toy: bool) -> StageBenchmark:
             limits.append(
                 Limit(
                     f"{one.rig}, {one.subject}: {one.effect}: change with 3 standard errors",
-                    one.at_most, BOUND, "<=", "of the noise",
+                    one.at_most,
+                    BOUND,
+                    "<=",
+                    "of the noise",
                 )
-            )  # fmt: skip
+            )
     built = [one for one in found if one.verdict == "built"]
     told = [one for one in built if one.told is not None and not _other_shadows(one)]
     limits.append(
         Limit(
             "largest change, less its rounding, over what the rule told, of what is built",
             max(((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0),
-            1.0, "<=",
+            1.0,
+            "<=",
         )
-    )  # fmt: skip
+    )
     return StageBenchmark(
         "omissions",
         "largest change of a pixel by leaving it out, over its noise",

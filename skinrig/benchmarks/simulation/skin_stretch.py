@@ -6,10 +6,10 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
+from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 STATES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
@@ -52,8 +52,9 @@ def stretched(*, toy: bool) -> StageBenchmark:
 
             timing = measure(run, repeats=1, memory=not toy)
             states = run()
-            errors = np.array([abs(_variance(s, half) / t - 1.0) for s, t in zip(
-                states, truth, strict=True)])  # fmt: skip
+            errors = np.array(
+                [abs(_variance(s, half) / t - 1.0) for s, t in zip(states, truth, strict=True)]
+            )
             spread = float(errors.std(ddof=1) / np.sqrt(errors.size))
             error = float(errors.mean())
             evaluations = np.mean([s.convergence.evaluations for s in states])
@@ -86,19 +87,37 @@ def _limits() -> tuple[Limit, ...]:
         states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in STATES}
         spent = time.process_time() - begin
         variance = np.array([_variance(states[r], 1.2) for r in STATES])
-        limits.append(Limit(f"processor seconds for 8 states of 2.8 mm, {site}", spent,
-                            PATCH_STATES_S, "<=", "s"))  # fmt: skip
+        limits.append(
+            Limit(
+                f"processor seconds for 8 states of 2.8 mm, {site}",
+                spent,
+                PATCH_STATES_S,
+                "<=",
+                "s",
+            )
+        )
         flatter = float((np.diff(variance) < 0.0).sum())
-        limits.append(Limit(f"steps of r along which slopes flatten, {site}", flatter,
-                            len(STATES) - 1.0, ">="))  # fmt: skip
+        limits.append(
+            Limit(
+                f"steps of r along which slopes flatten, {site}", flatter, len(STATES) - 1.0, ">="
+            )
+        )
         strain = max(abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
-        limits.append(Limit(f"membrane strain over that without excess length, {site}", strain,
-                            1.0, "<="))  # fmt: skip
+        limits.append(
+            Limit(f"membrane strain over that without excess length, {site}", strain, 1.0, "<=")
+        )
     field = make_micro_skin("forehead", seed=1, size_mm=size_for(12.3, 1.0, angle_deg=0.0))
     begin = time.process_time()
     deform(field, stretch=1.2, angle_deg=90.0)
-    limits.append(Limit("processor seconds for one state of 12.3 mm", time.process_time() - begin,
-                        FIELD_STATE_S, "<=", "s"))  # fmt: skip
+    limits.append(
+        Limit(
+            "processor seconds for one state of 12.3 mm",
+            time.process_time() - begin,
+            FIELD_STATE_S,
+            "<=",
+            "s",
+        )
+    )
     flat = _flat(field)
     worst = float(np.abs(deform(flat, stretch=0.8, angle_deg=0.0).height_um).max())
     limits.append(Limit("height of a flat patch under compression", worst, 1e-6, "<=", "um"))
@@ -107,7 +126,7 @@ def _limits() -> tuple[Limit, ...]:
 
 def _flat(skin: MicroSkin) -> MicroSkin:
     crop = slice(0, 200)
-    maps: dict[str, NDArray[np.float32]] = {
+    maps: dict[str, Float32Array] = {
         name: getattr(skin, name)[crop, crop]
         for name in ("height_um", "albedo", "alpha", "layer_um")
     }

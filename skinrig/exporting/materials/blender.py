@@ -122,7 +122,10 @@ class Import:
         operator = "import_scene.gltf" if self.file.endswith(".glb") else "wm.usd_import"
         channels = None if self.channels is None else tuple(round(c, 9) for c in self.channels)
         return _TEXT.format(
-            file=self.file, script=FILE, operator=operator, channels=channels,
+            file=self.file,
+            script=FILE,
+            operator=operator,
+            channels=channels,
             radius=f"{RADIUS_FACTOR * self.radius_mm * MM_M:.9g}",
             textures={socket: (name, factor) for socket, name, factor in self.textures},
-        )  # fmt: skip
+        )

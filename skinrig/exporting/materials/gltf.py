@@ -51,8 +51,10 @@ class _Buffer:
     def view(self, content: bytes, target: int | None = None) -> int:
         self.data += b"\0" * (-len(self.data) % 4)
         entry: dict[str, Any] = {
-            "buffer": 0, "byteOffset": len(self.data), "byteLength": len(content),
-        }  # fmt: skip
+            "buffer": 0,
+            "byteOffset": len(self.data),
+            "byteLength": len(content),
+        }
         if target is not None:
             entry["target"] = target
         self.data += content
@@ -62,9 +64,11 @@ class _Buffer:
     def vectors(self, values: NDArray[Any], *, bounds: bool = False) -> int:
         rows = np.ascontiguousarray(values, "<f4")
         entry: dict[str, Any] = {
-            "bufferView": self.view(rows.tobytes(), VERTICES), "componentType": FLOAT,
-            "count": len(rows), "type": f"VEC{rows.shape[1]}",
-        }  # fmt: skip
+            "bufferView": self.view(rows.tobytes(), VERTICES),
+            "componentType": FLOAT,
+            "count": len(rows),
+            "type": f"VEC{rows.shape[1]}",
+        }
         if bounds:
             entry["min"], entry["max"] = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
         self.accessors.append(entry)
@@ -73,9 +77,13 @@ class _Buffer:
     def indices(self, faces: NDArray[Any]) -> int:
         flat = np.ascontiguousarray(faces.reshape(-1), "<u4")
         self.accessors.append(
-            {"bufferView": self.view(flat.tobytes(), INDICES), "componentType": UNSIGNED_INT,
-             "count": len(flat), "type": "SCALAR"}
-        )  # fmt: skip
+            {
+                "bufferView": self.view(flat.tobytes(), INDICES),
+                "componentType": UNSIGNED_INT,
+                "count": len(flat),
+                "type": "SCALAR",
+            }
+        )
         return len(self.accessors) - 1
 
 
@@ -174,8 +182,11 @@ def content(material: Material) -> bytes:
         for moved in material.shapes.values()
     ]
     primitive: dict[str, Any] = {
-        "attributes": attributes, "indices": buffer.indices(mesh.faces), "material": 0, "mode": 4,
-    }  # fmt: skip
+        "attributes": attributes,
+        "indices": buffer.indices(mesh.faces),
+        "material": 0,
+        "mode": 4,
+    }
     shape: dict[str, Any] = {"name": "skin", "primitives": [primitive]}
     if targets:
         primitive["targets"] = targets
@@ -207,10 +218,12 @@ def content(material: Material) -> bytes:
     return b"".join(
         [
             struct.pack("<III", MAGIC, 2, total),
-            struct.pack("<II", len(text), JSON_CHUNK), text,
-            struct.pack("<II", len(binary), BINARY_CHUNK), binary,
+            struct.pack("<II", len(text), JSON_CHUNK),
+            text,
+            struct.pack("<II", len(binary), BINARY_CHUNK),
+            binary,
         ]
-    )  # fmt: skip
+    )
 
 
 def _material(material: Material) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError
 from skinrig.exporting.images import CAMERA, SRGB, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
@@ -18,9 +18,6 @@ from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
 from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
 from skinrig.exporting.sealing import ExportError
-
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 COLOR_NOTE: Final = (
     "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
@@ -75,18 +72,18 @@ class Material:
     """
 
     mesh: FramedMesh
-    shapes: dict[str, Floats]
-    base_color: Floats
-    base_color_stderr: Floats | None
-    normals: Floats
-    normals_rig: Floats
-    axes: NDArray[np.float64]
-    covered: Bools
-    valid: Bools
+    shapes: dict[str, Float32Array]
+    base_color: Float32Array
+    base_color_stderr: Float32Array | None
+    normals: Float32Array
+    normals_rig: Float32Array
+    axes: Float64Array
+    covered: BoolArray
+    valid: BoolArray
     surface: surface_fit.SurfaceFit
-    translucency_mm: Floats
-    translucency_stderr_mm: Floats | None
-    deficit: NDArray[np.float64]
+    translucency_mm: Float32Array
+    translucency_stderr_mm: Float32Array | None
+    deficit: Float64Array
     eta: float
     assumed: tuple[str, ...]
     source: str
@@ -148,7 +145,7 @@ class Material:
         )
 
     @property
-    def radius_mm(self) -> Floats:
+    def radius_mm(self) -> Float32Array:
         """Mean free path, (H, W, 3), mm; see `skinrig.exporting.materials.subsurface_radius`."""
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
@@ -182,7 +179,7 @@ class Material:
         return [float(r) for r in np.median(shown.reshape(-1, 3), axis=0)]
 
     @property
-    def specular_weight(self) -> Floats:
+    def specular_weight(self) -> Float32Array:
         """The surface's weight, held in [0, 1] as formats demand, (H, W)."""
         return np.clip(self.surface.weight, 0.0, 1.0)
 
@@ -233,10 +230,16 @@ class Material:
             green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
             what = f"tangent space of the mesh's vertex frames, {green}, x and y and z in -1 to 1"
             return Image(
-                name=name, values=flipped, unit="1", what=what, low=-1.0, high=1.0,
-                valid=self.valid, filler=(0.0, 0.0, 1.0),
-            )  # fmt: skip
-        simple: dict[str, tuple[Floats, str, str, float, float]] = {
+                name=name,
+                values=flipped,
+                unit="1",
+                what=what,
+                low=-1.0,
+                high=1.0,
+                valid=self.valid,
+                filler=(0.0, 0.0, 1.0),
+            )
+        simple: dict[str, tuple[Float32Array, str, str, float, float]] = {
             "base_color": (self.base_color, "1", SRGB, 0.0, 1.0),
             "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),
             "specular_weight": (self.specular_weight, "1", "data", 0.0, 1.0),
@@ -252,10 +255,16 @@ class Material:
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"
         return Image(
-            name=name, values=values, unit=unit, space=space, what=what, low=low, high=high,
+            name=name,
+            values=values,
+            unit=unit,
+            space=space,
+            what=what,
+            low=low,
+            high=high,
             valid=None if name == "mask" else self.valid,
             filler=(0.0,) if name == "mask" else None,
-        )  # fmt: skip
+        )
 
     def error_images(self) -> list[Image]:
         """Return standard errors of what has them, and the mask."""
@@ -279,7 +288,7 @@ class Material:
         return out
 
 
-def deficit_of(r_d: NDArray[np.floating[Any]], eta: float) -> NDArray[np.float64]:
+def deficit_of(r_d: FloatArray, eta: float) -> Float64Array:
     """Return 1 - alpha' of the medium of an albedo, looked up between 1 000 exact values.
 
     Parameters

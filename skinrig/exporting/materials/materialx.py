@@ -80,12 +80,14 @@ def write_textures(material: Material, out: ImageFolder) -> float:
     scale = float(shown.max())
     out.exr(
         Image(
-            name="subsurface_radius_scale", values=np.clip(radius / scale, 0.0, 1.0), unit="1",
+            name="subsurface_radius_scale",
+            values=np.clip(radius / scale, 0.0, 1.0),
+            unit="1",
             what=f"{NOTES['subsurface_radius']}; over {scale:.9g} mm, the largest",
             valid=material.valid,
         ),
         TEXTURES,
-    )  # fmt: skip
+    )
     return scale
 
 
@@ -153,8 +155,13 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
     colors = ("base_color", "subsurface_radius_scale")
     for name in (*colors, "specular_roughness", "specular_weight"):
         kind = "color3" if name in colors else "float"
-        _image(graph, name, kind, f"{TEXTURES}/{delivery.referred(name, 'exr')}",
-               LINEAR if name == "base_color" else None)  # fmt: skip
+        _image(
+            graph,
+            name,
+            kind,
+            f"{TEXTURES}/{delivery.referred(name, 'exr')}",
+            LINEAR if name == "base_color" else None,
+        )
         ElementTree.SubElement(graph, "output", name=f"{name}_out", type=kind, nodename=name)
     _normal_nodes(graph, f"{TEXTURES}/{delivery.referred('normal', 'png')}", delivery)
     shader = ElementTree.SubElement(

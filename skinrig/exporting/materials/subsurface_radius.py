@@ -25,15 +25,15 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from skinrig.arrays import Float64Array
 
 LEAST_COLOR, MOST_COLOR = 0.001, 0.999
 """Colors are held in this range: at 1 no light is absorbed, and no radius has a sigma_tr."""
 
 
-def deficit_root(color: ArrayLike) -> Floats:
+def deficit_root(color: ArrayLike) -> Float64Array:
     """Return sqrt(1 - alpha) of the medium that shows a color, isotropic scattering.
 
     Parameters
@@ -51,7 +51,7 @@ def deficit_root(color: ArrayLike) -> Floats:
     return np.asarray(np.clip(root, 1e-4, 1.0 - 1e-3))
 
 
-def decay(deficit: ArrayLike) -> Floats:
+def decay(deficit: ArrayLike) -> Float64Array:
     """Return the exact decay of light over sigma_t, isotropic scattering: alpha = k / artanh k.
 
     Parameters
@@ -69,7 +69,7 @@ def decay(deficit: ArrayLike) -> Floats:
     return np.asarray(np.tanh(np.exp(np.interp(held, log_deficit, log_artanh))))
 
 
-def radius_mm(translucency_mm: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Floats:
+def radius_mm(translucency_mm: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Float64Array:
     """Return the mean free path for OpenPBR.
 
     Parameters
@@ -89,7 +89,7 @@ def radius_mm(translucency_mm: ArrayLike, color: ArrayLike, deficit: ArrayLike) 
     return np.asarray(_per_translucency(color, deficit) * np.asarray(translucency_mm, np.float64))
 
 
-def translucency_mm(radius: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Floats:
+def translucency_mm(radius: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Float64Array:
     """Return 1/sigma_tr of a mean free path, mm: the inverse of `radius_mm`.
 
     Examples
@@ -100,7 +100,7 @@ def translucency_mm(radius: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> 
     return np.asarray(np.asarray(radius, np.float64) / _per_translucency(color, deficit))
 
 
-def _per_translucency(color: ArrayLike, deficit: ArrayLike) -> Floats:
+def _per_translucency(color: ArrayLike, deficit: ArrayLike) -> Float64Array:
     own = np.asarray(deficit, np.float64)
     known = np.isfinite(own) & (own > 0.0)
     safe = np.where(known, np.clip(own, 1e-9, 0.999), 0.1)
@@ -109,7 +109,7 @@ def _per_translucency(color: ArrayLike, deficit: ArrayLike) -> Floats:
 
 
 @lru_cache(maxsize=1)
-def _decay_table() -> tuple[Floats, Floats]:
+def _decay_table() -> tuple[Float64Array, Float64Array]:
     """Return log(1 - alpha) and log artanh k, both increasing."""
     t = np.geomspace(1e-5, 2e3, 8001)
     series = t**2 / 3.0 - 2.0 * t**4 / 15.0

@@ -12,14 +12,13 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import merl
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-
-Floats = NDArray[np.float64]
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 ROUGHNESS: Final = np.linspace(0.15, 1.0, 69)
 """Of materials: the square root of the slope width alpha."""
@@ -49,9 +48,9 @@ class SurfaceFit:
         RMS of what is left over the RMS of the mixture, by the sum's own weights.
     """
 
-    roughness: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    misfit: NDArray[np.float32]
+    roughness: Float32Array
+    weight: Float32Array
+    misfit: Float32Array
 
 
 def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
@@ -82,7 +81,9 @@ def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
     return SurfaceFit(roughness, weight, misfit)
 
 
-def _fit(share: Floats, gram: Floats, cross: Floats, own: Floats) -> tuple[Floats, Floats, Floats]:
+def _fit(
+    share: Float64Array, gram: Float64Array, cross: Float64Array, own: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return roughness, weight and misfit of N mixtures, by the products of `_products`."""
     energy = np.einsum("...k,kl,...l->...", share, gram, share)
     along = share @ cross  # (N, R)
@@ -90,7 +91,7 @@ def _fit(share: Floats, gram: Floats, cross: Floats, own: Floats) -> tuple[Float
     best = np.argmax(explained, axis=-1)
     inner = np.clip(best, 1, len(ROUGHNESS) - 2)
 
-    def at(offset: int) -> Floats:
+    def at(offset: int) -> Float64Array:
         return np.take_along_axis(explained, (inner + offset)[..., None], axis=-1)[..., 0]
 
     below, here, above = at(-1), at(0), at(1)
@@ -103,7 +104,7 @@ def _fit(share: Floats, gram: Floats, cross: Floats, own: Floats) -> tuple[Float
     low = np.clip(np.floor(place).astype(np.intp), 0, len(ROUGHNESS) - 2)
     part = place - low
 
-    def between(table: Floats) -> Floats:
+    def between(table: Float64Array) -> Float64Array:
         return (1.0 - part) * np.take_along_axis(table, low[..., None], -1)[..., 0] + (
             part * np.take_along_axis(table, (low + 1)[..., None], -1)[..., 0]
         )
@@ -112,20 +113,16 @@ def _fit(share: Floats, gram: Floats, cross: Floats, own: Floats) -> tuple[Float
     left = np.maximum(energy - np.maximum(here, explained.max(axis=-1)), 0.0)
     dark = energy <= 1e-30
     misfit = np.sqrt(left / np.where(dark, 1.0, energy))
-    return (
-        np.where(dark, 1.0, roughness),
-        np.where(dark, 0.0, scale),
-        np.where(dark, 0.0, misfit),
-    )
+    return (np.where(dark, 1.0, roughness), np.where(dark, 0.0, scale), np.where(dark, 0.0, misfit))
 
 
-def lobe_values(roughness: float, eta: float) -> Floats:
+def lobe_values(roughness: float, eta: float) -> Float64Array:
     """Return GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
     light, view, cos_h, cos_d, _ = _directions()
     return microfacet.brdf(light, view, cos_h, cos_d, roughness=roughness**2, eta=eta, kind="ggx")
 
 
-def _products(lobes: BrdfBasis, eta: float) -> tuple[Floats, Floats, Floats]:
+def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return weighted products: lobes with lobes (K, K), with GGX (K, R), of GGX itself (R,)."""
     keep = _directions()[-1]
     table = lobes.table[::STRIDE_D, ::STRIDE_PHI, ::STRIDE_H, : lobes.size]
@@ -138,7 +135,7 @@ def _products(lobes: BrdfBasis, eta: float) -> tuple[Floats, Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def _grid() -> tuple[Floats, Floats, Floats]:
+def _grid() -> tuple[Float64Array, Float64Array, Float64Array]:
     d, phi, h = brdf_tables.nodes()
     picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")
     theta_d, phi_d, theta_h = (axis.reshape(-1) for axis in picked)
@@ -146,7 +143,7 @@ def _grid() -> tuple[Floats, Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def _directions() -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
+def _directions() -> tuple[Float64Array, Float64Array, Float64Array, Float64Array, BoolArray]:
     """Return cosines of light, view, half vector and difference angle, and which nodes count."""
     theta_d, phi_d, theta_h = _grid()
     light, view = merl.to_directions(theta_h, theta_d, phi_d)
@@ -155,7 +152,7 @@ def _directions() -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
 
 
 @lru_cache(maxsize=1)
-def _solid() -> Floats:
+def _solid() -> Float64Array:
     """Return the solid angle of each node times both cosines, up to a factor."""
     theta_d, phi_d, theta_h = _grid()
     light, view = merl.to_directions(theta_h, theta_d, phi_d)

@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim.geometry.mesh import Mesh
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from skinrig.exporting.materials.udim import TiledMesh
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LEAST = 1e-12
 LEAST_VOLUME = 1e-6
@@ -47,12 +45,12 @@ class FramedMesh:
         The vertex of the mesh it was made of: mirrored charts have vertices of their own.
     """
 
-    vertices_mm: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    uv: NDArray[np.float32]
-    tangents: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    source: NDArray[np.int64]
+    vertices_mm: Float32Array
+    normals: Float32Array
+    uv: Float32Array
+    tangents: Float32Array
+    faces: Int32Array
+    source: Int64Array
 
     @staticmethod
     def of(mesh: Mesh | TiledMesh) -> FramedMesh:
@@ -90,11 +88,15 @@ class FramedMesh:
         lost = np.linalg.norm(tangent, axis=1) < 0.5
         tangent[lost] = _any_across(normals[lost])
         return FramedMesh(
-            mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source],
-            np.column_stack([tangent, signs]).astype(np.float32), faces.astype(np.int32), source,
-        )  # fmt: skip
+            mesh.vertices_mm[source],
+            normals.astype(np.float32),
+            mesh.uv[source],
+            np.column_stack([tangent, signs]).astype(np.float32),
+            faces.astype(np.int32),
+            source,
+        )
 
-    def only(self, faces: Bools) -> FramedMesh:
+    def only(self, faces: BoolArray) -> FramedMesh:
         """Return the mesh with some of its faces, (F,), all vertices and their frames."""
         return replace(self, faces=self.faces[faces])
 
@@ -126,7 +128,7 @@ class FramedMesh:
 
         return parts(rim) - parts(found)
 
-    def texel_frames(self, size: int) -> tuple[Floats, Bools]:
+    def texel_frames(self, size: int) -> tuple[Float64Array, BoolArray]:
         """Return the interpolated axes under each texel.
 
         Parameters
@@ -157,7 +159,7 @@ class FramedMesh:
         return axes, covered
 
 
-def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.float32]:
+def to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Float32Array:
     """Return normals in their texels' frames.
 
     Parameters
@@ -193,7 +195,7 @@ def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.f
     return out
 
 
-def filled(tangent_normals: ArrayLike, valid: Bools) -> NDArray[np.float32]:
+def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     """Return tangent-space normals with what was not measured filled from around, (H, W, 3).
 
     In its texel's frame relief goes on beyond an edge. Filled in the frame of the rig instead, the
@@ -222,12 +224,12 @@ def filled(tangent_normals: ArrayLike, valid: Bools) -> NDArray[np.float32]:
     return np.where(valid[..., None], given, _unit(spread)).astype(np.float32)
 
 
-def from_tangent(tangent_normals: ArrayLike, axes: Floats) -> NDArray[np.float64]:
+def from_tangent(tangent_normals: ArrayLike, axes: Float64Array) -> Float64Array:
     """Return unit normals in the frame of the axes, as a renderer decodes a map, (H, W, 3)."""
     return _unit(np.einsum("hwk,hwkc->hwc", np.asarray(tangent_normals, np.float64), axes))
 
 
-def _face_tangents(points: Floats, uv: Floats) -> tuple[Floats, Floats]:
+def _face_tangents(points: Float64Array, uv: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return each triangle's unit direction of growing u, and twice its signed area in uv."""
     a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
     (au, av), (bu, bv) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
@@ -237,18 +239,18 @@ def _face_tangents(points: Floats, uv: Floats) -> tuple[Floats, Floats]:
     return _unit(along), area
 
 
-def _across(vectors: Floats, normals: Floats) -> Floats:
+def _across(vectors: Float64Array, normals: Float64Array) -> Float64Array:
     """Return unit vectors laid into the plane across normals; 0 for those along them."""
     return _unit(vectors - np.sum(vectors * normals, axis=1, keepdims=True) * normals)
 
 
-def _any_across(normals: Floats) -> Floats:
+def _any_across(normals: Float64Array) -> Float64Array:
     """Return some unit vector across each normal."""
     axis = np.zeros_like(normals)
     axis[np.arange(len(normals)), np.argmin(np.abs(normals), axis=1)] = 1.0
     return _across(axis, normals)
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: Float64Array) -> Float64Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > LEAST, vectors / np.maximum(length, LEAST), 0.0)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
+from skinrig.arrays import Float32Array, FloatArray, Int32Array
 from skinrig.exporting.options import FIRST_TILE
 from skinrig.exporting.sealing import ExportError
 
@@ -36,12 +37,12 @@ class TiledMesh:
         UDIM tile of each face, (F,).
     """
 
-    vertices_mm: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    uv: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    vertices_mm: Float32Array
+    faces: Int32Array
+    uv: Float32Array
+    normals: Float32Array
     tile: NDArray[np.intp]
-    shapes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    shapes: Mapping[str, Float32Array] = field(default_factory=dict)
 
     @staticmethod
     def of(mesh: Mesh) -> TiledMesh:
@@ -72,12 +73,15 @@ class TiledMesh:
             )
         used, flat = np.unique(faces, return_inverse=True)
         return build_mesh(
-            self.vertices_mm[used], flat.reshape(-1, 3), np.clip(self.uv[used], 0.0, 1.0),
-            self.normals[used], shapes={n: moved[used] for n, moved in self.shapes.items()},
-        )  # fmt: skip
+            self.vertices_mm[used],
+            flat.reshape(-1, 3),
+            np.clip(self.uv[used], 0.0, 1.0),
+            self.normals[used],
+            shapes={n: moved[used] for n, moved in self.shapes.items()},
+        )
 
 
-def tiles_of(uv: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.intp]:
+def tiles_of(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     """Return the UDIM tile of each face.
 
     Parameters
@@ -135,16 +139,16 @@ def read(path: Path) -> TiledMesh:
     lowest, span = float(uv.min()), max(float(np.ptp(uv)), 1.0)
     checked = build_mesh(vertices, faces, (uv - lowest) / (2.0 * span), shapes=shapes)
     return TiledMesh(
-        checked.vertices_mm, checked.faces, np.asarray(uv, np.float32),
-        vertex_normals(checked.vertices_mm, checked.faces), tiles_of(uv, checked.faces),
+        checked.vertices_mm,
+        checked.faces,
+        np.asarray(uv, np.float32),
+        vertex_normals(checked.vertices_mm, checked.faces),
+        tiles_of(uv, checked.faces),
         dict(checked.shapes),
-    )  # fmt: skip
+    )
 
 
-Contents = tuple[
-    NDArray[np.floating], NDArray[np.integer], NDArray[np.floating],
-    dict[str, NDArray[np.floating]],
-]  # fmt: skip
+Contents = tuple[FloatArray, NDArray[np.integer], FloatArray, dict[str, FloatArray]]
 
 
 def _contents(path: Path) -> Contents:

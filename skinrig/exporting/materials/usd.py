@@ -96,9 +96,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     )
     left_out = [
         *tiles,
-        ("subsurface light and specular weight of UsdPreviewSurface",
-         f"it has no place for them: the mtlx network holds both; {blender.FILE} sets them"),
-    ]  # fmt: skip
+        (
+            "subsurface light and specular weight of UsdPreviewSurface",
+            f"it has no place for them: the mtlx network holds both; {blender.FILE} sets them",
+        ),
+    ]
     if not material.shapes:
         left_out.append(("blend shapes", "the mesh has none; name one with --mesh"))
     return left_out
@@ -243,9 +245,11 @@ def _openpbr(stage: Any, place: str, material: Material, radius: float, delivery
     shader.CreateIdAttr("ND_open_pbr_surface_surfaceshader")
     shader.CreateOutput("out", types.Token)
     for name, value in (
-        ("specular_ior", float(material.eta)), ("subsurface_weight", 1.0),
-        ("subsurface_radius", radius), ("subsurface_scatter_anisotropy", 0.0),
-    ):  # fmt: skip
+        ("specular_ior", float(material.eta)),
+        ("subsurface_weight", 1.0),
+        ("subsurface_radius", radius),
+        ("subsurface_scatter_anisotropy", 0.0),
+    ):
         shader.CreateInput(name, types.Float).Set(float(value))
     color = image("base_color", types.Color3f, "ND_image_color3")
     for name in ("base_color", "subsurface_color"):

@@ -7,18 +7,15 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import fresnel, store
 from model.skin import SkinAppearance
 from model.texture_resampling import resampled
 from skinrig.applying import expression
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 COLOR_SIZE, MOST = 512, 3
 NEUTRAL: Final = "neutral"
@@ -45,17 +42,19 @@ class Colors:
         Of `base`, see :mod:`skinrig.exporting.images`.
     """
 
-    base: Floats
-    deltas: Mapping[str, Floats]
-    valid: Bools
+    base: Float64Array
+    deltas: Mapping[str, Float64Array]
+    valid: BoolArray
     layout: str
     space: str
 
 
 def write(
-    appearance: SkinAppearance, out: ImageFolder, delivery: Delivery,
+    appearance: SkinAppearance,
+    out: ImageFolder,
+    delivery: Delivery,
     left_out: list[tuple[str, str]],
-) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
+) -> tuple[dict[str, Any], list[str]]:
     """Write base color and color deltas.
 
     Parameters
@@ -82,19 +81,27 @@ def write(
     colors = _colors(appearance, rig, states, delivery, left_out)
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
     base = Image(
-        name="base_color", values=_filled(colors.base, colors.valid), unit="1", space=SRGB,
+        name="base_color",
+        values=_filled(colors.base, colors.valid),
+        unit="1",
+        space=SRGB,
         what=f"neutral base color on {colors.layout}; {colors.space}; holes filled",
         valid=colors.valid,
-    )  # fmt: skip
+    )
     out.exr(base)
     out.png(base)
     largest = {}
     for name, state in names.items():
         delta = colors.deltas[state]
         image = Image(
-            name=f"{name}_delta", values=delta, unit="1", low=-1.0, high=1.0, valid=colors.valid,
+            name=f"{name}_delta",
+            values=delta,
+            unit="1",
+            low=-1.0,
+            high=1.0,
+            valid=colors.valid,
             what=f"color of {state} at full strength less neutral, linear, on {colors.layout}",
-        )  # fmt: skip
+        )
         out.exr(image)
         out.png(image)
         shown = np.abs(delta[colors.valid])
@@ -102,12 +109,16 @@ def write(
     if delivery.with_errors:
         out.exr(Image(name="color_mask", values=colors.valid.astype(float), unit="1"))
     return {
-        "size": COLOR_SIZE, "layout": colors.layout, "space": colors.space, "maps": names,
-        "largest_delta": largest, "valid_share": float(colors.valid.mean()),
-    }, have  # fmt: skip
+        "size": COLOR_SIZE,
+        "layout": colors.layout,
+        "space": colors.space,
+        "maps": names,
+        "largest_delta": largest,
+        "valid_share": float(colors.valid.mean()),
+    }, have
 
 
-def _filled(base: Floats, valid: Bools) -> Floats:
+def _filled(base: Float64Array, valid: BoolArray) -> Float64Array:
     """Return colors with the holes filled from around, as a texture must have them."""
     from reconstruction.surface.texture_fill import push_pull
 
@@ -115,9 +126,12 @@ def _filled(base: Floats, valid: Bools) -> Floats:
 
 
 def _colors(
-    appearance: SkinAppearance, rig: Any, states: list[str], delivery: Delivery,
+    appearance: SkinAppearance,
+    rig: Any,
+    states: list[str],
+    delivery: Delivery,
     left_out: list[tuple[str, str]],
-) -> Colors:  # fmt: skip
+) -> Colors:
     melanin = appearance.maps["melanin"]
     seen = np.ones(melanin.values.shape, bool) if melanin.valid is None else melanin.valid.copy()
     blends = {}
@@ -131,9 +145,12 @@ def _colors(
     neutral = shown[NEUTRAL]
     if delivery.onto is None:
         left_out.append(
-            ("colors on the face's texture", "they lie on the flash camera's picture; name the "
-             "dome's maps with --onto, and two tables of landmarks")
-        )  # fmt: skip
+            (
+                "colors on the face's texture",
+                "they lie on the flash camera's picture; name the "
+                "dome's maps with --onto, and two tables of landmarks",
+            )
+        )
         base, valid = sized(neutral, seen, COLOR_SIZE)
         deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
@@ -143,7 +160,7 @@ def _colors(
 
 
 def _on_texture(
-    delivery: Delivery, shown: Mapping[str, Floats], seen: Bools, states: list[str]
+    delivery: Delivery, shown: Mapping[str, Float64Array], seen: BoolArray, states: list[str]
 ) -> Colors:
     """Return colors on another appearance's texture: its albedo, and changes carried over."""
     if delivery.onto is None or len(delivery.landmarks) != 2:
@@ -165,7 +182,7 @@ def _on_texture(
     base, valid = sized(inside * albedo.values.astype(np.float64), known, COLOR_SIZE)
     source = _places(delivery, albedo.values.shape[:2])
     neutral = shown[NEUTRAL]
-    deltas: dict[str, Floats] = {}
+    deltas: dict[str, Float64Array] = {}
     for state in states:
         # a ratio of colors is the skin's own; a difference would be that of another exposure
         ratio = np.divide(shown[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
@@ -177,7 +194,7 @@ def _on_texture(
     return Colors(base, deltas, valid, layout, CAMERA)
 
 
-def _places(delivery: Delivery, shape: tuple[int, int]) -> Floats:
+def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
     """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
     from reconstruction.correspondence import landmark_field, landmark_table
 
@@ -200,7 +217,7 @@ def _places(delivery: Delivery, shape: tuple[int, int]) -> Floats:
     return texel + fine
 
 
-def _refined(coarse: Floats) -> Floats:
+def _refined(coarse: Float64Array) -> Float64Array:
     """Return every eighth sample, (C, n, n), at each, linearly; extrapolated past the last."""
     for axis in (1, 2):
         n = coarse.shape[axis]
@@ -211,7 +228,9 @@ def _refined(coarse: Floats) -> Floats:
     return coarse
 
 
-def _looked_up(values: Floats, seen: Bools, source: Floats) -> tuple[Floats, Bools]:
+def _looked_up(
+    values: Float64Array, seen: BoolArray, source: Float64Array
+) -> tuple[Float64Array, BoolArray]:
     """Return values at places of a picture, bilinearly among what is known."""
     from scipy.ndimage import map_coordinates
 
@@ -234,7 +253,7 @@ def chosen(have: list[str], delivery: Delivery, what: str, left_out: Any) -> lis
     return names[:MOST]
 
 
-def sized(values: Floats, valid: Bools, size: int) -> tuple[Floats, Bools]:
+def sized(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Array, BoolArray]:
     """Return values at another size, means among what is known; 0 where nothing is."""
     layers = np.moveaxis(np.where(valid[..., None], values, 0.0), -1, 0)
     share = resampled(valid.astype(np.float64), (size, size))

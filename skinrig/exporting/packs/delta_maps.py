@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import wrinkles
 from model.skin import SkinAppearance
@@ -26,14 +25,12 @@ from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.packs import color_deltas, detail_maps
 from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 DOCUMENT: Final = "delta_maps.json"
 SCHEMA: Final = "skinrig.export.delta-maps/1"
@@ -83,21 +80,33 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         told["color"], states = color_deltas.write(appearance, out, delivery, left_out)
         known |= set(states)
     else:
-        left_out.append(("base color, cm1 to cm3", "the folder holds no facial_color: run "
-                         "`skinrig fit facial-color`"))  # fmt: skip
+        left_out.append(
+            (
+                "base color, cm1 to cm3",
+                "the folder holds no facial_color: run `skinrig fit facial-color`",
+            )
+        )
     if WRINKLES in parts:
         told["wrinkles"], rows = _write_wrinkles(appearance, parts, out, delivery, left_out)
         known |= set(rows)
     else:
-        left_out.append(("normal, wm1 to wm3, masks, cavity", "the folder holds no wrinkles: run "
-                         "`skinrig fit wrinkles`"))  # fmt: skip
+        left_out.append(
+            (
+                "normal, wm1 to wm3, masks, cavity",
+                "the folder holds no wrinkles: run `skinrig fit wrinkles`",
+            )
+        )
     if MICROSTRUCTURE in parts:
         details, rest = detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out, delivery)
         told |= details
         left_out += rest
     else:
-        left_out.append(("micro normals", "the folder holds no microstructure: run "
-                         "`skinrig fit microstructure`"))  # fmt: skip
+        left_out.append(
+            (
+                "micro normals",
+                "the folder holds no microstructure: run `skinrig fit microstructure`",
+            )
+        )
     details, rest = detail_maps.scatter(delivery, out)
     told |= details
     left_out += rest
@@ -128,9 +137,12 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
 
 
 def _write_wrinkles(
-    appearance: SkinAppearance, parts: Mapping[str, Any], out: ImageFolder, delivery: Delivery,
+    appearance: SkinAppearance,
+    parts: Mapping[str, Any],
+    out: ImageFolder,
+    delivery: Delivery,
     left_out: list[tuple[str, str]],
-) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
+) -> tuple[dict[str, Any], list[str]]:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     rows = sorted({str(row) for layer in model.layers for row in layer.table.rows})  # type: ignore[union-attr]
     fitted = [str(n) for n in parts[WRINKLES].get("expressions", [])]
@@ -149,9 +161,14 @@ def _write_wrinkles(
         delta, _ = color_deltas.sized(moved, shown.valid, NORMAL_SIZE)
         layers = np.concatenate([delta * sign, np.zeros((*delta.shape[:2], 1))], axis=-1)
         image = Image(
-            name=f"{name}_delta", values=layers, unit="1", low=-1.0, high=1.0, valid=valid,
+            name=f"{name}_delta",
+            values=layers,
+            unit="1",
+            low=-1.0,
+            high=1.0,
+            valid=valid,
             what=f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0",
-        )  # fmt: skip
+        )
         out.exr(image)
         out.png(image)
         clipped[name] = float(np.mean(np.abs(delta[valid]) > 1.0)) if valid.any() else 0.0
@@ -163,26 +180,39 @@ def _write_wrinkles(
             name = f"wrinkle_mask_{number}_{zone}"
             sized = resampled(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
             told = zones[zone] if zone < len(zones) else str(zone)
-            out.png(Image(name=name, values=sized, unit="1", low=0.0, high=1.0,
-                          what=f"zone {told}"))  # fmt: skip
+            out.png(
+                Image(name=name, values=sized, unit="1", low=0.0, high=1.0, what=f"zone {told}")
+            )
             masks[name] = told
     hollows, rest = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
     left_out += rest
     if delivery.with_errors:
         out.exr(Image(name="normal_mask", values=valid.astype(float), unit="1"))
     return {
-        "size": NORMAL_SIZE, "layout": "the dome's texture", "maps": names, "masks": masks,
-        "measured_size": list(model.base.shape[:2]), "clipped_share": clipped,
-        "valid_share": float(valid.mean()), **hollows,
-    }, have  # fmt: skip
+        "size": NORMAL_SIZE,
+        "layout": "the dome's texture",
+        "maps": names,
+        "masks": masks,
+        "measured_size": list(model.base.shape[:2]),
+        "clipped_share": clipped,
+        "valid_share": float(valid.mean()),
+        **hollows,
+    }, have
 
 
 def _write_normal(
-    name: str, slopes: Floats, y: float, valid: Bools, out: ImageFolder, what: str
+    name: str, slopes: Float64Array, y: float, valid: BoolArray, out: ImageFolder, what: str
 ) -> None:
     normals = wrinkles.decode(slopes) * np.array([1.0, y, 1.0])
     green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     out.png(
-        Image(name=name, values=normals, unit="1", low=-1.0, high=1.0, valid=valid,
-              what=f"{what}, tangent space over the smooth shape, {green}")
-    )  # fmt: skip
+        Image(
+            name=name,
+            values=normals,
+            unit="1",
+            low=-1.0,
+            high=1.0,
+            valid=valid,
+            what=f"{what}, tangent space over the smooth shape, {green}",
+        )
+    )

@@ -18,13 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import store, wrinkles
 from model.skin import SkinAppearance
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.packs import color_deltas
 from skinrig.exporting.packs.seamless import FADE, periodic, periodic_normals
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 DIRECTIONS: Final = 16
 REACH_PX: Final = 16
@@ -36,7 +34,7 @@ UM_MM: Final = 0.001
 
 
 def cavity(
-    slopes: Floats, valid: Bools, size: int, out: ImageFolder
+    slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Write the share of light from all around that relief leaves to its own hollows.
 
@@ -68,23 +66,30 @@ def cavity(
     shown, known = color_deltas.sized(seen[..., None], found.valid, size)
     values = np.where(known, shown[..., 0], 1.0)
     image = Image(
-        name="cavity", values=values, unit="1", low=0.0, high=1.0, valid=known,
+        name="cavity",
+        values=values,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        valid=known,
         what="share of light from all around that relief leaves at a place: 1 on ridges and flat "
         f"skin; horizons of {REACH_PX} measured texels in {DIRECTIONS} directions; 1 where nothing "
         "was measured",
-    )  # fmt: skip
+    )
     out.exr(image)
     out.png(image)
     return {
         "cavity": {
             "of": "heights integrated from the neutral wrinkle normals",
-            "reach_texels": REACH_PX, "measured_size": list(slopes.shape[:2]),
-            "least": float(values[known].min()), "median": float(np.median(values[known])),
+            "reach_texels": REACH_PX,
+            "measured_size": list(slopes.shape[:2]),
+            "least": float(values[known].min()),
+            "median": float(np.median(values[known])),
         }
-    }, []  # fmt: skip
+    }, []
 
 
-def visible_share(height: ArrayLike, part: ArrayLike) -> Floats:
+def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
     """Return the share of cosine-weighted light from all around that reaches each texel.
 
     Parameters
@@ -125,7 +130,7 @@ def visible_share(height: ArrayLike, part: ArrayLike) -> Floats:
     return np.asarray(1.0 - total / DIRECTIONS)
 
 
-def _among(number: NDArray[Any], at: Floats) -> Bools:
+def _among(number: NDArray[Any], at: Float64Array) -> BoolArray:
     """Return whether all four texels around places, (2, H, W), are of the part of their own."""
     last = np.array(number.shape)[:, None, None] - 1
     low = np.clip(np.floor(at).astype(int), 0, last)
@@ -154,15 +159,20 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
     left_out : list of (str, str)
     """
     if delivery.onto is None:
-        return {}, [("scatter", "it is of a model: name one of `skinrig fit reflectance` by "
-                     "--onto")]  # fmt: skip
+        return {}, [
+            ("scatter", "it is of a model: name one of `skinrig fit reflectance` by --onto")
+        ]
     other = store.read(delivery.onto)
     depth = other.maps.get("translucency")
     if depth is None:
-        return {}, [("scatter", f"{delivery.onto.name} holds no translucency: `skinrig fit "
-                     "reflectance` makes it")]  # fmt: skip
+        return {}, [
+            (
+                "scatter",
+                f"{delivery.onto.name} holds no translucency: `skinrig fit reflectance` makes it",
+            )
+        ]
     values = np.asarray(depth.values, np.float64)
-    known: Bools = np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
+    known: BoolArray = np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
     if depth.valid is not None:
         known &= depth.valid
     if not known.any():
@@ -170,20 +180,26 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
     shown, valid = color_deltas.sized(values, known, SCATTER_SIZE)
     usual = np.median(values[known], axis=0)
     image = Image(
-        name="scatter", values=np.where(valid[..., None], shown, usual), unit="mm", low=0.0,
-        high=SCATTER_MM, valid=valid,
+        name="scatter",
+        values=np.where(valid[..., None], shown, usual),
+        unit="mm",
+        low=0.0,
+        high=SCATTER_MM,
+        valid=valid,
         what="1/sigma_tr in red, green and blue; the median where it is not known",
-    )  # fmt: skip
+    )
     out.exr(image)
     out.png(image)
     assumed = other.parameters.get("assumed", [])
     texts = [str(text) for text in assumed] if isinstance(assumed, list | tuple) else []
     return {
         "scatter": {
-            "size": SCATTER_SIZE, "layout": f"the texture of {delivery.onto.name}",
-            "median_mm": usual.tolist(), "assumed": [t for t in texts if "translucency" in t],
+            "size": SCATTER_SIZE,
+            "layout": f"the texture of {delivery.onto.name}",
+            "median_mm": usual.tolist(),
+            "assumed": [t for t in texts if "translucency" in t],
         }
-    }, []  # fmt: skip
+    }, []
 
 
 def micro_normals(
@@ -229,9 +245,13 @@ def micro_normals(
         normals = periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
         image = Image(
-            name=name, values=normals * [1.0, y, 1.0], unit="1", low=-1.0, high=1.0,
+            name=name,
+            values=normals * [1.0, y, 1.0],
+            unit="1",
+            low=-1.0,
+            high=1.0,
             what=f"relief of {site} at rest, tangent space, {green}, repeats without a seam",
-        )  # fmt: skip
+        )
         out.exr(image)
         out.png(image)
         slope = normals[..., :2] / normals[..., 2:]
@@ -248,7 +268,7 @@ def micro_normals(
     return ({"micro": told} if told else {}), left_out
 
 
-def _size_mm(height: Floats, pixel_um: float) -> list[float]:
+def _size_mm(height: Float64Array, pixel_um: float) -> list[float]:
     """Return width and height of a map on the skin, mm."""
     rows, columns = height.shape
     return [UM_MM * pixel_um * columns, UM_MM * pixel_um * rows]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from skinrig.arrays import Float64Array
 
 FADE: Final = 8
 """One part of so many of a tile is faded into what lies beyond its other end."""
 
 
-def periodic(image: ArrayLike) -> Floats:
+def periodic(image: ArrayLike) -> Float64Array:
     """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
 
     By weights whose squares sum to 1, so that relief of independent places keeps its variance.
@@ -48,7 +48,7 @@ def periodic(image: ArrayLike) -> Floats:
     return found
 
 
-def periodic_normals(height_um: Floats, pixel_um: float) -> Floats:
+def periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
     """Return unit normals of relief that repeats, (H, W, 3), +Y up, row 0 at the top.
 
     Examples

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.session import Session
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
 
@@ -105,7 +105,7 @@ def _write(
     toward = places / np.linalg.norm(places, axis=1, keepdims=True)
     names = [f"{images.lights[k]}.tif" for k in good]
 
-    def picture(light: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def picture(light: int) -> tuple[Float32Array, BoolArray]:
         if "light_list" in session.manifest.extra:
             return _imported(session, images.views[view], images.lights[light])
         found = dome.image(view, _capture(images, light))
@@ -118,9 +118,13 @@ def _write(
     for k, name in zip(good, names, strict=True):
         codes, clipped[name] = _coded(*picture(k), scale)
         tifffile.imwrite(
-            folder / name, codes, photometric="minisblack" if codes.ndim == 2 else "rgb",
-            compression=None, metadata=None, software=False,
-        )  # fmt: skip
+            folder / name,
+            codes,
+            photometric="minisblack" if codes.ndim == 2 else "rgb",
+            compression=None,
+            metadata=None,
+            software=False,
+        )
     rows = [f"{n} {x:.9f} {y:.9f} {z:.9f}" for n, (x, y, z) in zip(names, toward, strict=True)]
     (folder / LIST).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
     near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
@@ -148,9 +152,7 @@ def _write(
     return left_out
 
 
-def in_camera_frame(
-    position_mm: NDArray[np.floating[Any]], rotation: NDArray[np.floating[Any]]
-) -> NDArray[np.float64]:
+def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Array:
     """Return places as light lists have them: x right, y up, z towards the camera.
 
     Parameters
@@ -181,9 +183,7 @@ def _capture(images: Any, light: int) -> int:
     return int(images.captures.index((images.lights[light], -1)))
 
 
-def _imported(
-    session: Session, view: str, light: str
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:
     """Return a picture that came with a light list, which need not say its exposure."""
     from capture import raw
 
@@ -199,14 +199,12 @@ def _imported(
     return image.rgb * per_time, image.valid
 
 
-def _top(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
+def _top(values: Float32Array, valid: BoolArray) -> float:
     shown = values[valid]
     return float(np.quantile(shown, 1.0 - BRIGHT_SHARE)) if shown.size else 0.0
 
 
-def _coded(
-    values: NDArray[np.float32], valid: NDArray[np.bool_], scale: float
-) -> tuple[NDArray[np.uint16], float]:
+def _coded(values: Float32Array, valid: BoolArray, scale: float) -> tuple[UInt16Array, float]:
     codes = np.rint(np.nan_to_num(values.astype(np.float64)) * scale)
     beyond = codes > TOP - 1
     beyond = (beyond if codes.ndim == 2 else beyond.any(axis=-1)) | ~valid

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
+from skinrig.arrays import Float64Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.provenance import ORIENTATION, provenance
@@ -75,9 +75,14 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
                 write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
     write_json(
         folder / DOCUMENT,
-        {**provenance(appearance), "schema": SCHEMA, "orientation": ORIENTATION, "files": files,
-         "left_out": [list(row) for row in left_out]},
-    )  # fmt: skip
+        {
+            **provenance(appearance),
+            "schema": SCHEMA,
+            "orientation": ORIENTATION,
+            "files": files,
+            "left_out": [list(row) for row in left_out],
+        },
+    )
     return left_out
 
 
@@ -99,7 +104,7 @@ def channel(kind: str, wavelength_nm: float) -> str:
     return f"{kind}.{f'{wavelength_nm:.6g}'.replace('.', ',')}nm"
 
 
-def band_means_nm(camera: str, illuminant: str) -> NDArray[np.float64]:
+def band_means_nm(camera: str, illuminant: str) -> Float64Array:
     """Return the mean wavelength of a camera's bands under a light, nm, (3,).
 
     Examples
@@ -142,9 +147,12 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         folder / REFLECTANCE, channels, {"spectralLayoutVersion": LAYOUT, "comments": what}
     )
     return {
-        "what": what, "origin": "modelled", "unit": "1", "channels": list(channels),
+        "what": what,
+        "origin": "modelled",
+        "unit": "1",
+        "channels": list(channels),
         "valid_share": float(valid.mean()),
-    }  # fmt: skip
+    }
 
 
 def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
@@ -180,7 +188,11 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     }
     write_channels(folder / STOKES, channels, attributes)
     return {
-        "what": what, "origin": "measured", "unit": "white tile = 1", "channels": list(channels),
-        "camera": told["camera"], "illuminant": told["illuminant"],
+        "what": what,
+        "origin": "measured",
+        "unit": "white tile = 1",
+        "channels": list(channels),
+        "camera": told["camera"],
+        "illuminant": told["illuminant"],
         "valid_share": float(valid.mean()),
-    }  # fmt: skip
+    }

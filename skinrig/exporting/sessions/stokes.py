@@ -20,15 +20,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.session import Session
+from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
 from skinrig.exporting.sessions.spectral import LAYOUT, channel
-
-Float32 = NDArray[np.float32]
 
 NAME: Final = "stokes"
 DOCUMENT: Final = "stokes.json"
@@ -94,7 +92,7 @@ def export_stokes(
     )
 
 
-def components(parallel: Float32, crossed: Float32) -> dict[str, Float32]:
+def components(parallel: Float32Array, crossed: Float32Array) -> dict[str, Float32Array]:
     """Return S0 and S1 of pictures behind an analyser along an axis, and across it.
 
     Parameters
@@ -112,9 +110,12 @@ def components(parallel: Float32, crossed: Float32) -> dict[str, Float32]:
 
 
 def _write(
-    session: Session, folder: Path, only: tuple[str, ...], with_errors: bool,
+    session: Session,
+    folder: Path,
+    only: tuple[str, ...],
+    with_errors: bool,
     calibration: str | Path | None,
-) -> list[tuple[str, str]]:  # fmt: skip
+) -> list[tuple[str, str]]:
     from reconstruction.pipeline.evidence import Evidence
     from reconstruction.pipeline.gradient.images import GradientImages
     from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
@@ -139,9 +140,11 @@ def _write(
         "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
     )
     header = {
-        "spectralLayoutVersion": LAYOUT, "emissiveUnits": "1",
-        "polarisationHandedness": "right", "comments": what,
-    }  # fmt: skip
+        "spectralLayoutVersion": LAYOUT,
+        "emissiveUnits": "1",
+        "polarisationHandedness": "right",
+        "comments": what,
+    }
     files: dict[str, Any] = {}
     left_out: list[tuple[str, str]] = []
     for state in images.states:
@@ -157,13 +160,15 @@ def _write(
             found = components(
                 patterns.values[pattern, PARALLEL], patterns.values[pattern, CROSSED]
             )
-            write_channels(folder / f"{stem}.exr", dict(zip(band, found.values(), strict=True)),
-                           header)  # fmt: skip
+            write_channels(
+                folder / f"{stem}.exr", dict(zip(band, found.values(), strict=True)), header
+            )
             variance = patterns.variance[pattern, PARALLEL] + patterns.variance[pattern, CROSSED]
             files[f"{stem}.exr"] = {
-                "state": state.name, "pattern": pattern,
+                "state": state.name,
+                "pattern": pattern,
                 **_figures(found, np.sqrt(variance), patterns.valid),
-            }  # fmt: skip
+            }
             if with_errors:
                 told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
                 write_channels(folder / f"{stem}.stderr.exr", {"Y": np.sqrt(variance)}, told)
@@ -222,7 +227,7 @@ def file_stem(state: str, pattern: str) -> str:
 
 
 def _figures(
-    found: Mapping[str, Float32], stderr: Float32, valid: NDArray[np.bool_]
+    found: Mapping[str, Float32Array], stderr: Float32Array, valid: BoolArray
 ) -> dict[str, float]:
     """Return what is worth knowing of an image before it is opened, as JSON values."""
     if not valid.any():

@@ -6,13 +6,11 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin_reflectance import SkinReflectance
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import Mesh
-
-Float = NDArray[np.float64]
+from skinrig.arrays import Float32Array
 
 
 def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflectance]:
@@ -44,7 +42,7 @@ def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflec
     }
 
 
-def one_lobe(model: SkinReflectance) -> NDArray[np.float32]:
+def one_lobe(model: SkinReflectance) -> Float32Array:
     """Return weights of one common mixture, scaled at each texel to reflect most like its own.
 
     Returns

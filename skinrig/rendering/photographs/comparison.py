@@ -98,12 +98,18 @@ def tell(console: Console, record: Mapping[str, Any]) -> None:
     console.rows(
         ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
         [
-            (name if name not in record["by_kind"] else f"{name} held out", row["pairs"],
-             *(round(100 * row[key], 2) for key in ("median", "p68", "p95", "bias", "total_error")),
-             round(row["ssim"], 4))
+            (
+                name if name not in record["by_kind"] else f"{name} held out",
+                row["pairs"],
+                *(
+                    round(100 * row[key], 2)
+                    for key in ("median", "p68", "p95", "bias", "total_error")
+                ),
+                round(row["ssim"], 4),
+            )
             for name, row in rows
         ],
-    )  # fmt: skip
+    )
     for band, row in record["by_band"].items():
         console.say(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
     word = "kept" if record["passed"] else "MISSED"

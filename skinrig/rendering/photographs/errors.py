@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from skinrig.arrays import BoolArray, Float64Array
 
 LUMINANCE: Final = (0.2126, 0.7152, 0.0722)
 LEAST_SIGNAL: Final = 10.0
@@ -49,9 +48,9 @@ class Photograph:
         (H, W) bool; False where it is saturated.
     """
 
-    rgb: Float
-    variance: Float
-    valid: Bool
+    rgb: Float64Array
+    variance: Float64Array
+    valid: BoolArray
 
     def __post_init__(self) -> None:
         shape = np.shape(self.rgb)
@@ -84,9 +83,9 @@ class PairError:
         Mean structural similarity of the tone-mapped pair over the skin, -1 to 1.
     """
 
-    relative: Float
-    signed: Float
-    lit: Bool
+    relative: Float64Array
+    signed: Float64Array
+    lit: BoolArray
     noise: float
     total_error: float
     ssim: float
@@ -97,7 +96,7 @@ class PairError:
         return float(np.median(self.relative[self.lit])) if self.lit.any() else float("nan")
 
 
-def luminance(rgb: ArrayLike) -> Float:
+def luminance(rgb: ArrayLike) -> Float64Array:
     """Return the luminance of white-balanced linear RGB, (...).
 
     Examples
@@ -108,7 +107,7 @@ def luminance(rgb: ArrayLike) -> Float:
     return np.asarray(np.asarray(rgb, np.float64) @ np.array(LUMINANCE))
 
 
-def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> Bool:
+def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> BoolArray:
     """Return which pixels count as lit, see this module.
 
     Parameters
@@ -171,7 +170,7 @@ def compare(
     )
 
 
-def tone_mapped(rgb: ArrayLike, white: float) -> Float:
+def tone_mapped(rgb: ArrayLike, white: float) -> Float64Array:
     """Return linear light by the sRGB curve, 0 to 1, with `white` as 1; brighter is 1.
 
     Examples
@@ -184,7 +183,7 @@ def tone_mapped(rgb: ArrayLike, white: float) -> Float:
     return np.where(value <= 0.0031308, 12.92 * value, curve)
 
 
-def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: Bool) -> float:
+def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
     """Return the mean structural similarity over the skin of a tone-mapped pair.
 
     Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black beside
@@ -198,9 +197,14 @@ def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: Bool) -> float
     if min(skin.shape) < 11:
         raise PhotographError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
     _, full = structural_similarity(
-        *pair, data_range=1.0, channel_axis=-1, gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False, full=True,
-    )  # fmt: skip
+        *pair,
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
     return float(np.mean(np.asarray(full)[skin]))
 
 
@@ -253,10 +257,11 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
     p50, p68, p90, p95 = (float(p) for p in np.percentile(every, PERCENTILES))
     again = [
         float(np.median(np.concatenate(drawn)))
-        for drawn in ([values[k] for k in rng.integers(len(values), size=len(values))]
-                      for _ in range(200))
+        for drawn in (
+            [values[k] for k in rng.integers(len(values), size=len(values))] for _ in range(200)
+        )
         if sum(len(v) for v in drawn)
-    ]  # fmt: skip
+    ]
     low, high = np.quantile(again, [0.16, 0.84])
     some = [pair for pair in pairs if pair.lit.any()]
     return Summary(
@@ -295,5 +300,5 @@ def by_band(
     }
 
 
-def _sigma(photograph: Photograph) -> Float:
+def _sigma(photograph: Photograph) -> Float64Array:
     return np.asarray(np.sqrt(np.asarray(photograph.variance, np.float64) @ np.square(LUMINANCE)))

@@ -16,8 +16,8 @@ from model import fresnel, store
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance, assemble
 from rigsim.geometry.atlas import sample
-from rigsim.geometry.mesh import Float32Array
 from rigsim.render import Caster
+from skinrig.arrays import Float32Array
 from skinrig.drawing import png
 from skinrig.evaluating.skin_bands import bands_of, typology_angle_deg
 from skinrig.rendering import folder
@@ -52,9 +52,14 @@ class _Surface:
 
     def render(self, photographs: Photographs, shot: Shot, subsurface: Subsurface) -> Rendering:
         return render(
-            self.laid.model, self.laid, photographs.camera(shot), photographs.light(shot),
-            subsurface=subsurface, caster=self.caster, interior=self.interior,
-        )  # fmt: skip
+            self.laid.model,
+            self.laid,
+            photographs.camera(shot),
+            photographs.light(shot),
+            subsurface=subsurface,
+            caster=self.caster,
+            interior=self.interior,
+        )
 
 
 def evaluate(
@@ -131,11 +136,14 @@ def evaluate(
         bands.append(_bands(whole, made))
         rows.append(
             {
-                **dataclasses.asdict(shot), "median": pair.median, "noise": pair.noise,
-                "lit_pixels": int(np.count_nonzero(pair.lit)), "ssim": pair.ssim,
+                **dataclasses.asdict(shot),
+                "median": pair.median,
+                "noise": pair.noise,
+                "lit_pixels": int(np.count_nonzero(pair.lit)),
+                "ssim": pair.ssim,
                 "total_error": pair.total_error,
             }
-        )  # fmt: skip
+        )
         for name, image in _without(surface, fewer, photographs, shot, subsurface, made, ablation):
             parts.setdefault(name, []).append(_compare(photo, made, image))
         if shot in drawn:
@@ -186,9 +194,16 @@ def evaluate_folders(
     beside = appearance.resolve().parent / named
     found = store.read(beside) if named and (beside / store.DOCUMENT).is_file() else None
     comparison, pictures = evaluate(
-        read, photographs, truth=found, subsurface=subsurface, count=count, ablation=ablation,
-        model=model, rng=np.random.default_rng(seed), progress=progress,
-    )  # fmt: skip
+        read,
+        photographs,
+        truth=found,
+        subsurface=subsurface,
+        count=count,
+        ablation=ablation,
+        model=model,
+        rng=np.random.default_rng(seed),
+        progress=progress,
+    )
     document = {
         "kind": "comparison with photographs",
         "appearance": appearance,
@@ -272,11 +287,13 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
     shown = [tone(np.where(on, image, 0.0), exposure) for image in (photo.rgb, made.radiance)]
     error = png.colorize(pair.signed, -ERROR_SHOWN, ERROR_SHOWN, scale="RdBu_r", valid=pair.lit)
     return sheet(
-        [[
-            Panel("photograph", shown[0]),
-            Panel("rendering", shown[1]),
-            Panel(f"error, red +{100 * ERROR_SHOWN:.0f} %", error),
-        ]],
+        [
+            [
+                Panel("photograph", shown[0]),
+                Panel("rendering", shown[1]),
+                Panel(f"error, red +{100 * ERROR_SHOWN:.0f} %", error),
+            ]
+        ],
         title=f"{shot.view} {shot.light} ({shot.held_out} held out): "
         f"median {100 * pair.median:.1f} %",
-    )  # fmt: skip
+    )

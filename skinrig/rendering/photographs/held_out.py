@@ -191,8 +191,9 @@ def _held_out(appearance: SkinAppearance) -> HoldOut:
 
 
 def _why(held: HoldOut, light: str, view: str) -> str:
-    kinds = [kind for kind, out in (("light", light in held.lights), ("view", view in held.views))
-             if out]  # fmt: skip
+    kinds = [
+        kind for kind, out in (("light", light in held.lights), ("view", view in held.views)) if out
+    ]
     return " and ".join(kinds)
 
 

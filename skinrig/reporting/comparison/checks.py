@@ -72,9 +72,15 @@ def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> str:
     return "<h2>Checks of both</h2>" + page.table(
         ("check", a.label, b.label, "difference", "limit", "changed"),
         [
-            (row.name, told(row.a), told(row.b), row.difference, limit(row),
-             row.changed or ("no" if row.a and row.b else "only in one"))
+            (
+                row.name,
+                told(row.a),
+                told(row.b),
+                row.difference,
+                limit(row),
+                row.changed or ("no" if row.a and row.b else "only in one"),
+            )
             for row in rows
         ],
         caption="Verdicts that changed stand first; limits that follow a bound may differ",
-    )  # fmt: skip
+    )

@@ -71,14 +71,25 @@ def benchmarks(a: Run, b: Run) -> str:
     body = f"<h2>Error against run time</h2><div class='plots'>{plots}</div>"
     if machines:
         body += page.table(
-            ("machine", a.label, b.label), machines,
+            ("machine", a.label, b.label),
+            machines,
             caption="Measured on different machines: seconds compare those, too",
-        )  # fmt: skip
+        )
     return body + page.table(
-        ("stage", "setting", "seconds A", "seconds B", "B over A", "error A", "error B",
-         "error B over A", "68 % intervals apart"),
-        rows, caption="Settings that both measured, at the same size",
-    )  # fmt: skip
+        (
+            "stage",
+            "setting",
+            "seconds A",
+            "seconds B",
+            "B over A",
+            "error A",
+            "error B",
+            "error B over A",
+            "68 % intervals apart",
+        ),
+        rows,
+        caption="Settings that both measured, at the same size",
+    )
 
 
 def _bench_of(run: Run) -> dict[str, Any] | None:
@@ -102,10 +113,18 @@ def _settings_of_stage(
         apart = high < low_b or high_b < low
         ratio = match["error"] / point["error"] if point["error"] else float("nan")
         rows.append(
-            (name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],
-             match["seconds"], match["seconds"] / point["seconds"], point["error"],
-             match["error"], ratio, "yes" if apart else "no")
-        )  # fmt: skip
+            (
+                name,
+                ", ".join(f"{k} {v}" for k, v in point["knobs"].items()),
+                point["seconds"],
+                match["seconds"],
+                match["seconds"] / point["seconds"],
+                point["error"],
+                match["error"],
+                ratio,
+                "yes" if apart else "no",
+            )
+        )
     return rows
 
 
@@ -121,9 +140,10 @@ def seconds(a: Run, b: Run) -> str:
     total = [sum(side[step] for step in common) for side in sides]
     rows.append(("all of these", total[0], total[1], total[1] - total[0]))
     return "<h2>Seconds</h2>" + page.table(
-        ("step", a.label, b.label, "difference"), rows,
+        ("step", a.label, b.label, "difference"),
+        rows,
         caption="Wall-clock seconds of steps that both tell; other work of the machine is in them",
-    )  # fmt: skip
+    )
 
 
 def _steps(run: Run) -> Iterator[tuple[str, float]]:
@@ -149,13 +169,21 @@ def moved_calibrations(a: Run, b: Run) -> str:
                 rows.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
                 continue
             rows += [
-                (f"{folder.name}, {path.stem}", one.serial, one.name, one.old, one.new,
-                 float("nan") if one.sigmas is None else one.sigmas, f"{len(moved)} moved")
+                (
+                    f"{folder.name}, {path.stem}",
+                    one.serial,
+                    one.name,
+                    one.old,
+                    one.new,
+                    float("nan") if one.sigmas is None else one.sigmas,
+                    f"{len(moved)} moved",
+                )
                 for one in moved[:MOST_DRIFTS]
-            ]  # fmt: skip
+            ]
     if not rows:
         return ""
     return "<h2>Calibrations that moved</h2>" + page.table(
         ("calibration", "device", "quantity", "A", "B", "in combined standard errors", "remark"),
-        rows, caption="The farthest of each kind",
-    )  # fmt: skip
+        rows,
+        caption="The farthest of each kind",
+    )

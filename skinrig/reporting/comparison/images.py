@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import store
+from skinrig.arrays import Float64Array
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page, provenance
 from skinrig.reporting.comparison.runs import Run
 from skinrig.reporting.sections import images as pictures_section
-
-Floats = NDArray[np.float64]
 
 MOST_DRAWN = 4
 """Pictures of a folder that are drawn: those that differ most."""
@@ -48,11 +47,11 @@ class PictureDifference:
 
     name: str
     kind: str
-    a: Floats
-    b: Floats
+    a: Float64Array
+    b: Float64Array
 
     @property
-    def difference(self) -> Floats:
+    def difference(self) -> Float64Array:
         """B less A, mean over the channels, (H, W)."""
         return np.asarray((self.b - self.a).mean(axis=-1))
 
@@ -95,8 +94,9 @@ def compared(a: Path, b: Path) -> tuple[list[PictureDifference], list[tuple[str,
         Folders that `skinrig render` or `skinrig analyse` wrote.
     """
     found, refused = [], []
-    names = [{p.stem for p in folder.glob("*.*") if p.suffix in (".exr", ".png")}
-             for folder in (a, b)]  # fmt: skip
+    names = [
+        {p.stem for p in folder.glob("*.*") if p.suffix in (".exr", ".png")} for folder in (a, b)
+    ]
     for name in sorted(names[0] | names[1]):
         if name not in names[0] or name not in names[1]:
             refused.append((name, f"only in {'A' if name in names[0] else 'B'}"))
@@ -141,16 +141,28 @@ def section(a: Run, b: Run) -> str:
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
             body += page.table(
-                ("picture", "values", "RMS of B − A over A, %", "mean B over A", "largest |B − A|",
-                 "equal"),
+                (
+                    "picture",
+                    "values",
+                    "RMS of B − A over A, %",
+                    "mean B over A",
+                    "largest |B − A|",
+                    "equal",
+                ),
                 [
-                    (one.name, one.kind, 100 * one.relative_rms, one.mean_ratio, one.largest,
-                     "yes" if one.equal else "no")
+                    (
+                        one.name,
+                        one.kind,
+                        100 * one.relative_rms,
+                        one.mean_ratio,
+                        one.largest,
+                        "yes" if one.equal else "no",
+                    )
                     for one in order
                 ],
                 caption="Linear values in the unit of the renderings; codes over 255, which follow "
                 "the brightness that each picture was shown with",
-            )  # fmt: skip
+            )
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MOST_DRAWN]:
                 body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"
@@ -169,9 +181,7 @@ def alone(a: Run, b: Run) -> list[tuple[str, str]]:
     one, other = ({path.name for path in run.found.pictures} for run in (a, b))
     if len(one) == len(other) == 1:
         return []
-    return [(n, a.label) for n in sorted(one - other)] + [
-        (n, b.label) for n in sorted(other - one)
-    ]  # fmt: skip
+    return [(n, a.label) for n in sorted(one - other)] + [(n, b.label) for n in sorted(other - one)]
 
 
 def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
@@ -190,9 +200,14 @@ def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
     every = np.ones(one.difference.shape, bool)
     reach = map_pictures.reach_of(one.difference, every, PERCENTILE) or one.largest or 1.0
     yield map_pictures.scalar_picture(
-        "B − A, mean of the channels", one.difference, low=-reach, high=reach, scale="RdBu_r",
-        width=200, of=one.name,
-    )  # fmt: skip
+        "B − A, mean of the channels",
+        one.difference,
+        low=-reach,
+        high=reach,
+        scale="RdBu_r",
+        width=200,
+        of=one.name,
+    )
 
 
 def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> str:
@@ -215,11 +230,11 @@ def _document(folder: Path) -> Mapping[str, Any]:
     return {key: value for key, value in told.items() if key not in UNTOLD}
 
 
-def _linear(path: Path) -> Floats:
+def _linear(path: Path) -> Float64Array:
     return _layers(store.read_exr(path))
 
 
-def _codes(path: Path) -> Floats:
+def _codes(path: Path) -> Float64Array:
     import cv2
 
     read = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -230,16 +245,16 @@ def _codes(path: Path) -> Floats:
     return layers[..., [2, 1, 0]] / top if layers.shape[-1] >= 3 else layers / top
 
 
-def _layers(values: NDArray[Any]) -> Floats:
+def _layers(values: NDArray[Any]) -> Float64Array:
     image = np.asarray(values, np.float64)
     return image if image.ndim == 3 else image[..., None]
 
 
-def _size(image: Floats) -> str:
+def _size(image: Float64Array) -> str:
     return " x ".join(str(n) for n in image.shape)
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: Float64Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 

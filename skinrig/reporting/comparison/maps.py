@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinMap
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.reporting.page import short_unit
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LEVELS = (1.0, 2.0, 3.0)
 """Combined standard errors that shares of pixels beyond are told for."""
@@ -56,8 +53,8 @@ class MapDifference:
     high: float
     combined: float
     beyond: tuple[float, ...]
-    difference: Floats
-    sigmas: Floats | None
+    difference: Float64Array
+    sigmas: Float64Array | None
 
     @property
     def disagree(self) -> bool:
@@ -116,7 +113,7 @@ def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     good_a, good_b = _known(a), _known(b)
     both = good_a & good_b
     difference = vb - va
-    sigmas: Floats | None = None
+    sigmas: Float64Array | None = None
     combined = float("nan")
     beyond: tuple[float, ...] = ()
     if a.stderr is not None and b.stderr is not None:
@@ -131,14 +128,21 @@ def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         sigmas = np.where(both, np.clip(sigmas, -FARTHEST, FARTHEST), np.nan)
     told = difference[both]
     return MapDifference(
-        name, short_unit(a.unit), int(both.sum()),
-        int((good_a & ~good_b).sum()), int((good_b & ~good_a).sum()),
-        _median(va[both]), _median(vb[both]), _median(told), _median(np.abs(told)),
+        name,
+        short_unit(a.unit),
+        int(both.sum()),
+        int((good_a & ~good_b).sum()),
+        int((good_b & ~good_a).sum()),
+        _median(va[both]),
+        _median(vb[both]),
+        _median(told),
+        _median(np.abs(told)),
         float(np.percentile(np.abs(told), 95)) if told.size else float("nan"),
-        combined, beyond,
+        combined,
+        beyond,
         np.where(both, difference if difference.ndim == 2 else difference.mean(axis=2), np.nan),
         sigmas,
-    )  # fmt: skip
+    )
 
 
 def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
@@ -152,7 +156,7 @@ def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     angle[both] = metrics.angular_error_rad(
         a.values[both].astype(np.float64), b.values[both].astype(np.float64)
     )
-    sigmas: Floats | None = None
+    sigmas: Float64Array | None = None
     combined = float("nan")
     beyond: tuple[float, ...] = ()
     if a.stderr is not None and b.stderr is not None:
@@ -168,26 +172,36 @@ def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         beyond = _beyond(sigmas[both])
     degrees = np.degrees(angle)
     return MapDifference(
-        name, "°", int(both.sum()), int((good_a & ~good_b).sum()), int((good_b & ~good_a).sum()),
-        float("nan"), float("nan"), float("nan"), _median(degrees[both]),
+        name,
+        "°",
+        int(both.sum()),
+        int((good_a & ~good_b).sum()),
+        int((good_b & ~good_a).sum()),
+        float("nan"),
+        float("nan"),
+        float("nan"),
+        _median(degrees[both]),
         float(np.percentile(degrees[both], 95)) if both.any() else float("nan"),
-        combined, beyond, degrees, sigmas,
-    )  # fmt: skip
+        combined,
+        beyond,
+        degrees,
+        sigmas,
+    )
 
 
-def _known(one: SkinMap) -> Bools:
+def _known(one: SkinMap) -> BoolArray:
     finite = np.isfinite(one.values)
     good = finite if finite.ndim == 2 else finite.all(axis=2)
     return np.asarray(good if one.valid is None else good & one.valid, bool)
 
 
-def _beyond(sigmas: Floats) -> tuple[float, ...]:
+def _beyond(sigmas: Float64Array) -> tuple[float, ...]:
     told = np.abs(sigmas[~np.isnan(sigmas)])
     if not told.size:
         return ()
     return tuple(float(np.mean(told > level)) for level in LEVELS)
 
 
-def _median(values: Floats) -> float:
+def _median(values: Float64Array) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")

@@ -96,9 +96,10 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> str:
     missing = [*alone(a, b), *picture_comparison.alone(a, b)]
     if missing:
         body += "<h2>Only in one</h2>" + page.table(
-            ("folder", "in"), missing,
+            ("folder", "in"),
+            missing,
             caption="Folders of maps or pictures without one of the same name",
-        )  # fmt: skip
+        )
     return body + consents.section([a.found, b.found])
 
 
@@ -111,13 +112,27 @@ def _pair(a: Run, b: Run, pair: Pair) -> str:
             "difference is the processing's, and combined standard errors are too large for it."
         )
     body += page.table(
-        ("map", "verdict", "beyond 3 σ, %", "2 σ, %", "1 σ, %", "median A", "median B",
-         "median B − A", "median |B − A|", "95th percentile", "σ", "unit", "pixels",
-         "only A", "only B"),
+        (
+            "map",
+            "verdict",
+            "beyond 3 σ, %",
+            "2 σ, %",
+            "1 σ, %",
+            "median A",
+            "median B",
+            "median B − A",
+            "median |B − A|",
+            "95th percentile",
+            "σ",
+            "unit",
+            "pixels",
+            "only A",
+            "only B",
+        ),
         [_difference_row(one) for one in sorted(pair.differences, key=_farthest_first)],
         caption="Pixel by pixel; σ: the two standard errors combined, median; beyond: share of "
         "pixels that far apart, by chance 0.27, 4.6 and 31.7 %; only: pixels without a partner",
-    )  # fmt: skip
+    )
     if pair.refused:
         table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
         body += page.folded(f"{len(pair.refused)} maps not subtracted", table)
@@ -135,9 +150,20 @@ def _difference_row(one: MapDifference) -> tuple[object, ...]:
     if one.beyond:
         verdict = "disagree" if one.disagree else "equal" if one.high == 0.0 else "agree"
     return (
-        words(one.name), verdict, *shares[::-1], one.median_a, one.median_b, one.bias, one.median,
-        one.high, one.combined, one.unit, one.pixels, one.only_a, one.only_b,
-    )  # fmt: skip
+        words(one.name),
+        verdict,
+        *shares[::-1],
+        one.median_a,
+        one.median_b,
+        one.bias,
+        one.median,
+        one.high,
+        one.combined,
+        one.unit,
+        one.pixels,
+        one.only_a,
+        one.only_b,
+    )
 
 
 def _pictures(a: Run, b: Run, pair: Pair) -> str:
@@ -182,24 +208,41 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
             )
         else:
             yield map_pictures.scalar_picture(
-                label, image, low=low, high=high, valid=mask, unit=one.unit, width=WIDTH_PX,
+                label,
+                image,
+                low=low,
+                high=high,
+                valid=mask,
+                unit=one.unit,
+                width=WIDTH_PX,
                 of=one.name,
-            )  # fmt: skip
+            )
     image, mask = laid(one.difference)
     reach = map_pictures.reach_of(image, mask, 98) or 1.0
     signed = one.unit != "°"
     yield map_pictures.scalar_picture(
-        "B − A" if signed else "angle between them", image, low=-reach if signed else 0.0,
-        high=reach, scale="RdBu_r" if signed else "magma", valid=mask, unit=one.unit,
-        width=WIDTH_PX, of=one.name,
-    )  # fmt: skip
+        "B − A" if signed else "angle between them",
+        image,
+        low=-reach if signed else 0.0,
+        high=reach,
+        scale="RdBu_r" if signed else "magma",
+        valid=mask,
+        unit=one.unit,
+        width=WIDTH_PX,
+        of=one.name,
+    )
     if one.sigmas is not None:
         image, mask = laid(one.sigmas)
         yield map_pictures.scalar_picture(
-            "in combined standard errors", image, low=-SIGMAS_SHOWN if signed else 0.0,
-            high=SIGMAS_SHOWN, scale="RdBu_r" if signed else "magma", valid=mask,
-            width=WIDTH_PX, of=f"{one.name}, difference",
-        )  # fmt: skip
+            "in combined standard errors",
+            image,
+            low=-SIGMAS_SHOWN if signed else 0.0,
+            high=SIGMAS_SHOWN,
+            scale="RdBu_r" if signed else "magma",
+            valid=mask,
+            width=WIDTH_PX,
+            of=f"{one.name}, difference",
+        )
 
 
 def _by_band(pair: Pair) -> str:
@@ -223,18 +266,33 @@ def _by_band(pair: Pair) -> str:
                 continue
             sigmas = np.abs(one.sigmas[inside])
             rows.append(
-                (words(one.name), melanin_band(low, high), one.unit, int(inside.sum()),
-                 float(np.median(one.difference[inside])),
-                 float(np.median(np.abs(one.difference[inside]))),
-                 float(np.median(sigmas)), 100 * float(np.mean(sigmas > 3.0)))
-            )  # fmt: skip
+                (
+                    words(one.name),
+                    melanin_band(low, high),
+                    one.unit,
+                    int(inside.sum()),
+                    float(np.median(one.difference[inside])),
+                    float(np.median(np.abs(one.difference[inside]))),
+                    float(np.median(sigmas)),
+                    100 * float(np.mean(sigmas > 3.0)),
+                )
+            )
     if not rows:
         return ""
     table = page.table(
-        ("map", "band", "unit", "pixels", "median difference", "median |difference|",
-         "median of combined standard errors", "beyond 3 %"),
-        rows, caption="By band of the melanin fraction C_m that both find on average",
-    )  # fmt: skip
+        (
+            "map",
+            "band",
+            "unit",
+            "pixels",
+            "median difference",
+            "median |difference|",
+            "median of combined standard errors",
+            "beyond 3 %",
+        ),
+        rows,
+        caption="By band of the melanin fraction C_m that both find on average",
+    )
     return "<h3>By melanin band</h3>" + table
 
 
@@ -260,10 +318,18 @@ def _errors(a: Run, b: Run, pair: Pair) -> str:
         apart = one.interval[1] < other.interval[0] or other.interval[1] < one.interval[0]
         known = np.isfinite([*one.interval, *other.interval]).all()
         rows.append(
-            (one.quantity, one.skin, one.unit, one.error, other.error, other.error - one.error,
-             ("yes" if apart else "no") if known else "not known",
-             100 * one.coverage, 100 * other.coverage)
-        )  # fmt: skip
+            (
+                one.quantity,
+                one.skin,
+                one.unit,
+                one.error,
+                other.error,
+                other.error - one.error,
+                ("yes" if apart else "no") if known else "not known",
+                100 * one.coverage,
+                100 * other.coverage,
+            )
+        )
     if not rows:
         return ""
     body = "<h3>Errors against the truths</h3>"
@@ -276,7 +342,17 @@ def _errors(a: Run, b: Run, pair: Pair) -> str:
             "The truths differ, too: part of what differs between the maps is the skin's own."
         )
     return body + page.table(
-        ("error", "skin", "unit", "A", "B", "difference", "68 % intervals apart",
-         "68 % coverage % A", "B"),
-        rows, caption="Each against its own truth",
-    )  # fmt: skip
+        (
+            "error",
+            "skin",
+            "unit",
+            "A",
+            "B",
+            "difference",
+            "68 % intervals apart",
+            "68 % coverage % A",
+            "B",
+        ),
+        rows,
+        caption="Each against its own truth",
+    )

@@ -66,22 +66,29 @@ def _chromophores(appearance: SkinAppearance, truth: SkinAppearance) -> list[Tru
     return [
         TruthError(
             f"{row.name}, median relative error against the {row.against} truth",
-            row.band_name, "%", 100 * row.median_relative,
-            (100 * row.interval[0], 100 * row.interval[1]), row.coverage.share,
+            row.band_name,
+            "%",
+            100 * row.median_relative,
+            (100 * row.interval[0], 100 * row.interval[1]),
+            row.coverage.share,
         )
         for row in found
-    ]  # fmt: skip
+    ]
 
 
 def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
     found = surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     rows = [
         TruthError(
-            f"{row.name}, median error", "all", unit_sign(row.unit),
-            row.median, row.interval, row.coverage.share,
+            f"{row.name}, median error",
+            "all",
+            unit_sign(row.unit),
+            row.median,
+            row.interval,
+            row.coverage.share,
         )
         for row in found
-    ]  # fmt: skip
+    ]
     for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
         rows.append(TruthError(f"{name}, median error", f"{band} skin", unit, middle))
     return rows
@@ -91,14 +98,25 @@ def _microrelief(appearance: SkinAppearance, truth: SkinAppearance) -> list[Trut
     rows = []
     for one in microrelief.compare(appearance, truth, rng=np.random.default_rng(0)):
         rows.append(
-            TruthError("normals, median error", one.state, "°", one.median_deg, one.interval_deg,
-                       one.coverage)
-        )  # fmt: skip
+            TruthError(
+                "normals, median error",
+                one.state,
+                "°",
+                one.median_deg,
+                one.interval_deg,
+                one.coverage,
+            )
+        )
         if np.isfinite(one.height_um):
             rows.append(
-                TruthError("height, rms error of relief", one.state, "%",
-                           100 * one.height_relative, coverage=one.height_coverage)
-            )  # fmt: skip
+                TruthError(
+                    "height, rms error of relief",
+                    one.state,
+                    "%",
+                    100 * one.height_relative,
+                    coverage=one.height_coverage,
+                )
+            )
     return rows
 
 
@@ -108,7 +126,12 @@ def _subsurface(appearance: SkinAppearance, truth: SkinAppearance) -> list[Truth
     for kind in dict.fromkeys(row.kind for row in fits):
         for one in subsurface.by_method([row for row in fits if row.kind == kind]):
             rows.append(
-                TruthError(f"sigma_tr by {one.method}, median relative error", f"{kind} tissue",
-                           "%", 100 * one.median, coverage=one.coverage)
-            )  # fmt: skip
+                TruthError(
+                    f"sigma_tr by {one.method}, median relative error",
+                    f"{kind} tissue",
+                    "%",
+                    100 * one.median,
+                    coverage=one.coverage,
+                )
+            )
     return rows

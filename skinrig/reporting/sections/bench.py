@@ -39,10 +39,14 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
             got = float("nan") if limit["got"] is None else limit["got"]
             checks.append(
                 page.Check(
-                    f"{name}: {limit['name']}", got, limit["bound"], limit["sense"],
-                    limit["unit"], worst=_worst(stage),
+                    f"{name}: {limit['name']}",
+                    got,
+                    limit["bound"],
+                    limit["sense"],
+                    limit["unit"],
+                    worst=_worst(stage),
                 )
-            )  # fmt: skip
+            )
     plots = [
         bench_figures.error_against_seconds(name, stage)
         for name, stage in document["stages"].items()
@@ -50,13 +54,27 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     ]
     body += f'<div class="plots">{"".join(plots)}</div>'
     body += page.table(
-        ("stage", "setting", "seconds", "cold, s", "peak, MB", "error", "Cramér-Rao",
-         "efficiency", "place"),
+        (
+            "stage",
+            "setting",
+            "seconds",
+            "cold, s",
+            "peak, MB",
+            "error",
+            "Cramér-Rao",
+            "efficiency",
+            "place",
+        ),
         [
             (
-                name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],
-                point["cold_seconds"], _cell(point["peak_memory_mb"]), point["error"],
-                _cell(point["cramer_rao_bound"]), _cell(point.get("efficiency")),
+                name,
+                ", ".join(f"{k} {v}" for k, v in point["knobs"].items()),
+                point["seconds"],
+                point["cold_seconds"],
+                _cell(point["peak_memory_mb"]),
+                point["error"],
+                _cell(point["cramer_rao_bound"]),
+                _cell(point.get("efficiency")),
                 "knee" if point["knee"] else "front" if point["on_front"] else "beaten",
             )
             for name, stage in document["stages"].items()
@@ -64,13 +82,14 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
         ],
         caption="Every setting measured; errors in the unit on each plot's axis; efficiency is "
         "variance over the Cramér-Rao bound, 1 is perfect; cold: the first call of a process",
-    )  # fmt: skip
+    )
     bands = bench_table.bands(document)
     if bands:
         body += page.table(
-            bench_table.BAND_COLUMNS, bands,
+            bench_table.BAND_COLUMNS,
+            bands,
             caption="Error of the usual setting by melanin band; of light: over the lightest one",
-        )  # fmt: skip
+        )
     return body + _left_out(document)
 
 

@@ -9,11 +9,11 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration import store
 from capture.calibration.record import Calibration, CalibrationError
 from model.skin import SkinAppearance
+from skinrig.arrays import Float64Array
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
 
@@ -21,7 +21,6 @@ LONGEST = 12
 """Numbers of a quantity up to which a table lists it."""
 MOST_VALUES = 60
 """Rows beyond which values stay in their file."""
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +30,7 @@ class Figure:
     quantity: str
     words: str
     unit: str
-    of: Callable[[Floats], float] = lambda values: float(np.max(np.abs(values)))
+    of: Callable[[Float64Array], float] = lambda values: float(np.max(np.abs(values)))
     factor: float = 1.0
     worst: Callable[[Sequence[float]], float] = max
 
@@ -115,21 +114,32 @@ def section(
             checks.append(
                 page.Check(
                     f"{folder.name}: days that it would still have held at capture, least",
-                    float(np.min(left)), 0.0, ">=", "d",
+                    float(np.min(left)),
+                    0.0,
+                    ">=",
+                    "d",
                 )
-            )  # fmt: skip
+            )
     body = "<h2>Calibration: quality and age</h2>" + page.table(
         ("calibration", "made", "valid until", "used for", "captured", "age then, days", "verdict"),
         ages,
         caption="Age at the day of capture against validity; used for: maps here that name this "
         "very file among their inputs",
-    )  # fmt: skip
+    )
     body += page.table(
-        ("calibration", "figure", "unit", "devices", "median", "worst", "worst device",
-         "largest standard error"),
+        (
+            "calibration",
+            "figure",
+            "unit",
+            "devices",
+            "median",
+            "worst",
+            "worst device",
+            "largest standard error",
+        ),
         figures,
         caption="Quality; standard errors are of the figure itself where the calibration has them",
-    )  # fmt: skip
+    )
     return body + values
 
 
@@ -161,10 +171,14 @@ def _age(
         verdict = f"in force, {min(days)} days left"
     ages = [(day - found.created).days for day in captured]
     return [float(d) for d in days], (
-        f"{folder}, {found.kind}", found.created.isoformat(), found.valid_until.isoformat(),
-        ", ".join(users) or "nothing here", ", ".join(day.isoformat() for day in captured),
-        ", ".join(map(str, ages)), f"{verdict}; {found.source}",
-    )  # fmt: skip
+        f"{folder}, {found.kind}",
+        found.created.isoformat(),
+        found.valid_until.isoformat(),
+        ", ".join(users) or "nothing here",
+        ", ".join(day.isoformat() for day in captured),
+        ", ".join(map(str, ages)),
+        f"{verdict}; {found.source}",
+    )
 
 
 def _plain(digests: object) -> set[str]:
@@ -199,11 +213,16 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
         device = next(serial for serial, value in told.items() if value == worst)
         rows.append(
             (
-                f"{folder}, {found.kind}", figure.words, figure.unit, len(told),
-                float(np.median(list(told.values()))), worst, device,
+                f"{folder}, {found.kind}",
+                figure.words,
+                figure.unit,
+                len(told),
+                float(np.median(list(told.values()))),
+                worst,
+                device,
                 max(errors) if errors else "",
             )
-        )  # fmt: skip
+        )
     flagged = [
         serial
         for serial, names in sorted(found.values.items())
@@ -213,10 +232,16 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
     if counted:
         rows.append(
             (
-                f"{folder}, {found.kind}", "devices found not valid", "", counted,
-                float(len(flagged)), float(len(flagged)), ", ".join(flagged[:6]), "",
+                f"{folder}, {found.kind}",
+                "devices found not valid",
+                "",
+                counted,
+                float(len(flagged)),
+                float(len(flagged)),
+                ", ".join(flagged[:6]),
+                "",
             )
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -232,9 +257,10 @@ def _values(folder: str, found: Calibration) -> str:
         body += page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
     else:
         body += page.table(
-            ("device", "quantity", "value", "standard error"), rows,
+            ("device", "quantity", "value", "standard error"),
+            rows,
             caption=f"Values of {folder}, {found.kind}, made {found.created}",
-        )  # fmt: skip
+        )
     return page.folded(f"{folder}, {found.kind}: notes and values", body)
 
 

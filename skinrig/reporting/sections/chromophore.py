@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import flash
 from skinrig.reporting import map_images as map_pictures
@@ -54,12 +54,17 @@ def _alone(key: str, skin_map: SkinMap) -> str:
     if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
     return map_pictures.scalar_picture(
-        map_names.heading(key), skin_map.values, low=low, high=high, valid=mask,
-        unit=page.short_unit(skin_map.unit), width=SMALL_PX,
-    )  # fmt: skip
+        map_names.heading(key),
+        skin_map.values,
+        low=low,
+        high=high,
+        valid=mask,
+        unit=page.short_unit(skin_map.unit),
+        width=SMALL_PX,
+    )
 
 
-def _shown(estimate: SkinMap, truth: SkinMap | None) -> NDArray[np.bool_] | None:
+def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
     masks = [m.valid for m in (estimate, truth) if m is not None and m.valid is not None]
     return np.logical_and.reduce(masks) if masks else None
 
@@ -87,29 +92,52 @@ def errors(
             checks.append(
                 page.Check(
                     f"{name}: {row.name}, median error",
-                    100 * row.median_relative, 100 * flash.limit(row), "<=", "%",
+                    100 * row.median_relative,
+                    100 * flash.limit(row),
+                    "<=",
+                    "%",
                     f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
-                    masked=row.masked, coverage=row.coverage.share, worst=worst,
+                    masked=row.masked,
+                    coverage=row.coverage.share,
+                    worst=worst,
                     worst_got=worst_got,
                 )
-            )  # fmt: skip
+            )
     body = "<h3>Errors by melanin band</h3>" + page.table(
-        ("map", "truth", "band", "pixels", "masked, %", "median |error|, %", "68 % interval",
-         "bias, %", "68 % coverage, %", "by noise alone, %", "median standard error, %",
-         "bound, %"),
+        (
+            "map",
+            "truth",
+            "band",
+            "pixels",
+            "masked, %",
+            "median |error|, %",
+            "68 % interval",
+            "bias, %",
+            "68 % coverage, %",
+            "by noise alone, %",
+            "median standard error, %",
+            "bound, %",
+        ),
         [
             (
-                row.name, row.against, row.band_name, row.pixels, 100 * row.masked,
+                row.name,
+                row.against,
+                row.band_name,
+                row.pixels,
+                100 * row.masked,
                 100 * row.median_relative,
                 f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.bias, 100 * row.coverage.share, 100 * row.noise_coverage,
-                100 * row.median_stderr, 100 * row.median_bound,
+                100 * row.bias,
+                100 * row.coverage.share,
+                100 * row.noise_coverage,
+                100 * row.median_stderr,
+                100 * row.median_bound,
             )
             for row in rows
         ],
         caption="Relative errors against what the subject is made of (sharp) and against what "
         "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
-    )  # fmt: skip
+    )
     limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
     return body + _bars([row for row in blurred if row.band is not None], limits)
 
@@ -135,9 +163,12 @@ def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> str:
         for key in dict.fromkeys(row.name for row in banded)
     }
     plot = figures.bars(
-        "median error by melanin band; dashed: limit of all bands together", labels, series,
-        unit="%", limits=limits,
-    )  # fmt: skip
+        "median error by melanin band; dashed: limit of all bands together",
+        labels,
+        series,
+        unit="%",
+        limits=limits,
+    )
     return f'<div class="plots">{plot}</div>'
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import microstructure
 from model.microstructure import KernelTable
@@ -15,6 +14,7 @@ from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.appearances.dynamic import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.drawing import figures
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
@@ -24,9 +24,17 @@ SHOWN = 4
 """States drawn; the tables list all."""
 WIDTH_PX = 240
 ZONE_COLORS = np.array(
-    [[0.85, 0.1, 0.1], [0.1, 0.65, 0.15], [0.1, 0.25, 0.85], [0.5, 0.3, 0.1],
-     [0.1, 0.75, 0.8], [0.8, 0.15, 0.7], [0.95, 0.55, 0.1], [0.5, 0.5, 0.5]]
-)  # fmt: skip
+    [
+        [0.85, 0.1, 0.1],
+        [0.1, 0.65, 0.15],
+        [0.1, 0.25, 0.85],
+        [0.5, 0.3, 0.1],
+        [0.1, 0.75, 0.8],
+        [0.8, 0.15, 0.7],
+        [0.95, 0.55, 0.1],
+        [0.5, 0.5, 0.5],
+    ]
+)
 """Zones in the colors that Jimenez2011 names them by."""
 
 
@@ -107,7 +115,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     )
 
 
-def _normals(derivatives: Any) -> NDArray[np.float64]:
+def _normals(derivatives: Any) -> Float64Array:
     values = np.asarray(derivatives, float)
     small = np.concatenate([values, np.ones((*values.shape[:2], 1))], axis=2)
     return np.asarray(small / np.linalg.norm(small, axis=2, keepdims=True))
@@ -125,13 +133,24 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
         relief = appearance.maps[entry["map"]]
         spread = 2.5 * float(np.std(relief.values[_valid(relief)]))
         pictures += map_pictures.scalar_picture(
-            f"{site}: neutral relief", relief.values, low=-spread, high=spread, scale="gray",
-            valid=relief.valid, unit="um", width=WIDTH_PX,
-        )  # fmt: skip
+            f"{site}: neutral relief",
+            relief.values,
+            low=-spread,
+            high=spread,
+            scale="gray",
+            valid=relief.valid,
+            unit="um",
+            width=WIDTH_PX,
+        )
         rows.append(
-            (site, entry["pixel_um"], entry["kernels"] or "the paper's table",
-             f"{low:.2f} – {high:.2f}", table.source)
-        )  # fmt: skip
+            (
+                site,
+                entry["pixel_um"],
+                entry["kernels"] or "the paper's table",
+                f"{low:.2f} – {high:.2f}",
+                table.source,
+            )
+        )
     plots = figures.curves("strength", "stretch ratio", "alpha", alphas)
     plots += figures.curves("width", "stretch ratio", "sigma, um", sigmas)
     return (
@@ -144,6 +163,6 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     )
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

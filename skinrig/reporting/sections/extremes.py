@@ -62,12 +62,18 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     checks.append(page.Check("extremes that failed", failed, 0, "<=", "", f"of {len(cases)}"))
     rows = [
         (
-            case["stage"], case["name"], case["extreme"], case["danger"], case["expected"],
-            *(("" if case[name]["passed"] else "FAILED: ") + case[name]["got"]
-              for name in PRECISIONS),
+            case["stage"],
+            case["name"],
+            case["extreme"],
+            case["danger"],
+            case["expected"],
+            *(
+                ("" if case[name]["passed"] else "FAILED: ") + case[name]["got"]
+                for name in PRECISIONS
+            ),
         )
         for case in cases
-    ]  # fmt: skip
+    ]
     return "<h2>Stiff and extreme cases</h2>" + page.table(
         ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS),
         rows,

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.facial_color import HemoglobinRig
 from model.skin import SkinAppearance, SkinMap
 from skinrig.applying.expression import colors, hemoglobin_rig
+from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.evaluating.flash import BANDS
@@ -60,20 +60,29 @@ def section(
         change = appearance.maps.get(f"change_{state}")
         rows.append(
             (
-                state, _mean(change), float(np.median(maps.scale[maps.valid])),
-                100 * rms, 100 * largest,
+                state,
+                _mean(change),
+                float(np.median(maps.scale[maps.valid])),
+                100 * rms,
+                100 * largest,
                 placed[0]["median_error_px"] if placed else "",
                 placed[0]["by"] if placed else "",
             )
-        )  # fmt: skip
+        )
     body += page.table(
-        ("state", "mean change of blood, points", "median scale",
-         "lost by storing small, rms, points", "largest, points", "error of place, px",
-         "placed by"),
+        (
+            "state",
+            "mean change of blood, points",
+            "median scale",
+            "lost by storing small, rms, points",
+            "largest, points",
+            "error of place, px",
+            "placed by",
+        ),
         rows,
         caption="States; points are percent of the dermis' volume, the mean change is over all "
         "pixels whose change was found",
-    )  # fmt: skip
+    )
     body += _repeats(part.get("repeatability"))
     if truths:
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
@@ -87,11 +96,13 @@ def section(
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
         body += map_pictures.map_panel(
-            f"blood of {state}, by the rig", "volume fraction",
+            f"blood of {state}, by the rig",
+            "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
             standard_error=np.where(blend.valid, blend.stderr, 0.0),
-            truth=None if true is None else true.values, valid=seen,
-        )  # fmt: skip
+            truth=None if true is None else true.values,
+            valid=seen,
+        )
     return body
 
 
@@ -103,23 +114,35 @@ def _repeats(told: Mapping[str, Any] | None) -> str:
     rows = []
     for row in told["hemoglobin"]:
         drift = drifts.get(row["region"])
-        slope = "" if drift is None else (
-            f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})"
-        )  # fmt: skip
+        slope = (
+            ""
+            if drift is None
+            else (f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})")
+        )
         rows.append(
             (
-                row["region"], 100 * row["within"], 100 * row["between"],
+                row["region"],
+                100 * row["within"],
+                100 * row["between"],
                 float("nan") if row["correlation"] is None else row["correlation"],
-                "yes" if row["scatters"] else "no", slope,
+                "yes" if row["scatters"] else "no",
+                slope,
                 "" if drift is None else f"{drift['p_value']:.2g}",
             )
-        )  # fmt: skip
+        )
     return page.table(
-        ("region", "between repeats, points", "between states, points", "intraclass correlation",
-         "more than noise", "melanin's drift a minute, points", "p"),
+        (
+            "region",
+            "between repeats, points",
+            "between states, points",
+            "intraclass correlation",
+            "more than noise",
+            "melanin's drift a minute, points",
+            "p",
+        ),
         rows,
         caption="Repeats: standard deviations of blood",
-    )  # fmt: skip
+    )
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:
@@ -159,47 +182,74 @@ def _errors(
         checks.append(
             page.Check(
                 f"{name}: blood of {row.state} by the rig, median error",
-                100 * row.median_relative, 100 * evaluation.LEVEL_LIMIT, "<=", "%",
-                coverage=row.coverage, worst=worst,
+                100 * row.median_relative,
+                100 * evaluation.LEVEL_LIMIT,
+                "<=",
+                "%",
+                coverage=row.coverage,
+                worst=worst,
             )
-        )  # fmt: skip
+        )
     body = "<h3>Blood of each state: error by way</h3>" + page.table(
-        ("state", "way", "median |error|, %", "68 % interval", "rms, points", "bias, %",
-         "68 % coverage, %", "pixels"),
+        (
+            "state",
+            "way",
+            "median |error|, %",
+            "68 % interval",
+            "rms, points",
+            "bias, %",
+            "68 % coverage, %",
+            "pixels",
+        ),
         [
-            (row.state, row.way, 100 * row.median_relative,
-             f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}", 100 * row.rms,
-             100 * row.bias, 100 * row.coverage, row.pixels)
+            (
+                row.state,
+                row.way,
+                100 * row.median_relative,
+                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+                100 * row.rms,
+                100 * row.bias,
+                100 * row.coverage,
+                row.pixels,
+            )
             for row in states
         ],
         caption="Against the true blood of each state, by way of getting it; pixels that every "
         "way tells",
-    )  # fmt: skip
+    )
     body += page.table(
-        ("state", "true change, points", "found, points", "rms of the map, points",
-         "68 % coverage, %"),
+        (
+            "state",
+            "true change, points",
+            "found, points",
+            "rms of the map, points",
+            "68 % coverage, %",
+        ),
         [
             (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
             for row in changes
         ],
         caption="Change of blood from the neutral state, one melanin for all states; over those of "
         "these pixels whose change was found",
-    )  # fmt: skip
+    )
     if banded:
         body += page.table(
-            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"), banded,
+            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"),
+            banded,
             caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
             "the rig tells, also where the state itself was not measured",
-        )  # fmt: skip
+        )
     labels = list(dict.fromkeys(row.state for row in states))
     series = {
         way: [
-            next((100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
-                 float("nan"))
+            next(
+                (100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
+                float("nan"),
+            )
             for label in labels
         ]
         for way in evaluation.WAYS
-    }  # fmt: skip
+    }
     plot = figures.bars("median error of a state's blood", labels, series, unit="%")
     return body + f"<div class='plots'>{plot}</div>"
 
@@ -243,10 +293,15 @@ def errors_by_band(
             relative = (found - real) / real
             held = np.abs(found - real) <= blend.stderr[inside]
             rows.append(
-                (state, melanin_band(low, high), int(inside.sum()),
-                 100 * float(np.median(np.abs(relative))), 100 * float(np.median(relative)),
-                 100 * float(np.mean(held)))
-            )  # fmt: skip
+                (
+                    state,
+                    melanin_band(low, high),
+                    int(inside.sum()),
+                    100 * float(np.median(np.abs(relative))),
+                    100 * float(np.median(relative)),
+                    100 * float(np.mean(held)),
+                )
+            )
     return rows
 
 
@@ -266,6 +321,6 @@ def _mean(skin_map: SkinMap | None) -> float:
     return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -62,9 +62,10 @@ def section(folder: Path, checks: list[page.Check]) -> str:
     body += _pictures(folder)
     if document.get("assumed"):
         body += "<h3>Assumed</h3>" + page.table(
-            ("assumption",), [[t] for t in document["assumed"]],
+            ("assumption",),
+            [[t] for t in document["assumed"]],
             caption="Taken for granted, not measured",
-        )  # fmt: skip
+        )
     return body
 
 
@@ -79,32 +80,45 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
     checks.append(
         page.Check(
             f"{name}: luminance of held-out photographs, median error on lit pixels",
-            100 * full["median"], 100 * document["limit"], "<=", "%",
+            100 * full["median"],
+            100 * document["limit"],
+            "<=",
+            "%",
             f"noise alone makes {100 * full['noise']:.2f} %",
         )
-    )  # fmt: skip
+    )
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
     rows = {FULL: full, **kinds, **document["ablation"]}
     body = page.table(
-        ("model", "photographs", "median error, %", "68 % below, %", "95 % below, %", "bias, %",
-         "all skin, %", "SSIM"),
+        (
+            "model",
+            "photographs",
+            "median error, %",
+            "68 % below, %",
+            "95 % below, %",
+            "bias, %",
+            "all skin, %",
+            "SSIM",
+        ),
         [
             (
-                label, row["pairs"],
+                label,
+                row["pairs"],
                 *(100 * row[key] for key in ("median", "p68", "p95", "bias", "total_error")),
                 row["ssim"],
             )
             for label, row in rows.items()
         ],
         caption="Luminance of photographs that no fit has seen; parts of the model left out",
-    )  # fmt: skip
+    )
     bands = [
         (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
     ]
     return body + page.table(
-        ("skin", "pixels", "median error, %"), bands,
+        ("skin", "pixels", "median error, %"),
+        bands,
         caption="The full model by skin color, from the individual typology angle",
-    )  # fmt: skip
+    )
 
 
 def _data_set(one: Mapping[str, Any]) -> str:

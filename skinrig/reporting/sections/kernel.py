@@ -14,8 +14,13 @@ from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
 _ALPHA_AND_SIGMA = (
-    "alpha", "alpha_stderr", "alpha_95", "sigma_um", "sigma_stderr_um", "sigma_95_um",
-)  # fmt: skip
+    "alpha",
+    "alpha_stderr",
+    "alpha_95",
+    "sigma_um",
+    "sigma_stderr_um",
+    "sigma_95_um",
+)
 
 
 def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
@@ -38,10 +43,15 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
     if judged:
         worst = max(judged, key=lambda fit: fit["distance"] / fit["distance_before"])
         checks.append(
-            page.Check(f"{name}: histogram distance after the kernel over that before, worst state",
-                       worst["distance"] / worst["distance_before"], evaluation.DISTANCE_LIMIT,
-                       "<=", "", worst=state_words(worst["name"]))
-        )  # fmt: skip
+            page.Check(
+                f"{name}: histogram distance after the kernel over that before, worst state",
+                worst["distance"] / worst["distance_before"],
+                evaluation.DISTANCE_LIMIT,
+                "<=",
+                "",
+                worst=state_words(worst["name"]),
+            )
+        )
     untold = [state_words(fit["name"]) for fit in fits if fit["valid"] and not _told(fit)]
     note = (
         page.note(
@@ -52,23 +62,42 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
         if untold
         else ""
     )
-    body = "<h3>Convolution kernels</h3>" + note + page.table(
-        ("state", "r", "alpha", "standard error", "95 % half width", "sigma, um",
-         "standard error, um", "95 % half width, um", "distance before", "after",
-         "other skin of this size", "nearly as good", "fitted"),
-        [
+    body = (
+        "<h3>Convolution kernels</h3>"
+        + note
+        + page.table(
             (
-                state_words(fit["name"]), fit["stretch_s"],
-                *(_value(fit.get(key)) for key in _ALPHA_AND_SIGMA),
-                _value(fit["distance_before"]), _value(fit["distance"]),
-                _value(fit.get("noise_floor")), fit.get("near_best_count", 0),
-                "yes" if fit["valid"] else "no",
-            )
-            for fit in fits
-        ],
-        caption="Kernels fitted to histograms of normals; distances before and after the kernel. "
-        "Errors of kernels are not Gaussian: 95 % half widths are not 1.96 standard errors",
-    )  # fmt: skip
+                "state",
+                "r",
+                "alpha",
+                "standard error",
+                "95 % half width",
+                "sigma, um",
+                "standard error, um",
+                "95 % half width, um",
+                "distance before",
+                "after",
+                "other skin of this size",
+                "nearly as good",
+                "fitted",
+            ),
+            [
+                (
+                    state_words(fit["name"]),
+                    fit["stretch_s"],
+                    *(_value(fit.get(key)) for key in _ALPHA_AND_SIGMA),
+                    _value(fit["distance_before"]),
+                    _value(fit["distance"]),
+                    _value(fit.get("noise_floor")),
+                    fit.get("near_best_count", 0),
+                    "yes" if fit["valid"] else "no",
+                )
+                for fit in fits
+            ],
+            caption="Kernels fitted to histograms of normals; distances before and after the kernel. "
+            "Kernel errors are not Gaussian: 95 % half widths are not 1.96 standard errors",
+        )
+    )
     plots = ""
     for key, error, title in (
         ("alpha", "alpha_stderr", "kernel strength alpha"),
@@ -93,9 +122,13 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
         for table in document.get("tables", []):
             line = table["lines"]
             series.append(
-                figures.Curve(f"lines, {table['name']}", line["stretch"],
-                              [_value(v) for v in line[key]], marks=False)
-            )  # fmt: skip
+                figures.Curve(
+                    f"lines, {table['name']}",
+                    line["stretch"],
+                    [_value(v) for v in line[key]],
+                    marks=False,
+                )
+            )
         if series:
             plots += figures.curves(title, "stretch ratio r of the skin", title, series)
     return body + f"<div class='plots'>{plots}</div>" + _direction(document.get("direction"))
@@ -107,10 +140,14 @@ def _direction(found: Mapping[str, Any] | None) -> str:
     rows = [
         (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
         for angle, alpha, alpha_error, sigma, sigma_error in zip(
-            found["angle_deg"], found["alpha_offset"], found["alpha_stderr"],
-            found["sigma_offset_um"], found["sigma_stderr_um"], strict=True,
+            found["angle_deg"],
+            found["alpha_offset"],
+            found["alpha_stderr"],
+            found["sigma_offset_um"],
+            found["sigma_stderr_um"],
+            strict=True,
         )
-    ]  # fmt: skip
+    ]
     return (
         "<h3>Kernels by the direction of stretch, less one table of all</h3>"
         + page.table(

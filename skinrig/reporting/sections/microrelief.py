@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
+from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import map_images as map_pictures
@@ -103,9 +103,14 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
         if truth is not None:
             relief = evaluation.true_relief(appearance, truth, state)
         body += map_pictures.map_panel(
-            f"height, {state_words(state)}", "um", estimate=height.values,
-            standard_error=height.stderr, truth=relief, valid=_valid(height), width=280,
-        )  # fmt: skip
+            f"height, {state_words(state)}",
+            "um",
+            estimate=height.values,
+            standard_error=height.stderr,
+            truth=relief,
+            valid=_valid(height),
+            width=280,
+        )
     return body
 
 
@@ -117,9 +122,15 @@ def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
     heights = [m.values[_valid(m)] for k, m in appearance.maps.items() if k.startswith("height_a")]
     reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
     return map_pictures.scalar_picture(
-        title, skin_map.values, low=-reach, high=reach, scale="RdBu_r", valid=_valid(skin_map),
-        unit="um", width=WIDTH_PX,
-    )  # fmt: skip
+        title,
+        skin_map.values,
+        low=-reach,
+        high=reach,
+        scale="RdBu_r",
+        valid=_valid(skin_map),
+        unit="um",
+        width=WIDTH_PX,
+    )
 
 
 def _normal_picture(title: str, skin_map: SkinMap, state: str) -> str:
@@ -128,13 +139,17 @@ def _normal_picture(title: str, skin_map: SkinMap, state: str) -> str:
     )
 
 
-def _angle_picture(
-    title: str, degrees: NDArray[np.floating], valid: NDArray[np.bool_], state: str
-) -> str:
+def _angle_picture(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> str:
     return map_pictures.scalar_picture(
-        title, degrees, low=0.0, high=map_pictures.reach_of(degrees, valid, 98), scale="magma",
-        valid=valid, unit="°", of=f"normals, {state_words(state)}",
-    )  # fmt: skip
+        title,
+        degrees,
+        low=0.0,
+        high=map_pictures.reach_of(degrees, valid, 98),
+        scale="magma",
+        valid=valid,
+        unit="°",
+        of=f"normals, {state_words(state)}",
+    )
 
 
 def _relief_errors(
@@ -147,11 +162,19 @@ def _relief_errors(
     where, worst_got = _worst(rows)
     for row in neutral:
         checks.append(
-            page.Check(f"{name}: specular normals at the lens's resolution, mean error",
-                       row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", state_words(row.state),
-                       masked=row.masked, coverage=row.coverage, worst=where,
-                       worst_got=worst_got)
-        )  # fmt: skip
+            page.Check(
+                f"{name}: specular normals at the lens's resolution, mean error",
+                row.mean_deg,
+                evaluation.NORMAL_LIMIT_DEG,
+                "<=",
+                "°",
+                state_words(row.state),
+                masked=row.masked,
+                coverage=row.coverage,
+                worst=where,
+                worst_got=worst_got,
+            )
+        )
     note = (
         "<p class='note'>Errors are told at the lens's resolution; the unblurred truth has detail "
         "that this aperture does not show. Heights have the lens's blur undone and are told "
@@ -160,21 +183,44 @@ def _relief_errors(
         "corrected, and standard errors, which know noise alone, are then too small.</p>"
     )
     note += page.one_skin(truth.parameters)
-    return "<h3>Errors of normals and height</h3>" + note + page.table(
-        ("state", "pixels", "masked, %", "mean error, °", "median, °", "68 % interval",
-         "unblurred truth, °", "median standard error, °", "68 % coverage, %", "height rms, um",
-         "relief rms, um", "of relief, %"),
-        [
+    return (
+        "<h3>Errors of normals and height</h3>"
+        + note
+        + page.table(
             (
-                state_words(row.state), row.pixels, 100 * row.masked, row.mean_deg, row.median_deg,
-                f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}", row.unblurred_deg,
-                row.stderr_deg, 100 * row.coverage, row.height_um, row.relief_um,
-                100 * row.height_relative,
-            )
-            for row in rows
-        ],
-        caption="Every state against its truth; angles of normals in degrees",
-    )  # fmt: skip
+                "state",
+                "pixels",
+                "masked, %",
+                "mean error, °",
+                "median, °",
+                "68 % interval",
+                "unblurred truth, °",
+                "median standard error, °",
+                "68 % coverage, %",
+                "height rms, um",
+                "relief rms, um",
+                "of relief, %",
+            ),
+            [
+                (
+                    state_words(row.state),
+                    row.pixels,
+                    100 * row.masked,
+                    row.mean_deg,
+                    row.median_deg,
+                    f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}",
+                    row.unblurred_deg,
+                    row.stderr_deg,
+                    100 * row.coverage,
+                    row.height_um,
+                    row.relief_um,
+                    100 * row.height_relative,
+                )
+                for row in rows
+            ],
+            caption="Every state against its truth; angles of normals in degrees",
+        )
+    )
 
 
 def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
@@ -200,28 +246,52 @@ def _strain(
     if true:
         worst = max(true.values(), key=lambda row: abs(row.error))
         checks.append(
-            page.Check(f"{name}: stretch of the skin, largest error", abs(worst.error),
-                       evaluation.STRAIN_LIMIT, "<=", "", worst=state_words(worst.state))
-        )  # fmt: skip
+            page.Check(
+                f"{name}: stretch of the skin, largest error",
+                abs(worst.error),
+                evaluation.STRAIN_LIMIT,
+                "<=",
+                "",
+                worst=state_words(worst.state),
+            )
+        )
     rows = [
         (
-            state_words(state["name"]), _value(state["reading_mm"]), _value(state["force_n"]),
-            _value(state["reading_ratio"]), _value(state["stretch_s"]),
+            state_words(state["name"]),
+            _value(state["reading_mm"]),
+            _value(state["force_n"]),
+            _value(state["reading_ratio"]),
+            _value(state["stretch_s"]),
             round(_value(state["stretch_s_stderr"]), 6),
             true[state["name"]].truth if state["name"] in true else math.nan,
-            round(_value(state["slip"]), 6), _value(state["stretch_t"]),
+            round(_value(state["slip"]), 6),
+            _value(state["stretch_t"]),
             round(math.degrees(_value(state["shear_rad"])), 4),
             round(math.degrees(_value(state["rotation_rad"])), 4),
-            state["windows"], "yes" if state["valid"] else "no",
+            state["windows"],
+            "yes" if state["valid"] else "no",
         )
         for state in document["states"]
-    ]  # fmt: skip
+    ]
     return "<h3>Strain of the skin, from its pigment</h3>" + page.table(
-        ("state", "jaws, mm", "force, N", "caliper's ratio", "skin's r", "standard error", "true r",
-         "slip", "r across", "shear, °", "rotation, °", "windows", "measured"),
+        (
+            "state",
+            "jaws, mm",
+            "force, N",
+            "caliper's ratio",
+            "skin's r",
+            "standard error",
+            "true r",
+            "slip",
+            "r across",
+            "shear, °",
+            "rotation, °",
+            "windows",
+            "measured",
+        ),
         rows,
         caption="Stretch ratio r of the skin between the jaws, and what the caliper reads",
-    )  # fmt: skip
+    )
 
 
 def _histograms(appearance: SkinAppearance) -> str:
@@ -239,9 +309,14 @@ def _histograms(appearance: SkinAppearance) -> str:
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
         panels += map_pictures.scalar_picture(
-            state_words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX,
+            state_words(state["name"]),
+            shown,
+            low=0.0,
+            high=top,
+            scale="magma",
+            width=WIDTH_PX,
             of="histogram of normals",
-        )  # fmt: skip
+        )
     aliased = [state_words(state["name"]) for state in states if state["aliased"]]
     note = (
         page.note(
@@ -263,11 +338,13 @@ def _variances(appearance: SkinAppearance) -> str:
         return ""
     series = [
         figures.Curve(
-            f"jaws at {angle:.0f}°", [row[0] for row in rows], [row[2] for row in rows],
+            f"jaws at {angle:.0f}°",
+            [row[0] for row in rows],
+            [row[2] for row in rows],
             [row[3] for row in rows],
         )
         for angle, rows in by_angle.items()
-    ]  # fmt: skip
+    ]
     plot = figures.curves(
         "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
     )
@@ -283,6 +360,6 @@ def _value(value: object) -> float:
     return math.nan if value is None else float(str(value))
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

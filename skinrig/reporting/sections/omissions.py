@@ -81,10 +81,12 @@ def section(sessions: Sequence[Path]) -> str:
 def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     over, switch = effect.get("over_noise"), str(effect.get("switch", ""))
     return (
-        str(effect["name"]), WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
-        str(effect["reason"]), "" if over is None else f"{over:.3g}",
+        str(effect["name"]),
+        WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
+        str(effect["reason"]),
+        "" if over is None else f"{over:.3g}",
         switch if may_be_left_out(switch) else "",
-    )  # fmt: skip
+    )
 
 
 def _place(words: str) -> int:

@@ -60,10 +60,7 @@ def section(
     for c, channel in enumerate(CHANNELS):
         row: list[object] = ["published (Weyrich et al. 2005, table 2)", channel]
         for s in range(len(published.sites)):
-            row += [
-                float(published.mean_per_mm[s, c]),
-                float(published.deviation_per_mm[s, c]),
-            ]
+            row += [float(published.mean_per_mm[s, c]), float(published.deviation_per_mm[s, c])]
         rows.append(tuple(row))
     rows += _rows(f"simulated, {PEOPLE} people drawn from it", drawn, published.sites)
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]

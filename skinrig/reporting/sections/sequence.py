@@ -47,10 +47,15 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> str:
         values = 100.0 * np.array([_number(v) for v in one["hemoglobin"]])
         errors = 100.0 * np.array([_number(v) for v in one["stderr"]])
         curves.append(
-            figures.Curve(place, when[order].tolist(), values[order].tolist(),
-                          errors[order].tolist(), line=cycle_s is None,
-                          color=COLORS[number % len(COLORS)])
-        )  # fmt: skip
+            figures.Curve(
+                place,
+                when[order].tolist(),
+                values[order].tolist(),
+                errors[order].tolist(),
+                line=cycle_s is None,
+                color=COLORS[number % len(COLORS)],
+            )
+        )
     plot = figures.curves(
         f"blood in {told['state']}", axis, "blood, % of the dermis' volume", curves
     )
@@ -65,17 +70,26 @@ def _table(told: Mapping[str, Any]) -> str:
         repeat = repeats.get(place)
         rows.append(
             (
-                place, 100 * _number(fit["start"]), 100 * _number(fit["end"]), fit["text"],
+                place,
+                100 * _number(fit["start"]),
+                100 * _number(fit["end"]),
+                fit["text"],
                 "" if seen is None else _words(seen),
                 float("nan") if repeat is None else 100 * _number(repeat["sd"]),
             )
-        )  # fmt: skip
+        )
     body = page.table(
-        ("place", "level at the start, %", "at the end, %", "time constant", "transition seen",
-         "between cycles, points"),
+        (
+            "place",
+            "level at the start, %",
+            "at the end, %",
+            "time constant",
+            "transition seen",
+            "between cycles, points",
+        ),
         rows,
         caption="Levels and time constants by place; points are percent of the dermis' volume",
-    )  # fmt: skip
+    )
     together = page.escape(told["fit_of_all"]["text"])
     return body + f"<p class='note'>Time constant, all places together: {together}.</p>"
 

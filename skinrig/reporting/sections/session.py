@@ -47,9 +47,16 @@ def section(sessions: Mapping[str, SessionFacts]) -> str:
     return "<h2>Sessions</h2>" + page.table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
         [
-            (name, one.rig, one.day.isoformat(), one.source,
-             "" if one.seed is None else one.seed, one.frames, one.megabytes)
+            (
+                name,
+                one.rig,
+                one.day.isoformat(),
+                one.source,
+                "" if one.seed is None else one.seed,
+                one.frames,
+                one.megabytes,
+            )
             for name, one in sessions.items()
         ],
         caption="Frames on disk; `skinrig verify` checks every one of them",
-    )  # fmt: skip
+    )

@@ -77,21 +77,35 @@ def _plots(appearance: SkinAppearance) -> str:
             value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             value = np.where(np.asarray(one["valid"], bool), value, np.nan)
             series.append(
-                figures.Curve(f"{channel}, measured", radius, value.tolist(), stderr.tolist(),
-                              line=False, color=COLORS[channel])
-            )  # fmt: skip
+                figures.Curve(
+                    f"{channel}, measured",
+                    radius,
+                    value.tolist(),
+                    stderr.tolist(),
+                    line=False,
+                    color=COLORS[channel],
+                )
+            )
             for fit in [] if found is None else found["fits"]:
                 if fit["channel"] != channel or fit["method"] != evaluation.RECOMMENDED:
                     continue
                 predicted = numbers(fit["predicted_per_mm2"])
                 series.append(
-                    figures.Curve(f"{channel}, fit", radius, predicted.tolist(), marks=False,
-                                  color=COLORS[channel])
-                )  # fmt: skip
+                    figures.Curve(
+                        f"{channel}, fit",
+                        radius,
+                        predicted.tolist(),
+                        marks=False,
+                        color=COLORS[channel],
+                    )
+                )
         plots += figures.curves(
-            f"{_words(entry)}: profile and photon-table fit", "distance from the source, mm",
-            "reflectance, 1/mm²", series, log_y=True,
-        )  # fmt: skip
+            f"{_words(entry)}: profile and photon-table fit",
+            "distance from the source, mm",
+            "reflectance, 1/mm²",
+            series,
+            log_y=True,
+        )
         plots += _residuals(entry, found, radius)
     return f"<h3>Radial profiles</h3><div class='plots'>{plots}</div>"
 
@@ -109,15 +123,21 @@ def _residuals(
         if fit["channel"] == channel and fit["valid"]:
             left = 100.0 * np.where(told, value / numbers(fit["predicted_per_mm2"]) - 1.0, np.nan)
             series.append(
-                figures.Curve(METHOD_NAMES[fit["method"]], radius, left.tolist(),
-                              (100.0 * stderr / np.where(told, value, np.nan)).tolist())
-            )  # fmt: skip
+                figures.Curve(
+                    METHOD_NAMES[fit["method"]],
+                    radius,
+                    left.tolist(),
+                    (100.0 * stderr / np.where(told, value, np.nan)).tolist(),
+                )
+            )
     if not series:
         return ""
     return figures.curves(
-        f"{_words(entry)}, {channel}: measured less fitted", "distance from the source, mm",
-        "% of the fit", series,
-    )  # fmt: skip
+        f"{_words(entry)}, {channel}: measured less fitted",
+        "distance from the source, mm",
+        "% of the fit",
+        series,
+    )
 
 
 def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
@@ -136,20 +156,42 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
             low, high = numbers(fit["interval_per_mm"])
             rows.append(
                 (
-                    _words(entry), fit["channel"], METHOD_NAMES[fit["method"]], real, found,
-                    f"{low:.3g} – {high:.3g}", 100 * (found / real - 1),
-                    number(fit["sigma_a_per_mm"]), number(fit["sigma_s_prime_per_mm"]),
-                    number(fit["correlation"]), number(fit["chi2"]), fit["dof"],
-                    sum(fit["used"]), "yes" if fit["valid"] else fit["reason"] or "no",
+                    _words(entry),
+                    fit["channel"],
+                    METHOD_NAMES[fit["method"]],
+                    real,
+                    found,
+                    f"{low:.3g} – {high:.3g}",
+                    100 * (found / real - 1),
+                    number(fit["sigma_a_per_mm"]),
+                    number(fit["sigma_s_prime_per_mm"]),
+                    number(fit["correlation"]),
+                    number(fit["chi2"]),
+                    fit["dof"],
+                    sum(fit["used"]),
+                    "yes" if fit["valid"] else fit["reason"] or "no",
                 )
-            )  # fmt: skip
+            )
     table = page.table(
-        ("measurement", "channel", "method", "true sigma_tr, 1/mm", "sigma_tr", "68 % interval",
-         "error, %", "sigma_a", "sigma_s'", "their correlation", "chi²", "degrees of freedom",
-         "fibres", "valid"),
+        (
+            "measurement",
+            "channel",
+            "method",
+            "true sigma_tr, 1/mm",
+            "sigma_tr",
+            "68 % interval",
+            "error, %",
+            "sigma_a",
+            "sigma_s'",
+            "their correlation",
+            "chi²",
+            "degrees of freedom",
+            "fibres",
+            "valid",
+        ),
         rows,
         caption="Every fit, with what it says of itself",
-    )  # fmt: skip
+    )
     note = page.note(
         "1/sigma_tr is the translucency: the smallest sigma_tr is the most translucent skin. The "
         "true sigma_tr of layers is that of the homogeneous medium whose profile fits best."
@@ -166,15 +208,27 @@ def _errors(
         found = evaluation.by_method([row for row in rows if row.kind == kind])
         body += f"<h3>Error of sigma_tr against the truth, {page.escape(kind)} tissue</h3>"
         body += page.table(
-            ("method", "fits", "median |error|, %", "worst, %", "bias, %",
-             "68 % interval covers, %"),
+            (
+                "method",
+                "fits",
+                "median |error|, %",
+                "worst, %",
+                "bias, %",
+                "68 % interval covers, %",
+            ),
             [
-                (METHOD_NAMES[row.method], row.fits, 100 * row.median, 100 * row.worst,
-                 100 * row.bias, 100 * row.coverage)
+                (
+                    METHOD_NAMES[row.method],
+                    row.fits,
+                    100 * row.median,
+                    100 * row.worst,
+                    100 * row.bias,
+                    100 * row.coverage,
+                )
                 for row in found
             ],
             caption=f"By method, {kind} tissue",
-        )  # fmt: skip
+        )
         body += _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED), None)
         if kind == "homogeneous" and best is not None:
@@ -188,15 +242,27 @@ def _errors(
     profiles = evaluation.compare_profiles(appearance, truth)
     if profiles:
         body += "<h3>Profiles against the truth</h3>" + page.table(
-            ("measurement", "channel", "fibres", "median |error|, %", "worst, %",
-             "68 % interval covers, %"),
+            (
+                "measurement",
+                "channel",
+                "fibres",
+                "median |error|, %",
+                "worst, %",
+                "68 % interval covers, %",
+            ),
             [
-                (_words_of_name(row.name), row.channel, row.fibres, 100 * row.median,
-                 100 * row.worst, 100 * row.coverage)
+                (
+                    _words_of_name(row.name),
+                    row.channel,
+                    row.fibres,
+                    100 * row.median,
+                    100 * row.worst,
+                    100 * row.coverage,
+                )
                 for row in profiles
             ],
             caption="Over fibres whose signal is ten times its standard error",
-        )  # fmt: skip
+        )
     return body
 
 
@@ -219,20 +285,37 @@ def _anisotropy(appearance: SkinAppearance) -> str:
         return ""
     rows = [
         (
-            entry["site"], entry["repeat"], entry["channel"], entry["directions"],
-            number(entry["ratio"]), number(entry["ratio_stderr"]), number(entry["axis_deg"]),
-            number(entry["axis_stderr_deg"]), number(entry["p_value"]),
+            entry["site"],
+            entry["repeat"],
+            entry["channel"],
+            entry["directions"],
+            number(entry["ratio"]),
+            number(entry["ratio_stderr"]),
+            number(entry["axis_deg"]),
+            number(entry["axis_stderr_deg"]),
+            number(entry["p_value"]),
             number(entry["worst_direction_percent"]),
             "yes" if entry["valid"] else entry["reason"],
         )
         for entry in document["sites"]
-    ]  # fmt: skip
+    ]
     return "<h3>Dependence on direction</h3>" + page.table(
-        ("site", "repeat", "channel", "directions", "ratio", "standard error", "axis, °",
-         "standard error, °", "chance if isotropic", "one direction is off by up to, %", "valid"),
+        (
+            "site",
+            "repeat",
+            "channel",
+            "directions",
+            "ratio",
+            "standard error",
+            "axis, °",
+            "standard error, °",
+            "chance if isotropic",
+            "one direction is off by up to, %",
+            "valid",
+        ),
         rows,
         caption="sigma_tr along the long axis over that across it",
-    )  # fmt: skip
+    )
 
 
 def _sites(appearance: SkinAppearance) -> str:
@@ -240,17 +323,30 @@ def _sites(appearance: SkinAppearance) -> str:
     if fitted is None or not fitted.get("sites"):
         return ""
     rows = [
-        (entry["site"], entry["channel"], entry["measurements"],
-         number(entry["sigma_tr_per_mm"]), number(entry["sigma_tr_stderr"]),
-         number(entry["translucency_mm"]), number(entry["translucency_stderr_mm"]))
+        (
+            entry["site"],
+            entry["channel"],
+            entry["measurements"],
+            number(entry["sigma_tr_per_mm"]),
+            number(entry["sigma_tr_stderr"]),
+            number(entry["translucency_mm"]),
+            number(entry["translucency_stderr_mm"]),
+        )
         for entry in fitted["sites"]
-    ]  # fmt: skip
+    ]
     return "<h3>Sites</h3>" + page.table(
-        ("site", "channel", "measurements", "sigma_tr, 1/mm", "standard error",
-         "translucency, mm", "standard error"),
+        (
+            "site",
+            "channel",
+            "measurements",
+            "sigma_tr, 1/mm",
+            "standard error",
+            "translucency, mm",
+            "standard error",
+        ),
         rows,
         caption="Mean of each site's measurements; translucency is 1/sigma_tr",
-    )  # fmt: skip
+    )
 
 
 def _map(appearance: SkinAppearance) -> str:
@@ -265,15 +361,26 @@ def _map(appearance: SkinAppearance) -> str:
         if not inside.size:
             continue
         pictures += map_pictures.scalar_picture(
-            f"translucency, {channel}", values, low=float(inside.min()), high=float(inside.max()),
-            valid=found.valid, unit="mm", width=WIDTH_PX,
-        )  # fmt: skip
+            f"translucency, {channel}",
+            values,
+            low=float(inside.min()),
+            high=float(inside.max()),
+            valid=found.valid,
+            unit="mm",
+            width=WIDTH_PX,
+        )
         if found.stderr is not None:
             spread = found.stderr[..., c]
             pictures += map_pictures.scalar_picture(
-                "standard error", spread, low=0.0, high=float(spread.max()), scale="magma",
-                valid=found.valid, unit="mm", width=WIDTH_PX,
-            )  # fmt: skip
+                "standard error",
+                spread,
+                low=0.0,
+                high=float(spread.max()),
+                scale="magma",
+                valid=found.valid,
+                unit="mm",
+                width=WIDTH_PX,
+            )
     note = page.note(
         "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
         "them the error grows to what people differ by."

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.front_view import WIDTH_PX, FrontView
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.evaluating.surface_bands import Banded, errors_by_band
@@ -100,9 +101,7 @@ def _rank(key: str) -> tuple[int, str]:
     return (FIRST.index(key) if key in FIRST else len(FIRST), key)
 
 
-def _shown(
-    title: str, key: str, image: NDArray[np.float64], valid: NDArray[np.bool_], *, width: int
-) -> str:
+def _shown(title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int) -> str:
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
@@ -126,7 +125,7 @@ def _error(
     appearance: SkinAppearance,
     truth: SkinAppearance,
     pairs: evaluation.Match,
-    box: tuple[NDArray[np.floating], NDArray[np.floating]],
+    box: tuple[FloatArray, FloatArray],
     *,
     width: int,
 ) -> str:
@@ -137,13 +136,27 @@ def _error(
     reach = map_pictures.reach_of(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
         return map_pictures.scalar_picture(
-            "error", image, low=0.0, high=reach, scale="magma", valid=valid, unit="°", of=key,
+            "error",
+            image,
+            low=0.0,
+            high=reach,
+            scale="magma",
+            valid=valid,
+            unit="°",
+            of=key,
             width=width,
-        )  # fmt: skip
+        )
     return map_pictures.scalar_picture(
-        "estimate − truth", image, low=-reach, high=reach, scale="RdBu_r", valid=valid, unit="%",
-        of=key, width=width,
-    )  # fmt: skip
+        "estimate − truth",
+        image,
+        low=-reach,
+        high=reach,
+        scale="RdBu_r",
+        valid=valid,
+        unit="%",
+        of=key,
+        width=width,
+    )
 
 
 def _spread(
@@ -152,7 +165,7 @@ def _spread(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     view: FrontView,
-    good: NDArray[np.bool_],
+    good: BoolArray,
     *,
     width: int,
 ) -> str:
@@ -171,9 +184,16 @@ def _spread(
     image, valid = view.picture(stderr, valid=good)
     reach = map_pictures.reach_of(image, valid, 98)
     return map_pictures.scalar_picture(
-        _title("standard error", key), image, low=0.0, high=reach, scale="magma", valid=valid,
-        unit=unit, of=key, width=width,
-    )  # fmt: skip
+        _title("standard error", key),
+        image,
+        low=0.0,
+        high=reach,
+        scale="magma",
+        valid=valid,
+        unit=unit,
+        of=key,
+        width=width,
+    )
 
 
 def _errors(
@@ -194,10 +214,17 @@ def _errors(
         where, worst_got = _worst(row.name, banded)
         checks.append(
             page.Check(
-                f"{name}: {words(row.name)}, {what}", got, bound, "<=", unit,
-                masked=row.masked, coverage=row.coverage.share, worst=where, worst_got=worst_got,
+                f"{name}: {words(row.name)}, {what}",
+                got,
+                bound,
+                "<=",
+                unit,
+                masked=row.masked,
+                coverage=row.coverage.share,
+                worst=where,
+                worst_got=worst_got,
             )
-        )  # fmt: skip
+        )
     note = ""
     if coarse:
         note = (
@@ -206,25 +233,48 @@ def _errors(
             f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
             "</p>"
         )
-    return "<h3>Errors on the surface</h3>" + note + page.table(
-        ("map", "unit", "points", "masked, %", "mean |error|", "median", "68 % interval",
-         "95th percentile", "bias", "68 % coverage, %", "median standard error"),
-        [
+    return (
+        "<h3>Errors on the surface</h3>"
+        + note
+        + page.table(
             (
-                words(row.name), unit_sign(row.unit), row.points,
-                100 * row.masked, row.mean, row.median,
-                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}", row.high, row.bias,
-                100 * row.coverage.share, row.median_stderr,
-            )
-            for row in found
-        ],
-        caption="Texel by texel against the nearest true point; angles in degrees",
-    ) + page.table(
-        ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
-        [(words(row[0]), *row[1:]) for row in banded],
-        caption="By skin color: the individual typology angle of the true reflectance "
-        "(Chardon et al. 1991)",
-    )  # fmt: skip
+                "map",
+                "unit",
+                "points",
+                "masked, %",
+                "mean |error|",
+                "median",
+                "68 % interval",
+                "95th percentile",
+                "bias",
+                "68 % coverage, %",
+                "median standard error",
+            ),
+            [
+                (
+                    words(row.name),
+                    unit_sign(row.unit),
+                    row.points,
+                    100 * row.masked,
+                    row.mean,
+                    row.median,
+                    f"{row.interval[0]:.3g} – {row.interval[1]:.3g}",
+                    row.high,
+                    row.bias,
+                    100 * row.coverage.share,
+                    row.median_stderr,
+                )
+                for row in found
+            ],
+            caption="Texel by texel against the nearest true point; angles in degrees",
+        )
+        + page.table(
+            ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
+            [(words(row[0]), *row[1:]) for row in banded],
+            caption="By skin color: the individual typology angle of the true reflectance "
+            "(Chardon et al. 1991)",
+        )
+    )
 
 
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
@@ -256,10 +306,17 @@ def _reflection(
     low, high = held_out.interval
     body = "<h3>Reflection in directions that no light of the capture had</h3>" + page.table(
         ("points", "directions", "median error, %", "68 % interval", "in highlights, %"),
-        [(held_out.points, held_out.directions, 100 * held_out.median,
-          f"{100 * low:.3g} – {100 * high:.3g}", 100 * held_out.highlights)],
+        [
+            (
+                held_out.points,
+                held_out.directions,
+                100 * held_out.median,
+                f"{100 * low:.3g} – {100 * high:.3g}",
+                100 * held_out.highlights,
+            )
+        ],
         caption="Against the true reflection at points of the surface",
-    )  # fmt: skip
+    )
     figures = []
     for site, true_image, image in reflection.spheres(appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
@@ -271,6 +328,6 @@ def _reflection(
     return body
 
 
-def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+def _valid(skin_map: SkinMap) -> BoolArray:
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

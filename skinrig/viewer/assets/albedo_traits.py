@@ -16,18 +16,15 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skinrig.appearances import face_textures
+from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks
 from skinrig.traits import regions
 from skinrig.viewer.assets.reflectance import filled
 from skinrig.viewer.assets.traits import told_from_chance
 from skinrig.viewer.scene import SceneSource, Texture
-
-Float32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 SIZE: Final = 128
 """Most texels a side of a factor's map; the common map that edits are made on has no more detail
@@ -56,11 +53,11 @@ class AlbedoTraits:
     """
 
     names: tuple[str, ...]
-    log_factor: Float32
+    log_factor: Float32Array
     change: Mapping[str, float]
     between_error: Mapping[str, float]
 
-    def factor(self, amounts: Mapping[str, float]) -> Float32:
+    def factor(self, amounts: Mapping[str, float]) -> Float32Array:
         """Return the factor of the albedo under some traits, (H, W, 3), as the page computes it."""
         total = np.zeros(self.log_factor.shape[1:], np.float32)
         for i, name in enumerate(self.names):
@@ -106,11 +103,18 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     chart = face.chart(parts.frame)
     region = masks.feathered("face", parts.frame)
 
-    def log_factor(name: str, amount: float) -> Float32:
+    def log_factor(name: str, amount: float) -> Float32Array:
         found = editing_albedo.edit_albedo(
-            r_d, valid, chart, space, {name: amount}, region=region > 0.0, share=region,
-            iterations=ITERATIONS, rng=np.random.default_rng([0, names.index(name)]),
-        )  # fmt: skip
+            r_d,
+            valid,
+            chart,
+            space,
+            {name: amount},
+            region=region > 0.0,
+            share=region,
+            iterations=ITERATIONS,
+            rng=np.random.default_rng([0, names.index(name)]),
+        )
         return np.log(found.factor).astype(np.float32)
 
     layers, change, between = [], {}, {}
@@ -124,11 +128,11 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     return AlbedoTraits(names, np.stack(layers), change, between)
 
 
-def _coarse(values: Float32, valid: Bools) -> Float32:
+def _coarse(values: Float32Array, valid: BoolArray) -> Float32Array:
     return filled(values, valid, SIZE)
 
 
-def _refined(values: Float32, shape: tuple[int, ...]) -> Float32:
+def _refined(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
     """Return a map at more texels, linear between the centres, as the page samples it."""
     for axis, size in enumerate(shape[:2]):
         old = values.shape[axis]
@@ -140,5 +144,5 @@ def _refined(values: Float32, shape: tuple[int, ...]) -> Float32:
     return values
 
 
-def _rms(values: NDArray[np.floating]) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values.astype(np.float64)))))

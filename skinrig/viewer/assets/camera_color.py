@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skinrig.arrays import Float64Array
 
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
     from skinrig.viewer.scene import SceneSource
 
-Floats = NDArray[np.float64]
 
 COLOR: Final = "color"
 HASHED: Final = "calibration "
@@ -42,7 +42,7 @@ class CameraColor:
         False: nothing is known, and camera RGB is taken for linear sRGB.
     """
 
-    convert: Callable[[Floats], Floats]
+    convert: Callable[[Float64Array], Float64Array]
     told: str
     known: bool = True
 
@@ -97,7 +97,7 @@ def _calibrated(folder: Path) -> CameraColor:
     ]
     error = float(np.mean([one.mean_delta_e for one, _ in cameras]))
 
-    def convert(rgb: Floats) -> Floats:
+    def convert(rgb: Float64Array) -> Float64Array:
         # maps merge all cameras: so are their colors
         return np.asarray(
             np.mean([one.to_linear_srgb(rgb * white) for one, white in cameras], axis=0)

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import merl
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import NODES_D, NODES_H, NODES_PHI, BrdfBasis
+from skinrig.arrays import Float32Array, Float64Array
 
-FloatArray = NDArray[np.float64]
 Form = Literal["table", "factors", "log factors"]
 
 SLABS: Final = (1, 2, 3, 4, 6, 12)
@@ -63,7 +62,7 @@ class CompactBrdf:
 
     form: Form
     detail: int
-    table: FloatArray
+    table: Float64Array
     numbers: int
     lookups: int
     rms_error: float
@@ -123,7 +122,7 @@ def chosen(lobes: BrdfBasis, bound: float = GOOD_ENOUGH) -> CompactBrdf:
     return found
 
 
-def in_slabs(table: FloatArray, slabs: int) -> FloatArray:
+def in_slabs(table: Float64Array, slabs: int) -> Float64Array:
     """Return (32, 12, 90, K) with runs of phi_d nodes at their mean over the visible half-space."""
     if slabs not in SLABS:
         raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, SLABS))}")
@@ -136,7 +135,7 @@ def in_slabs(table: FloatArray, slabs: int) -> FloatArray:
     return np.broadcast_to(held, parts.shape).reshape(table.shape)
 
 
-def atlas(found: CompactBrdf) -> NDArray[np.float32]:
+def atlas(found: CompactBrdf) -> Float32Array:
     """Return a table as an image for one bilinear look-up, (G * slabs * 32, 90, 4).
 
     Group g of four lobes, slab s, node i of theta_d is row (g * slabs + s) * 32 + i, theta_h goes
@@ -153,7 +152,7 @@ def atlas(found: CompactBrdf) -> NDArray[np.float32]:
 
 
 def _judged(
-    form: Form, detail: int, back: FloatArray, numbers: int, lookups: int, table: FloatArray
+    form: Form, detail: int, back: Float64Array, numbers: int, lookups: int, table: Float64Array
 ) -> CompactBrdf:
     weight = (_solid_weight() * _cosines())[..., None]
     axes = (0, 1, 2)
@@ -170,7 +169,7 @@ def _judged(
     return CompactBrdf(form, detail, back, numbers, lookups, rms, worst)
 
 
-def _separated(one: FloatArray, weight: FloatArray, rank: int, form: str) -> FloatArray:
+def _separated(one: Float64Array, weight: Float64Array, rank: int, form: str) -> Float64Array:
     """Return (32, 12, 90) of a lobe's first products."""
     shape = (NODES_D * NODES_PHI, NODES_H)
     if form == "log factors":
@@ -184,13 +183,13 @@ def _separated(one: FloatArray, weight: FloatArray, rank: int, form: str) -> Flo
     return np.asarray(np.maximum(back, 0.0).reshape(one.shape))
 
 
-def _solid_weight() -> FloatArray:
+def _solid_weight() -> Float64Array:
     d, _, h = brdf_tables.nodes()
     solid = np.sin(2.0 * d)[:, None, None] * (np.sin(h) * np.gradient(h))
     return np.asarray(np.broadcast_to(solid, (NODES_D, NODES_PHI, NODES_H)))
 
 
-def _cosines() -> FloatArray:
+def _cosines() -> Float64Array:
     """Return the product of the cosines of light and view at the nodes, 0 below the horizon."""
     d, phi, h = np.meshgrid(*brdf_tables.nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)

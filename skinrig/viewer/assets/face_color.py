@@ -6,14 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
-
-
-Mask = NDArray[np.bool_]
-
+from skinrig.arrays import Float64Array
 
 RIG_SIZE: Final = 256
 """Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
@@ -37,9 +30,9 @@ class FaceColor:
         What could not be placed.
     """
 
-    melanin: Floats
-    hemoglobin: Floats
-    states: Mapping[str, Floats]
+    melanin: Float64Array
+    hemoglobin: Float64Array
+    states: Mapping[str, Float64Array]
     global_states: tuple[str, ...]
     facts: Mapping[str, Any]
     left_out: tuple[tuple[str, str], ...] = ()

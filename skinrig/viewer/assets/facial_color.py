@@ -12,9 +12,10 @@ from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.arrays import BoolArray, Float64Array
 from skinrig.viewer.assets import camera_color
 from skinrig.viewer.assets.camera_color import CameraColor
-from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor, Floats, Mask
+from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -116,7 +117,7 @@ def simulated(person: Subject, skin: FineSkin) -> FaceColor:
     )
 
 
-def stored_states(rig: HemoglobinRig) -> dict[str, Floats]:
+def stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
     """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
     layers = {}
     for name in (NEUTRAL, *rig.states):
@@ -133,7 +134,7 @@ def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
         if appearance is None or ALBEDO not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO]
-        valid: Mask = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
+        valid: BoolArray = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
         if found.valid is not None:
             valid = valid & found.valid
         values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)

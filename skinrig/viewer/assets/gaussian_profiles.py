@@ -16,13 +16,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize, nnls
 from scipy.special import erf
 
 from model import dipole, fresnel
-
-FloatArray = NDArray[np.float64]
+from skinrig.arrays import Float64Array
 
 COUNT: Final = 4
 """Spread an edge of light within 0.1 % (three: 0.4 %; six: 0.01 %) and are two passes each."""
@@ -51,12 +50,12 @@ class GaussianProfile:
         RMS difference of the profiles over the plane's rings, over the profile's own.
     """
 
-    variances_mm2: FloatArray
-    weights: FloatArray
-    edge_error: FloatArray
-    radial_error: FloatArray
+    variances_mm2: Float64Array
+    weights: Float64Array
+    edge_error: Float64Array
+    radial_error: Float64Array
 
-    def edge(self, distance_mm: ArrayLike) -> FloatArray:
+    def edge(self, distance_mm: ArrayLike) -> Float64Array:
         """Return the light at distances from an edge, (..., 3): lit where the distance is > 0.
 
         Examples
@@ -69,11 +68,7 @@ class GaussianProfile:
 
 
 def fit(
-    r_d: ArrayLike,
-    sigma_tr_per_mm: ArrayLike,
-    *,
-    eta: float = fresnel.ETA_SKIN,
-    count: int = COUNT,
+    r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, *, eta: float = fresnel.ETA_SKIN, count: int = COUNT
 ) -> GaussianProfile:
     """Fit Gaussians to the dipoles of three channels.
 
@@ -118,11 +113,11 @@ def fit(
     lines = np.stack([_edge_of(radii, one, at) for one in profiles.T], axis=-1)
     middle = 1.0 / float(np.median(transport))
 
-    def variances(place: FloatArray) -> FloatArray:
+    def variances(place: Float64Array) -> Float64Array:
         narrow, step = place
         return np.asarray(np.exp(2.0 * (narrow + np.arange(count) * abs(step))))
 
-    def off(place: FloatArray) -> float:
+    def off(place: Float64Array) -> float:
         bases = _edges(variances(place), at)
         return float(np.sum((bases @ _weights(bases, lines) - lines) ** 2))
 
@@ -143,8 +138,8 @@ def fit(
 
 
 def _dipoles(
-    albedo: FloatArray, transport: FloatArray, eta: float
-) -> tuple[FloatArray, FloatArray]:
+    albedo: Float64Array, transport: Float64Array, eta: float
+) -> tuple[Float64Array, Float64Array]:
     """Return radii, mm, and the normalized profiles at them, (n, 3), 1/mm^2."""
     sigma_a, sigma_s = dipole.coefficients(dipole.invert_to_deficit(albedo, eta), transport)
     radii = np.geomspace(1e-4 / transport.max(), _FAR / transport.min(), _NODES)
@@ -152,7 +147,7 @@ def _dipoles(
     return radii, values / albedo
 
 
-def _edge_of(radii: FloatArray, profile: FloatArray, at: FloatArray) -> FloatArray:
+def _edge_of(radii: Float64Array, profile: Float64Array, at: Float64Array) -> Float64Array:
     """Return how a radial profile spreads an edge: the share of it within half-planes.
 
     Of a ring of radius r, the share on the dark side of a line at distance x < r is
@@ -166,15 +161,15 @@ def _edge_of(radii: FloatArray, profile: FloatArray, at: FloatArray) -> FloatArr
     return np.asarray(1.0 - dark @ mass)
 
 
-def _edges(variances: FloatArray, at: FloatArray) -> FloatArray:
+def _edges(variances: Float64Array, at: Float64Array) -> Float64Array:
     return np.asarray(0.5 + 0.5 * erf(at[:, None] / np.sqrt(2.0 * variances)))
 
 
-def _gaussians(variances: FloatArray, radii: FloatArray) -> FloatArray:
+def _gaussians(variances: Float64Array, radii: Float64Array) -> Float64Array:
     return np.exp(-(radii[:, None] ** 2) / (2.0 * variances)) / (2.0 * np.pi * variances)
 
 
-def _weights(bases: FloatArray, wanted: FloatArray) -> FloatArray:
+def _weights(bases: Float64Array, wanted: Float64Array) -> Float64Array:
     """Return weights of at least 0 that add up to 1, (G, 3)."""
     firm = 1e3  # a row that holds the sum at 1
     rows = np.vstack([bases, np.full((1, bases.shape[1]), firm)])

@@ -10,8 +10,9 @@ from model.facial_color.coarse_maps import fitting
 from model.facial_color.document import DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import placing
-from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor, Floats
+from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 
@@ -72,7 +73,7 @@ def placed(source: SceneSource, subject: Subject) -> FaceColor:
         left_out.append(("melanin of this face", "no map of it is in the folder; simulated"))
         melanin = FineSkin(subject, size).melanin()
     cells = fitting((size, size), RIG_SIZE)
-    states: dict[str, Floats] = {}
+    states: dict[str, Float64Array] = {}
     for name in (NEUTRAL, *rig.states):
         held = rig.neutral_mean_valid if name == NEUTRAL else rig.states[name].valid
         pair = []

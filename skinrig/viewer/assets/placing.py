@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from reconstruction.correspondence import landmark_field
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Points2 = Mapping[str, tuple[float, float]]
 Points3 = Mapping[str, tuple[float, float, float]]
 
@@ -50,12 +48,12 @@ class Placement:
         How many were used.
     """
 
-    pixel: Floats
-    seen: Mask
+    pixel: Float64Array
+    seen: BoolArray
     leave_one_out_px: float
     landmarks: int
 
-    def sampled(self, values: NDArray[np.floating], valid: Mask) -> tuple[Floats, Mask]:
+    def sampled(self, values: FloatArray, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
         """Return a map of the picture in the texture, (N, N), and where it is known.
 
         Parameters
@@ -74,9 +72,9 @@ class Placement:
 
 
 def place(
-    position_mm: NDArray[np.floating],
-    normal: NDArray[np.floating],
-    covered: Mask,
+    position_mm: FloatArray,
+    normal: FloatArray,
+    covered: BoolArray,
     *,
     landmarks_mm: Points3,
     landmarks_px: Points2,
@@ -132,15 +130,15 @@ def place(
 
 
 def _on_nodes(
-    field: landmark_field.LandmarkField, low: Floats, shape: tuple[int, int]
-) -> tuple[Floats, Floats]:
+    field: landmark_field.LandmarkField, low: Float64Array, shape: tuple[int, int]
+) -> tuple[Float64Array, Float64Array]:
     shifted = landmark_field.fit(
         field.points_px - low, field.moved_px - low, stderr_px=field.stderr_px
     )
     return shifted.on_grid(shape)
 
 
-def _camera(solid: Floats, flat: Floats) -> Floats:
+def _camera(solid: Float64Array, flat: Float64Array) -> Float64Array:
     """Return the projective camera (3, 4) through points, by the normalized linear method."""
     middle, size = solid.mean(axis=0), float(np.sqrt(solid.var(axis=0).sum()))
     center, spread = flat.mean(axis=0), float(np.sqrt(flat.var(axis=0).sum()))
@@ -149,12 +147,7 @@ def _camera(solid: Floats, flat: Floats) -> Floats:
     X = np.column_stack([(solid - middle) / size, np.ones(len(solid))])
     x = (flat - center) / spread
     zero = np.zeros_like(X)
-    rows = np.vstack(
-        [
-            np.hstack([X, zero, -x[:, :1] * X]),
-            np.hstack([zero, X, -x[:, 1:] * X]),
-        ]
-    )
+    rows = np.vstack([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:] * X])])
     _, values, vectors = np.linalg.svd(rows)
     if values[-2] < 1e-4 * values[0]:
         raise PlacingError("landmarks: lie in one plane, expected nose and ears among them")
@@ -168,12 +161,12 @@ def _camera(solid: Floats, flat: Floats) -> Floats:
     return np.asarray(full * np.sign(front))
 
 
-def _project(camera: Floats, points: Floats) -> Floats:
+def _project(camera: Float64Array, points: Float64Array) -> Float64Array:
     seen = np.column_stack([points, np.ones(len(points))]) @ camera.T
     return np.asarray(seen[:, :2] / np.where(seen[:, 2:] > 1e-12, seen[:, 2:], np.inf))
 
 
-def _center(camera: Floats) -> Floats:
+def _center(camera: Float64Array) -> Float64Array:
     """Return where the camera stands: what it maps to nothing."""
     _, _, vectors = np.linalg.svd(camera)
     far = vectors[-1]

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import color_table, skin_reflectance, spectra
 from model.brdf import tables as brdf_tables
@@ -21,13 +20,11 @@ from model.skin_reflectance import TRANSLUCENCY
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.viewer.assets import compact_brdf, gaussian_profiles
 from skinrig.viewer.assets.compact_brdf import LANES, CompactBrdf
 from skinrig.viewer.assets.gaussian_profiles import GaussianProfile
 from skinrig.viewer.scene import Assets, SceneSource, Texture
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 SHARES_SIZE: Final = 256
 """Most texels a side of the maps of shares; finer ones are averaged."""
@@ -65,8 +62,8 @@ class PageLobes:
     """
 
     lobes: BrdfBasis
-    shares: Float32
-    mix: Floats
+    shares: Float32Array
+    mix: Float64Array
     materials: tuple[str, ...]
     origin: Origin
 
@@ -119,7 +116,7 @@ def lobes_of(source: SceneSource) -> PageLobes:
     )
 
 
-def layers_of(shares: Float32) -> Float32:
+def layers_of(shares: Float32Array) -> Float32Array:
     """Return shares (H, W, K) as layers of four, (L, H, W, 4); what fills them up is 0."""
     height, width, count = shares.shape
     groups = -(-count // LANES)
@@ -129,7 +126,7 @@ def layers_of(shares: Float32) -> Float32:
     return np.ascontiguousarray(np.moveaxis(split, 2, 0))
 
 
-def rounded(values: Float32) -> Float32:
+def rounded(values: Float32Array) -> Float32Array:
     """Return numbers with `SHARE_BITS` binary digits, the nearest: a fit knows shares to percents.
 
     Examples
@@ -142,7 +139,7 @@ def rounded(values: Float32) -> Float32:
     return np.asarray(np.ldexp(np.rint(mantissa * steps) / steps, exponent), np.float32)
 
 
-def filled(values: Float32, valid: NDArray[np.bool_], most: int) -> Float32:
+def filled(values: Float32Array, valid: BoolArray, most: int) -> Float32Array:
     """Return (h, w, C) with values in texels that have none, no more than `most` a side.
 
     Parameters
@@ -165,7 +162,7 @@ def filled(values: Float32, valid: NDArray[np.bool_], most: int) -> Float32:
     return np.asarray(texture_fill.push_pull(held, kept).values, np.float32)
 
 
-def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32 | None, str]:
+def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | None, str]:
     """Return the profile at a face's mean, how much wider it is at each texel, and where from.
 
     Returns
@@ -199,7 +196,7 @@ def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32 | None, 
     return gaussian_profiles.fit(_typical_r_d(), 1.0 / mean_mm), None, told
 
 
-def _mean_albedo(appearance: SkinAppearance) -> Floats:
+def _mean_albedo(appearance: SkinAppearance) -> Float64Array:
     if "r_d" not in appearance.maps:
         return _typical_r_d()
     r_d = appearance.maps["r_d"]
@@ -209,7 +206,7 @@ def _mean_albedo(appearance: SkinAppearance) -> Floats:
     return np.asarray(np.clip(np.median(r_d.values[good].astype(np.float64), axis=0), 0.01, 0.98))
 
 
-def _typical_r_d() -> Floats:
+def _typical_r_d() -> Float64Array:
     table = color_table.build(spectra.LINEAR_SRGB, "D65", size=32, anisotropy=ANISOTROPY_SKIN)
     return np.asarray(table.lookup(*TYPICAL_CHROMOPHORES))
 
@@ -221,11 +218,11 @@ def _told(appearance: SkinAppearance) -> str:
     return skin_reflectance.population_mean_mm()[1]
 
 
-def _valid(one: SkinMap) -> NDArray[np.bool_]:
+def _valid(one: SkinMap) -> BoolArray:
     return np.ones(one.values.shape[:2], np.bool_) if one.valid is None else one.valid
 
 
-def _blocks(values: Float32, step: int) -> Float32:
+def _blocks(values: Float32Array, step: int) -> Float32Array:
     """Return means over blocks of `step` texels; what is beyond whole blocks is left out."""
     height, width = (size // step * step for size in values.shape[:2])
     cut = values[:height, :width]

@@ -17,17 +17,15 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.traits import TraitSpace, lobe_edits, reduced_spaces
 from model.traits import storage as trait_storage
 from model.traits.vectors import DOUBTFUL_P, TraitVector
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.assets.compact_brdf import LANES
 from skinrig.viewer.assets.reflectance import PageLobes
-
-Floats = NDArray[np.float64]
 
 SWEEPS: Final = 96
 """Of coordinate descent: after as many, errors stay within a few percent of a trait."""
@@ -63,13 +61,13 @@ class LobeTraits:
     """
 
     lobes: PageLobes
-    gram: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    pull: Mapping[str, NDArray[np.float32]]
+    gram: Float32Array
+    scale: Float32Array
+    pull: Mapping[str, Float32Array]
     misfit: Mapping[str, float]
     held_error: Mapping[str, tuple[float, float]]
 
-    def projected(self, shares: Floats, amounts: Mapping[str, float]) -> NDArray[np.float32]:
+    def projected(self, shares: Float64Array, amounts: Mapping[str, float]) -> Float32Array:
         """Return the shares under some traits as the page computes them.
 
         Least squares over shares of at least 0 by `SWEEPS` sweeps of coordinate descent, in
@@ -179,7 +177,7 @@ def surface_facts(traits: LobeTraits) -> dict[str, Any]:
     }
 
 
-def _some(shares: NDArray[np.float32]) -> Floats:
+def _some(shares: Float32Array) -> Float64Array:
     """Return at most `TRIED` texels with any share, evenly taken, (n, K)."""
     rows = shares.reshape(-1, shares.shape[-1]).astype(np.float64)
     rows = rows[rows.sum(axis=1) > 0.0]
@@ -188,7 +186,7 @@ def _some(shares: NDArray[np.float32]) -> Floats:
     return rows[:: -(-len(rows) // TRIED)]
 
 
-def _padded(rows: Floats, count: int) -> Floats:
+def _padded(rows: Float64Array, count: int) -> Float64Array:
     return np.pad(rows, ((0, 0), (0, count - rows.shape[1])))
 
 
@@ -196,7 +194,7 @@ def _length(space: TraitSpace, name: str) -> float:
     return float(reduced_spaces.lengths(space.trait(name).vector, space.metric))
 
 
-def _misfit(mix: Floats, space: TraitSpace, name: str) -> float:
+def _misfit(mix: Float64Array, space: TraitSpace, name: str) -> float:
     frame = reduced_spaces.framed(np.eye(mix.shape[1]), space.metric)
     vector = space.trait(name).vector @ frame
     z = np.linalg.lstsq((mix @ frame).T, vector, rcond=1e-10)[0]
@@ -204,7 +202,7 @@ def _misfit(mix: Floats, space: TraitSpace, name: str) -> float:
 
 
 def _held_error(
-    made: LobeTraits, rows: Floats, space: TraitSpace, name: str, amount: float = 1.0
+    made: LobeTraits, rows: Float64Array, space: TraitSpace, name: str, amount: float = 1.0
 ) -> float:
     page = made.projected(rows, {name: amount}).astype(np.float64) @ made.lobes.mix
     edited = lobe_edits.edit_weights(rows, made.lobes.mix, space, {name: amount})

@@ -10,19 +10,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.texture_resampling import resampled
 from model.wrinkles import Layer, decode, encode, mask_textures
 from model.wrinkles.evaluation import FILE, WrinkleModel
 from model.wrinkles.expressions import as_table
+from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 if TYPE_CHECKING:
     from rigsim.subject import Subject
 
-Float32 = NDArray[np.float32]
 
 MAP_PX: Final = 512
 """Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
@@ -80,20 +79,23 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSIONS}
     few = min(MASK_PX, size)
     zones = fit_zones(
-        amplitudes(neutral, posed, size=(few, few)), zones=ZONES,
+        amplitudes(neutral, posed, size=(few, few)),
+        zones=ZONES,
         rng=np.random.default_rng(subject.seed),
-    )  # fmt: skip
+    )
     # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
     coarse = (min(WEIGHTS_PX, size),) * 2
     rough = fit(
-        _coarser(neutral, coarse), {name: _coarser(n, coarse) for name, n in posed.items()},
-        zones.masks, size=coarse,
-    )  # fmt: skip
+        _coarser(neutral, coarse),
+        {name: _coarser(n, coarse) for name, n in posed.items()},
+        zones.masks,
+        size=coarse,
+    )
     table = as_table(rough.model().layers[0].table)
     return fit(neutral, posed, zones.masks, size=(size, size), table=table).model()
 
 
-def _coarser(normals: Float32, shape: tuple[int, int]) -> Float32:
+def _coarser(normals: Float32Array, shape: tuple[int, int]) -> Float32Array:
     planes = np.moveaxis(encode(normals, limit=None), 2, 0)
     return np.asarray(decode(np.moveaxis(resampled(planes, shape), 0, 2)), np.float32)
 
@@ -180,11 +182,11 @@ def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float
     return found
 
 
-def _level_rms(derivatives: NDArray[np.float64], count: int) -> list[float]:
+def _level_rms(derivatives: Float64Array, count: int) -> list[float]:
     """Return the rms at each level over so many texels of the finest; others are 0."""
     share = count / derivatives[..., 0].size
     found = []
-    planes: NDArray[np.floating[Any]] = np.moveaxis(derivatives, 2, 0)
+    planes: FloatArray = np.moveaxis(derivatives, 2, 0)
     while True:
         found.append(float(np.sqrt(np.mean(np.sum(planes**2, axis=0)) / share)))
         if min(planes.shape[1:]) == 1:
@@ -194,18 +196,15 @@ def _level_rms(derivatives: NDArray[np.float64], count: int) -> list[float]:
 
 def _map_shape(model: WrinkleModel) -> tuple[int, int]:
     shapes = [layer.wrinkle.shape for layer in model.layers]
-    return (
-        min(max(h for h, _, _ in shapes), MAP_PX),
-        min(max(w for _, w, _ in shapes), MAP_PX),
-    )
+    return (min(max(h for h, _, _ in shapes), MAP_PX), min(max(w for _, w, _ in shapes), MAP_PX))
 
 
-def _plane(wrinkle: Any, shape: tuple[int, int]) -> Float32:
+def _plane(wrinkle: Any, shape: tuple[int, int]) -> Float32Array:
     planes = resampled(np.moveaxis(np.asarray(wrinkle, np.float32), 2, 0), shape)
     return np.ascontiguousarray(np.moveaxis(planes, 0, 2))
 
 
-def _masks(layers: tuple[Layer, ...]) -> Float32:
+def _masks(layers: tuple[Layer, ...]) -> Float32Array:
     """Return two RGBA textures a layer, of one size."""
     side = max(max(layer.masks.shape[1:]) for layer in layers)
     out = []

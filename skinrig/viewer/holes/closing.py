@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from skinrig.arrays import Float64Array, FloatArray, Int64Array
 
 LARGEST_MM: Final = 200.0
 """Length of a loop that is closed, at most: an eye, a nostril, the underside of a chin."""
@@ -52,13 +51,13 @@ class Patch:
         Of the loop.
     """
 
-    rim: Ints
-    disc: Floats
-    faces: Ints
-    inner_mm: Floats
+    rim: Int64Array
+    disc: Float64Array
+    faces: Int64Array
+    inner_mm: Float64Array
     length_mm: float
 
-    def continued(self, values: Floats) -> Floats:
+    def continued(self, values: Float64Array) -> Float64Array:
         """Return values of the rim, (n, C), at rim and new vertices, (n + m, C): harmonic in it.
 
         None lies beyond those of the rim.
@@ -69,7 +68,7 @@ class Patch:
         return np.concatenate([values, splu(inner).solve(-(weights[n:, :n] @ values))])
 
 
-def patches(vertices_mm: NDArray[np.floating], faces: NDArray[np.integer]) -> list[Patch]:
+def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[Patch]:
     """Return what closes the holes of a mesh that are small, the longest loop first.
 
     Parameters
@@ -97,11 +96,11 @@ def patches(vertices_mm: NDArray[np.floating], faces: NDArray[np.integer]) -> li
     return [_patch(points, neighbors, loop, size) for size, loop in found[1:] if size <= most]
 
 
-def _edges(loop_mm: Floats) -> Floats:
+def _edges(loop_mm: Float64Array) -> Float64Array:
     return np.asarray(np.linalg.norm(np.roll(loop_mm, -1, axis=0) - loop_mm, axis=1))
 
 
-def _loops(faces: Ints) -> list[Ints]:
+def _loops(faces: Int64Array) -> list[Int64Array]:
     """Return loops of vertices around holes, in the direction in which a filling triangle turns."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
@@ -125,14 +124,16 @@ def _loops(faces: Ints) -> list[Ints]:
     return loops
 
 
-def _neighbors(faces: Ints, count: int) -> sparse.csr_matrix:
+def _neighbors(faces: Int64Array, count: int) -> sparse.csr_matrix:
     """Return the (V, V) pattern of edges."""
     i, j = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
     whole = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (count, count))
     return whole.tocsr()
 
 
-def _patch(points: Floats, neighbors: sparse.csr_matrix, loop: Ints, length: float) -> Patch:
+def _patch(
+    points: Float64Array, neighbors: sparse.csr_matrix, loop: Int64Array, length: float
+) -> Patch:
     disc, faces = _disc(len(loop), np.cumsum(_edges(points[loop])) / length)
     n, m = len(loop), len(disc) - len(loop)
     if m == 0:
@@ -152,7 +153,7 @@ def _patch(points: Floats, neighbors: sparse.csr_matrix, loop: Ints, length: flo
     return Patch(loop, disc, faces, whole[n : n + m].copy(), length)
 
 
-def _disc(count: int, way: Floats) -> tuple[Floats, Ints]:
+def _disc(count: int, way: Float64Array) -> tuple[Float64Array, Int64Array]:
     """Return points of the unit disc, the rim's first, and their triangles.
 
     Rings have as many points as their radius has of the rim's.
@@ -179,7 +180,7 @@ def _disc(count: int, way: Floats) -> tuple[Floats, Ints]:
     return disc, faces
 
 
-def _uniform(faces: Ints, count: int) -> sparse.csr_matrix:
+def _uniform(faces: Int64Array, count: int) -> sparse.csr_matrix:
     """Return the graph's Laplacian, (count, count)."""
     pattern = _neighbors(faces, count)
     pattern.data[:] = 1.0
@@ -187,7 +188,9 @@ def _uniform(faces: Ints, count: int) -> sparse.csr_matrix:
     return (sparse.diags(degree) - pattern).tocsr()
 
 
-def _smoothed(points: Floats, faces: Ints, around: Ints, n: int, m: int) -> Floats:
+def _smoothed(
+    points: Float64Array, faces: Int64Array, around: Int64Array, n: int, m: int
+) -> Float64Array:
     """Return the m inner points of the least bending energy; the others are held."""
     total = len(points)
     rows, columns, values = [], [], []

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.viewer.holes import closing as hole_closing
 from skinrig.viewer.holes.closing import Patch
 from skinrig.viewer.scene import Texture, ViewerScene
@@ -23,7 +24,6 @@ from skinrig.viewer.scene import Texture, ViewerScene
 if TYPE_CHECKING:
     from rigsim.geometry.mesh import Mesh
 
-Floats = NDArray[np.float64]
 
 CELLS: Final = 512
 """Side of the grid on which empty places are sought."""
@@ -51,9 +51,9 @@ class Chart:
     """
 
     patch: Patch
-    center: Floats
+    center: Float64Array
     radius: float
-    rim_uv: Floats
+    rim_uv: Float64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +153,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
     return ClosedMesh(joined, tuple(charts), tuple(open_mm))
 
 
-def _area(points: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
+def _area(points: FloatArray, faces: NDArray[np.integer]) -> float:
     a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
@@ -165,7 +165,7 @@ def _uv_per_mm(mesh: Mesh) -> float:
     return float(np.sqrt(in_texture / max(_area(mesh.vertices_mm, mesh.faces), 1e-9)))
 
 
-def _placed(taken: NDArray[np.bool_], radius: float) -> tuple[Floats, float] | None:
+def _placed(taken: BoolArray, radius: float) -> tuple[Float64Array, float] | None:
     """Return middle and radius of the emptiest place, smaller where it must be; None: no room."""
     far = ndimage.distance_transform_edt(np.pad(~taken, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(far)), far.shape)
@@ -176,13 +176,13 @@ def _placed(taken: NDArray[np.bool_], radius: float) -> tuple[Floats, float] | N
     return center, min(radius, most)
 
 
-def _take(taken: NDArray[np.bool_], center: Floats, radius: float) -> None:
+def _take(taken: BoolArray, center: Float64Array, radius: float) -> None:
     at = (np.arange(CELLS) + 0.5) / CELLS
     far2 = (at[None, :] - center[0]) ** 2 + (1.0 - at[:, None] - center[1]) ** 2
     taken[far2 <= (radius + 1.0 / CELLS) ** 2] = True
 
 
-def _paint(layer: NDArray[np.float32], chart: Chart) -> None:
+def _paint(layer: Float32Array, chart: Chart) -> None:
     """Draw a patch into a map (H, W, C), row 0 at the top, in place."""
     from scipy.interpolate import LinearNDInterpolator
 

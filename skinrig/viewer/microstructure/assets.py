@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
+from skinrig.arrays import Float64Array
 from skinrig.viewer.microstructure import relief_growth
 from skinrig.viewer.microstructure.micro_relief import (
     PATCH_PX,
@@ -33,9 +33,6 @@ from skinrig.viewer.microstructure.slope_variances import (
 )
 from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
 from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, ViewerScene
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 SAMPLE_PX: Final = 512
 """Side of the part of a displacement that its slopes are known from."""
@@ -145,7 +142,7 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
     )
 
 
-def reach_px(table: KernelTable, scale: Floats, virtual_px: int) -> int:
+def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     """Return how many pixels of the displacement a kernel reaches, and two for its samples.
 
     Parameters
@@ -216,7 +213,7 @@ def with_displacement(
     return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
-def px_per_mm(mesh: ViewerMesh) -> Floats:
+def px_per_mm(mesh: ViewerMesh) -> Float64Array:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
     from model.microstructure.mesh_strain import strain
 

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.microstructure import FOREHEAD, KernelTable
+from skinrig.arrays import BoolArray, Float32Array
 
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
 
-Float32 = NDArray[np.float32]
 
 PATCH_PX: Final = 256
 """Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
@@ -38,7 +37,7 @@ class MicroRelief:
         "measured" or "simulated", and from where; shown in the page.
     """
 
-    height_um: Float32
+    height_um: Float32Array
     pixel_um: float
     table: KernelTable = FOREHEAD
     source: str = "simulated"
@@ -71,7 +70,7 @@ def simulated_relief(seed: int, *, site: str = "forehead", pixel_um: float = 15.
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
 
 
-def largest_square(height: Float32, valid: NDArray[np.bool_]) -> Float32:
+def largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
     """Return the largest square without holes; the first one in reading order of several.
 
     Examples

@@ -32,10 +32,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-UInt32 = NDArray[np.uint32]
+from skinrig.arrays import Float32Array, Float64Array, Int64Array, UInt32Array
 
 LEVELS: Final = 4
 """Levels of a pyramid that can be grown: 0 (the patch's pixels) to LEVELS - 1."""
@@ -69,7 +67,7 @@ class GrownRelief:
         0 ... 2^32 - 1.
     """
 
-    patch: Float32
+    patch: Float32Array
     pixel_um: float
     cell_px: int
     seed: int
@@ -98,7 +96,7 @@ class GrownRelief:
         """Moves to choose from along each side."""
         return _choices(self.patch.shape[0], self.cell_px)
 
-    def level(self, level: int) -> Float32:
+    def level(self, level: int) -> Float32Array:
         """Return the patch's means over 2^level pixels a side, shape (P / 2^level,) * 2."""
         if not 0 <= level < LEVELS:
             raise ReliefGrowthError(f"level: got {level}, expected 0 to {LEVELS - 1}")
@@ -106,7 +104,9 @@ class GrownRelief:
         blocks = self.patch.reshape(side, 1 << level, side, 1 << level).astype(np.float64)
         return blocks.mean(axis=(1, 3)).astype(np.float32)
 
-    def window(self, top: int, left: int, shape: tuple[int, int], *, level: int = 0) -> Float32:
+    def window(
+        self, top: int, left: int, shape: tuple[int, int], *, level: int = 0
+    ) -> Float32Array:
         """Return heights, um, of a window of the grown relief.
 
         Parameters
@@ -138,9 +138,7 @@ class GrownRelief:
             total += weight * patch[y + (move_y >> level), x + (move_x >> level)]
         return total.astype(np.float32)
 
-    def _moves(
-        self, i: NDArray[np.int64], j: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _moves(self, i: Int64Array, j: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Return by how many pixels of level 0 the patch's places are from the relief's."""
         at_x, at_y = corner_px(i, j, self.cell_px)
         drawn = hashed(i, j, self.seed)
@@ -170,7 +168,7 @@ def largest_cell_px(side_px: int) -> int:
     return max(fits, default=0)
 
 
-def hashed(i: NDArray[np.int64], j: NDArray[np.int64], seed: int) -> UInt32:
+def hashed(i: Int64Array, j: Int64Array, seed: int) -> UInt32Array:
     """Return 32 mixed bits for lattice corners; integer arithmetic modulo 2^32 throughout.
 
     Examples
@@ -188,9 +186,7 @@ def hashed(i: NDArray[np.int64], j: NDArray[np.int64], seed: int) -> UInt32:
     return np.asarray(h, np.uint32)
 
 
-def corner_px(
-    i: NDArray[np.int64], j: NDArray[np.int64], cell_px: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def corner_px(i: Int64Array, j: Int64Array, cell_px: int) -> tuple[Int64Array, Int64Array]:
     """Return columns and rows of lattice corners, on whole steps of `STEP_PX`."""
     # half the cell a row to the side, and sqrt(3)/2 of it down; in integers: 14189 / 16384
     x = (2 * i + j) * cell_px // 2
@@ -199,8 +195,8 @@ def corner_px(
 
 
 def corners_at(
-    x: NDArray[np.int64], y: NDArray[np.int64], cell_px: int, level: int
-) -> tuple[list[tuple[NDArray[np.int64], NDArray[np.int64]]], list[NDArray[np.float64]]]:
+    x: Int64Array, y: Int64Array, cell_px: int, level: int
+) -> tuple[list[tuple[Int64Array, Int64Array]], list[Float64Array]]:
     """Return the three corners around pixels of a level, and their weights (squares sum to 1)."""
     scale = float(1 << level)
     u = (x + 0.5) * scale / cell_px

@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.microstructure import KernelTable, gaussian_weights, kernel_parameters
+from skinrig.arrays import Float64Array
 from skinrig.viewer.microstructure.relief_growth import GrownRelief
-
-Floats = NDArray[np.float64]
 
 STRETCHES: Final = 33
 """Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
@@ -41,7 +39,7 @@ def slope_rms(growth: GrownRelief) -> list[float]:
     return found
 
 
-def strained_variance(growth: GrownRelief, table: KernelTable) -> Floats:
+def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
     """Return how the variance of slopes changes under strain, relative to neutral skin.
 
     The kernels' transfer functions on the patch's power spectrum, averaged with that of the

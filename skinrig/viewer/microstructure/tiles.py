@@ -14,9 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
-
-Float32 = NDArray[np.float32]
 
 TILE_PX: Final = 256
 LEAST_PX: Final = 512

@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.packing import deflating, octaves
 from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
 
-Float32 = NDArray[np.float32]
 Words = NDArray[Any]
 """uint8, uint16, int16, float16 or float32."""
 
@@ -58,7 +58,7 @@ class Packed:
         ).encode("utf-8")
 
 
-def quantize(values: Float32, storage: Storage) -> tuple[Words, Float32, Float32]:
+def quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Array, Float32Array]:
     """Return the words of a texture, and the range of each layer and channel.
 
     Parameters
@@ -86,7 +86,7 @@ def quantize(values: Float32, storage: Storage) -> tuple[Words, Float32, Float32
     return words.astype(np.uint8 if storage == "u8" else np.uint16), low, high
 
 
-def dequantize(words: Words, low: Float32, high: Float32) -> Float32:
+def dequantize(words: Words, low: Float32Array, high: Float32Array) -> Float32Array:
     """Return what the page makes of words."""
     if words.dtype.kind == "f":
         return words.astype(np.float32)
@@ -95,7 +95,7 @@ def dequantize(words: Words, low: Float32, high: Float32) -> Float32:
     return np.asarray(low[..., None, None, :] + span * (words.astype(np.float32) / top), np.float32)
 
 
-def stored(texture: Texture) -> tuple[Words, Float32, Float32]:
+def stored(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
     """Return the words that the page holds of a texture, and their range."""
     if texture.fine == 1:
         return quantize(texture.values, texture.storage)
@@ -104,7 +104,7 @@ def stored(texture: Texture) -> tuple[Words, Float32, Float32]:
     return octaves.joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
 
 
-def _unrounded(values: Float32, low: Float32, high: Float32) -> NDArray[np.float64]:
+def _unrounded(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
     """Return words of 0 to 255 before rounding, (L, H, W, C)."""
     spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
     share = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
@@ -200,13 +200,13 @@ def pack(scene: ViewerScene) -> Packed:
     return Packed(plain, payload, errors)
 
 
-def welded(positions: Float32) -> NDArray[np.intp]:
+def welded(positions: Float32Array) -> NDArray[np.intp]:
     """Return for each vertex the first that lies at the same place, shape (V,)."""
     _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[inverse.reshape(-1)])
 
 
-def _texture_entry(texture: Texture, low: Float32, high: Float32) -> dict[str, Any]:
+def _texture_entry(texture: Texture, low: Float32Array, high: Float32Array) -> dict[str, Any]:
     shape = texture.values.shape
     return {
         "width": shape[-2],

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from skinrig.arrays import Float64Array, Int64Array, UInt8Array
 
 
-def split(values: NDArray[np.float64], fine: int) -> tuple[Bytes, Bytes]:
+def split(values: Float64Array, fine: int) -> tuple[UInt8Array, UInt8Array]:
     """Return words of half as many texels a side, and the steps that the finest octave adds.
 
     Parameters
@@ -30,13 +29,13 @@ def split(values: NDArray[np.float64], fine: int) -> tuple[Bytes, Bytes]:
     return coarse, (steps % 256).astype(np.uint8)
 
 
-def joined(coarse: Bytes, steps: Bytes, fine: int) -> Bytes:
+def joined(coarse: UInt8Array, steps: UInt8Array, fine: int) -> UInt8Array:
     """Return the words of `split`, (L, H, W, C)."""
     words = _doubled(coarse) + fine * steps.view(np.int8).astype(np.int64)
     return np.clip(words, 0, 255).astype(np.uint8)
 
 
-def _doubled(coarse: Bytes) -> NDArray[np.int64]:
+def _doubled(coarse: UInt8Array) -> Int64Array:
     """Return twice as many texels a side, interpolated linearly and rounded half up, (L, H, W, C).
 
     Whole numbers throughout, so that the page comes to the same words.

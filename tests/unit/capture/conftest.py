@@ -14,8 +14,19 @@ RADIUS_PX, EDGE_PX = 13.0, 1.5
 class FibreCamera:
     """Discs with blurred edges on a Bayer sensor with dark current, hot pixels and offsets."""
 
-    def __init__(self, rng, *, shift=(3.0, -2.0), turn_rad=0.004, jitter_px=0.8, dark_e_per_s=0.2,
-                 hot=20, mixing=None, veil=0.0, places=None):  # fmt: skip
+    def __init__(
+        self,
+        rng,
+        *,
+        shift=(3.0, -2.0),
+        turn_rad=0.004,
+        jitter_px=0.8,
+        dark_e_per_s=0.2,
+        hot=20,
+        mixing=None,
+        veil=0.0,
+        places=None,
+    ):
         rig = load_rig("probe")
         view = rig.view("cam")
         self.rng, self.rig, self.view = rng, rig, view

@@ -24,9 +24,11 @@ def lobes():
 
 def packed(lobes, **changed):
     stored = {
-        "table": lobes.table[..., : lobes.size], "materials": np.array(lobes.names),
-        "mix": np.eye(lobes.size), "light_radius_rad": lobes.light_radius_rad,
-    }  # fmt: skip
+        "table": lobes.table[..., : lobes.size],
+        "materials": np.array(lobes.names),
+        "mix": np.eye(lobes.size),
+        "light_radius_rad": lobes.light_radius_rad,
+    }
     stream = io.BytesIO()
     np.savez_compressed(stream, **{k: v for k, v in (stored | changed).items() if v is not None})
     return stream.getvalue()
@@ -124,9 +126,14 @@ def even_model(lobes, r_d=0.5, valid=True, weights=None):
     up = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
     share = [1.0] + [0.0] * (lobes.size - 1) if weights is None else weights
     return SkinReflectance(
-        np.full((*shape, 3), r_d), np.broadcast_to(share, (*shape, lobes.size)), lobes,
-        np.full((*shape, 3), 1.5), up, 10.0 * up, np.full(shape, valid),
-    )  # fmt: skip
+        np.full((*shape, 3), r_d),
+        np.broadcast_to(share, (*shape, lobes.size)),
+        lobes,
+        np.full((*shape, 3), 1.5),
+        up,
+        10.0 * up,
+        np.full(shape, valid),
+    )
 
 
 def hemisphere(count=48):

@@ -14,14 +14,27 @@ from model.skin import SkinAppearance, SkinMap
 
 SIZE = 64
 MARKS = {
-    "nose tip": (0, 0), "nose bridge": (0, 30), "nose wing left": (-18, -5),
-    "nose wing right": (18, -5), "eye inner left": (-20, 33), "eye inner right": (20, 33),
-    "eye outer left": (-55, 34), "eye outer right": (55, 34), "upper lip": (0, -27),
-    "lower lip": (0, -42), "mouth corner left": (-30, -35), "mouth corner right": (30, -35),
-    "chin": (0, -62), "jaw left": (-75, -45), "jaw right": (75, -45), "forehead": (0, 75),
-    "cheek left": (-55, 0), "cheek right": (55, 0), "temple left": (-80, 50),
+    "nose tip": (0, 0),
+    "nose bridge": (0, 30),
+    "nose wing left": (-18, -5),
+    "nose wing right": (18, -5),
+    "eye inner left": (-20, 33),
+    "eye inner right": (20, 33),
+    "eye outer left": (-55, 34),
+    "eye outer right": (55, 34),
+    "upper lip": (0, -27),
+    "lower lip": (0, -42),
+    "mouth corner left": (-30, -35),
+    "mouth corner right": (30, -35),
+    "chin": (0, -62),
+    "jaw left": (-75, -45),
+    "jaw right": (75, -45),
+    "forehead": (0, 75),
+    "cheek left": (-55, 0),
+    "cheek right": (55, 0),
+    "temple left": (-80, 50),
     "temple right": (80, 50),
-}  # fmt: skip
+}
 """Arc to the right and height, mm."""
 
 
@@ -77,9 +90,13 @@ def face(seed=0, *, dark=0.0, oily=0.0, size=SIZE, wide=1.0, color=(0.32, 0.22, 
             weights[..., k], "1", np.full((size, size), 0.02), valid, "share"
         )
     return SkinAppearance(
-        maps, "simulated", {"session": "session-x", "truth": f"truth-{seed}"},
-        {"session": "sha256:0"}, {"skinrig": "0"}, files={"brdf_basis.npz": basis_file(mix)},
-    )  # fmt: skip
+        maps,
+        "simulated",
+        {"session": "session-x", "truth": f"truth-{seed}"},
+        {"session": "sha256:0"},
+        {"skinrig": "0"},
+        files={"brdf_basis.npz": basis_file(mix)},
+    )
 
 
 def basis_file(mix):
@@ -87,10 +104,14 @@ def basis_file(mix):
     tables = brdf_tables.default()
     stream = io.BytesIO()
     np.savez_compressed(
-        stream, materials=np.array(tables.names), mix=mix,
-        table=tables.mixed(mix).table[..., : len(mix)], light_radius_rad=tables.light_radius_rad,
-        ranks=np.array([4]), error_by_rank=np.array([0.1]),
-    )  # fmt: skip
+        stream,
+        materials=np.array(tables.names),
+        mix=mix,
+        table=tables.mixed(mix).table[..., : len(mix)],
+        light_radius_rad=tables.light_radius_rad,
+        ranks=np.array([4]),
+        error_by_rank=np.array([0.1]),
+    )
     return stream.getvalue()
 
 
@@ -111,10 +132,14 @@ def population(folder: Path, count=8, size=SIZE) -> tuple[list[Path], Path]:
         age = 20 + 5 * k
         paths.append(
             write(
-                folder, k, dark=0.35 * tan + 0.003 * (age - 20), oily=float(oily), size=size,
+                folder,
+                k,
+                dark=0.35 * tan + 0.003 * (age - 20),
+                oily=float(oily),
+                size=size,
                 wide=1.0 + 0.01 * (k % 3),
             )
-        )  # fmt: skip
+        )
         lines.append(f"{k},{tan},{oily},{age}")
     labels = folder / "labels.csv"
     labels.write_text("\n".join(lines) + "\n")

@@ -14,11 +14,15 @@ def offered(words):
     run = subprocess.run(
         [Path(sys.executable).with_name("skinrig")],
         env={
-            "_SKINRIG_COMPLETE": "complete_bash", "COMP_WORDS": typed,
-            "COMP_CWORD": str(len(typed.split(" ")) - 1), "PATH": "",
+            "_SKINRIG_COMPLETE": "complete_bash",
+            "COMP_WORDS": typed,
+            "COMP_CWORD": str(len(typed.split(" ")) - 1),
+            "PATH": "",
         },
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     return run.stdout.split()
 
 

@@ -14,15 +14,21 @@ from skinrig.workspace import look
 
 def session(path, rig="flash", kinds=("dark", "subject"), target=""):
     path.mkdir()
-    document = {"rig": {"name": rig}, "plan": {"steps": [{"kind": kind} for kind in kinds]},
-                "extra": {"simulation": {"target": target}} if target else {}}  # fmt: skip
+    document = {
+        "rig": {"name": rig},
+        "plan": {"steps": [{"kind": kind} for kind in kinds]},
+        "extra": {"simulation": {"target": target}} if target else {},
+    }
     (path / "session.json").write_text(json.dumps(document))
 
 
 def appearance(path, session="", kind="appearance", files=()):
     path.mkdir()
-    document = {"parameters": {"kind": kind, "session": session}, "maps": {"melanin": {}},
-                "files": dict.fromkeys(files, "")}  # fmt: skip
+    document = {
+        "parameters": {"kind": kind, "session": session},
+        "maps": {"melanin": {}},
+        "files": dict.fromkeys(files, ""),
+    }
     (path / "appearance.json").write_text(json.dumps(document))
 
 

@@ -50,18 +50,28 @@ class Bench:
         self.name = self.world.register(next(NAMES))
         self.rig, self.plan = rig, plan
         self.session = Session.create(
-            tmp_path / "s", plan=plan, rig=rig, devices={}, subject=Subject("p"),
-            source="simulated", seed=7,
-        )  # fmt: skip
+            tmp_path / "s",
+            plan=plan,
+            rig=rig,
+            devices={},
+            subject=Subject("p"),
+            source="simulated",
+            seed=7,
+        )
         self.box = DomeBox(Port(f"sim://dome?world={self.name}", clock=self.world.clock))
         self.cameras = {v.name: open_camera(f"sim://{self.name}/{v.name}") for v in rig.views}
         self.unit = self.world.box("dome").device
 
     def run(self, **more):
         return run_plan(
-            self.plan, self.rig, boxes={"dome": self.box}, cameras=self.cameras,
-            session=self.session, clock=lambda: 1.0, **{"eyes": "closed", **more},
-        )  # fmt: skip
+            self.plan,
+            self.rig,
+            boxes={"dome": self.box},
+            cameras=self.cameras,
+            session=self.session,
+            clock=lambda: 1.0,
+            **{"eyes": "closed", **more},
+        )
 
     def close(self):
         self.session.release()
@@ -141,11 +151,15 @@ def test_a_full_plan_takes_about_25_seconds_of_the_rig(make):
 @pytest.mark.parametrize(
     "faults",
     [
-        {"drop_frame": 0.06}, {"wrong_camera": 0.06}, {"wrong_exposure": 0.06}, {"stale": 1.0},
-        {"drift_ppm": 150.0}, {"drop": 5e-4, "flip": 5e-4, "lose_answer": 0.03, "cut": 0.01},
+        {"drop_frame": 0.06},
+        {"wrong_camera": 0.06},
+        {"wrong_exposure": 0.06},
+        {"stale": 1.0},
+        {"drift_ppm": 150.0},
+        {"drop": 5e-4, "flip": 5e-4, "lose_answer": 0.03, "cut": 0.01},
     ],
     ids=lambda faults: next(iter(faults)),
-)  # fmt: skip
+)
 def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
     bench = make(**faults)
     done = bench.run()
@@ -277,11 +291,15 @@ def test_a_plan_that_flickers_is_refused_before_anything_is_sent_unless_eyes_are
 
 def test_a_plan_beyond_the_dose_is_refused_before_anything_is_sent():
     steps = [
-        Step(f"S{k}", "olat", {"light": "L000", "exposure": 0, "pass": 0},
-             {"light": "L000", "level": 1.0, "dwell_s": 0.25, "exposure_s": 0.1, "iso": 100},
-             ("C00",))
+        Step(
+            f"S{k}",
+            "olat",
+            {"light": "L000", "exposure": 0, "pass": 0},
+            {"light": "L000", "level": 1.0, "dwell_s": 0.25, "exposure_s": 0.1, "iso": 100},
+            ("C00",),
+        )
         for k in range(201)
-    ]  # fmt: skip
+    ]
     with pytest.raises(AcquisitionError, match=r"light dose: L000 would send out 50\.2 Ws"):
         check_safety(Plan("dome", tuple(steps)), DOME)
 
@@ -289,11 +307,13 @@ def test_a_plan_beyond_the_dose_is_refused_before_anything_is_sent():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"leds": 149}, "the box drives 149 LEDs"), ({"cameras": 3}, "the box releases 3"),
-        ({"row_max_us": 50_000}, "got dwell_s 0.0833"), ({"settle_us": 30_000}, "do not fit"),
+        ({"leds": 149}, "the box drives 149 LEDs"),
+        ({"cameras": 3}, "the box releases 3"),
+        ({"row_max_us": 50_000}, "got dwell_s 0.0833"),
+        ({"settle_us": 30_000}, "do not fit"),
         ({"max_at_once": 5}, "6 lights at once"),
     ],
-)  # fmt: skip
+)
 def test_a_plan_beyond_the_box_is_refused_before_anything_is_lit(make, change, match):
     bench = make()
     bench.box._limits = {**bench.box.limits, **change}
@@ -363,9 +383,13 @@ def test_what_flickers_when_taken_again_alone_is_taken_in_single_flashes(make, m
     bench.plan = Plan("dome", tuple(missing))
     bench.session.release()
     bench.session = Session.create(
-        bench.session.path.with_name("t"), plan=bench.plan, rig=RIG, devices={},
-        subject=Subject("p"), source="simulated",
-    )  # fmt: skip
+        bench.session.path.with_name("t"),
+        plan=bench.plan,
+        rig=RIG,
+        devices={},
+        subject=Subject("p"),
+        source="simulated",
+    )
     # the host's own figures are not asked here: the box's refusal is what is under test
     monkeypatch.setattr("capture.acquire.dome.check_safety", lambda *plan, **eyes: None)
     done = bench.run(eyes="open")

@@ -56,9 +56,12 @@ class Box:
         for camera in self.line:
             camera.expose()
         return SimpleNamespace(
-            token=token, t_box_s=float(self.shots), power=self.power, polarizer=self.polarizer,
+            token=token,
+            t_box_s=float(self.shots),
+            power=self.power,
+            polarizer=self.polarizer,
             analyser_deg=90.0 if self.polarizer == "crossed" else 0.0,
-        )  # fmt: skip
+        )
 
     def trigger_cameras(self, token):
         self.log.append(f"trigger {token}")
@@ -72,9 +75,15 @@ class Box:
 class Camera:
     def __init__(self, spoil=()):
         self.info = CameraInfo(
-            VIEW.serial, VIEW.camera_model, VIEW.width_px, VIEW.height_px, "RGGB", (512.0,) * 4,
-            VIEW.white_level, (Trigger.EDGE, Trigger.SOFTWARE),
-        )  # fmt: skip
+            VIEW.serial,
+            VIEW.camera_model,
+            VIEW.width_px,
+            VIEW.height_px,
+            "RGGB",
+            (512.0,) * 4,
+            VIEW.white_level,
+            (Trigger.EDGE, Trigger.SOFTWARE),
+        )
         self.now, self.spoil, self.taken, self.queue = 0.0, list(spoil), 0, []
 
     def clock_s(self):
@@ -130,9 +139,14 @@ def session(tmp_path, plan):
 def run(plan, session, box, camera, **more):
     box.line = [camera]
     return run_plan(
-        plan, RIG, boxes={"flash": box}, cameras={"cam": camera}, session=session,
-        clock=lambda: 1.0, **more,
-    )  # fmt: skip
+        plan,
+        RIG,
+        boxes={"flash": box},
+        cameras={"cam": camera},
+        session=session,
+        clock=lambda: 1.0,
+        **more,
+    )
 
 
 def test_every_step_is_committed_with_the_light_that_made_it(plan, session):

@@ -73,8 +73,11 @@ def test_a_frame_of_another_camera_is_no_matter_of_waiting():
     with pytest.raises(cameras.WrongCamera):
         next_frame(
             Queue([dataclasses.replace(GOOD, serial="B2"), GOOD]),
-            seq=0, not_before_s=10.0, want=WANT, timeout_s=1.0,
-        )  # fmt: skip
+            seq=0,
+            not_before_s=10.0,
+            want=WANT,
+            timeout_s=1.0,
+        )
 
 
 @pytest.mark.parametrize("url", ["nonsense", "floppy:1", ""])
@@ -105,9 +108,16 @@ class Clock:
 def dng(value, **more):
     cfa = np.full((16, 16), value, np.uint16)
     return raw.encode_dng(
-        cfa, pattern="RGGB", black=64, white=4095, exposure_s=0.01, iso=100,
-        camera_model="test", camera_serial="A1", **more,
-    )  # fmt: skip
+        cfa,
+        pattern="RGGB",
+        black=64,
+        white=4095,
+        exposure_s=0.01,
+        iso=100,
+        camera_model="test",
+        camera_serial="A1",
+        **more,
+    )
 
 
 @pytest.fixture
@@ -143,9 +153,12 @@ def test_files_from_before_arming_are_no_frames(folder):
 
 def test_a_folder_is_released_by_the_box_or_by_hand_as_its_address_says(folder):
     for query, known in (
-        ("", Trigger.EDGE), ("?serial=A1", Trigger.EDGE), ("?release=hand", Trigger.HAND),
-        ("?serial=A1&release=hand", Trigger.HAND), ("?release=box", Trigger.EDGE),
-    ):  # fmt: skip
+        ("", Trigger.EDGE),
+        ("?serial=A1", Trigger.EDGE),
+        ("?release=hand", Trigger.HAND),
+        ("?serial=A1&release=hand", Trigger.HAND),
+        ("?release=box", Trigger.EDGE),
+    ):
         camera = cameras.open_camera(f"hotfolder:{folder}{query}")
         assert camera.info.triggers == (known,)
         camera.arm(1, known)

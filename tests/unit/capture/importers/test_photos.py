@@ -124,10 +124,18 @@ def test_not_a_number_in_an_exr_is_masked(tmp_path):
 def test_a_raw_file_keeps_its_sensor_values(tmp_path):
     cfa = np.random.default_rng(4).integers(512, 16000, (20, 30), dtype=np.uint16)
     raw.write_dng(
-        tmp_path / "a.dng", cfa, pattern="GRBG", black=500, white=16000, exposure_s=0.01, iso=200,
-        camera_model="Some Camera", camera_serial="SECRET123", neutral=(0.5, 1.0, 0.7),
+        tmp_path / "a.dng",
+        cfa,
+        pattern="GRBG",
+        black=500,
+        white=16000,
+        exposure_s=0.01,
+        iso=200,
+        camera_model="Some Camera",
+        camera_serial="SECRET123",
+        neutral=(0.5, 1.0, 0.7),
         captured_at=clock(),
-    )  # fmt: skip
+    )
     frame = read_photo(tmp_path / "a.dng").frame
     np.testing.assert_array_equal(frame.cfa, cfa)
     assert (frame.pattern, frame.white, frame.iso) == ("GRBG", 16000, 200)
@@ -139,10 +147,7 @@ def test_a_raw_file_keeps_its_sensor_values(tmp_path):
 def exif_with_place():
     """An APP1 segment with an owner's name and a GPS directory, as a phone writes."""
     owner = b"Anna Example\0"
-    entries = [
-        (0x013B, 2, len(owner), 200),
-        (0x8825, 4, 1, 100),
-    ]
+    entries = [(0x013B, 2, len(owner), 200), (0x8825, 4, 1, 100)]
     body = b"II*\0" + struct.pack("<IH", 8, len(entries))
     body += b"".join(struct.pack("<HHII", *entry) for entry in entries) + struct.pack("<I", 0)
     body = body.ljust(100, b"\0") + struct.pack("<HHHI4sI", 1, 1, 2, 2, b"N\0\0\0", 0)
@@ -306,11 +311,24 @@ def bad_file(kind, folder, picture):
 @pytest.mark.parametrize(
     "kind",
     [
-        "png cut", "png flipped bit", "png huge", "jpg cut", "jpg header only", "empty", "text",
-        "tif cut", "tif garbage", "tif 5 channels", "tif 32 bit", "exr cut", "exr of depth only",
-        "exr black", "dng cut", "pipe",
+        "png cut",
+        "png flipped bit",
+        "png huge",
+        "jpg cut",
+        "jpg header only",
+        "empty",
+        "text",
+        "tif cut",
+        "tif garbage",
+        "tif 5 channels",
+        "tif 32 bit",
+        "exr cut",
+        "exr of depth only",
+        "exr black",
+        "dng cut",
+        "pipe",
     ],
-)  # fmt: skip
+)
 def test_one_bad_file_gives_one_clear_error_and_nothing_is_written(kind, picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()

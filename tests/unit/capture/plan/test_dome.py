@@ -100,8 +100,10 @@ def test_light_faster_than_fusion_is_not_counted_as_flashes():
 def test_the_light_at_the_eyes_integrates_to_what_the_rows_give():
     rng = np.random.default_rng(3)
     weights = rng.random(20)
-    rows = [LedRow((int(k),), float(level), 0.0317) for k, level in zip(
-        rng.integers(0, 20, 50), rng.random(50), strict=True)]  # fmt: skip
+    rows = [
+        LedRow((int(k),), float(level), 0.0317)
+        for k, level in zip(rng.integers(0, 20, 50), rng.random(50), strict=True)
+    ]
     signal = eye_signal(rows, weights, overlap_s=0.0)
     given = sum(row.level * row.dwell_s * weights[row.leds[0]] for row in rows)
     assert signal.sum() * SAMPLE_S == pytest.approx(given, rel=1e-9)
@@ -203,10 +205,12 @@ def test_a_plan_survives_its_file():
 @pytest.mark.parametrize(
     ("target", "steps", "kinds"),
     [
-        ("charuco", 2 + 14, {"dark", "charuco"}), ("mirror", 4 * 20, {"mirror"}),
-        ("white", 2 + 7 * 151, {"dark", "white"}), ("dark", 32, {"dark"}),
+        ("charuco", 2 + 14, {"dark", "charuco"}),
+        ("mirror", 4 * 20, {"mirror"}),
+        ("white", 2 + 7 * 151, {"dark", "white"}),
+        ("dark", 32, {"dark"}),
     ],
-)  # fmt: skip
+)
 def test_a_calibration_plan_holds_what_its_target_needs(target, steps, kinds):
     plan = dome_calibration_plan(DOME, target)
     assert len(plan.steps) == steps
@@ -219,12 +223,16 @@ def test_a_calibration_plan_holds_what_its_target_needs(target, steps, kinds):
 @pytest.mark.parametrize(
     ("more", "match"),
     [
-        ({"exposures_s": (0.07,)}, "to fit with read-out"), ({"frames_per_s": 1.5}, "frames_per_s"),
-        ({"frames_per_s": 0.0}, "frames_per_s"), ({"level": 1.5}, "level"),
-        ({"order": [0, 1]}, "every light once"), ({"tracking_every": -1}, "tracking_every"),
-        ({"darks": -1}, "darks"), ({"frames_per_s": 3.0}, "level x dwell"),
+        ({"exposures_s": (0.07,)}, "to fit with read-out"),
+        ({"frames_per_s": 1.5}, "frames_per_s"),
+        ({"frames_per_s": 0.0}, "frames_per_s"),
+        ({"level": 1.5}, "level"),
+        ({"order": [0, 1]}, "every light once"),
+        ({"tracking_every": -1}, "tracking_every"),
+        ({"darks": -1}, "darks"),
+        ({"frames_per_s": 3.0}, "level x dwell"),
     ],
-)  # fmt: skip
+)
 def test_a_plan_that_cannot_be_carried_out_is_refused(more, match):
     with pytest.raises(PlanError, match=match):
         dome_plan(DOME, **more)
@@ -270,9 +278,16 @@ def test_the_blue_light_bound_is_radiance_times_time():
 
 @pytest.mark.parametrize(
     "change",
-    [{"max_on_s": 0.0}, {"max_duty": 1.5}, {"thermal_trip": 1.0}, {"max_at_once": 1},
-     {"overlap_s": 0.1}, {"max_rows": 0}, {"dose_ws": float("nan")}],
-)  # fmt: skip
+    [
+        {"max_on_s": 0.0},
+        {"max_duty": 1.5},
+        {"thermal_trip": 1.0},
+        {"max_at_once": 1},
+        {"overlap_s": 0.1},
+        {"max_rows": 0},
+        {"dose_ws": float("nan")},
+    ],
+)
 def test_limits_that_make_no_sense_are_refused(change):
     with pytest.raises(RigError):
         LedLimits(**change)

@@ -78,8 +78,11 @@ def test_each_angle_is_neutral_then_compressed_then_stretched_step_by_step():
         "a000_p2",
     ]
     assert [name for name in names if name.endswith("n0")] == [
-        "a000_n0", "a045_n0", "a090_n0", "a135_n0",
-    ]  # fmt: skip
+        "a000_n0",
+        "a045_n0",
+        "a090_n0",
+        "a135_n0",
+    ]
 
 
 def test_a_state_is_eight_patterns_parallel_and_the_same_crossed():
@@ -157,15 +160,23 @@ def test_the_dose_of_a_led_is_its_share_of_the_light_of_all_states():
 @pytest.mark.parametrize(
     ("more", "match"),
     [
-        ({"dwell_s": 0.04, "exposure_s": 0.018}, "duty: got '0.320"), ({"angles": [30]}, "angles"),
-        ({"angles": [0, 0]}, "none twice"), ({"angles": []}, "at least one"),
-        ({"steps": (-5, 0)}, "steps"), ({"steps": (1, 2)}, "steps"), ({"steps": (-1, 9)}, "steps"),
-        ({"patterns": ["x", "x"]}, "none twice"), ({"patterns": []}, "at least one"),
-        ({"patterns": ["up"]}, "patterns"), ({"level": 0.0}, "level"), ({"level": 1.5}, "level"),
-        ({"darks": -1}, "darks"), ({"exposure_s": 0.025}, "read-out"),
+        ({"dwell_s": 0.04, "exposure_s": 0.018}, "duty: got '0.320"),
+        ({"angles": [30]}, "angles"),
+        ({"angles": [0, 0]}, "none twice"),
+        ({"angles": []}, "at least one"),
+        ({"steps": (-5, 0)}, "steps"),
+        ({"steps": (1, 2)}, "steps"),
+        ({"steps": (-1, 9)}, "steps"),
+        ({"patterns": ["x", "x"]}, "none twice"),
+        ({"patterns": []}, "at least one"),
+        ({"patterns": ["up"]}, "patterns"),
+        ({"level": 0.0}, "level"),
+        ({"level": 1.5}, "level"),
+        ({"darks": -1}, "darks"),
+        ({"exposure_s": 0.025}, "read-out"),
         ({"dwell_s": 0.6}, "dwell_s"),
     ],
-)  # fmt: skip
+)
 def test_what_the_rig_may_not_do_is_refused(more, match):
     with pytest.raises(PlanError, match=match):
         gradient_plan(RIG, **more)
@@ -217,9 +228,14 @@ def test_the_dark_has_no_light():
 
 @pytest.mark.parametrize(
     ("target", "more", "match"),
-    [("chart", {}, "target"), ("flat", {"repeats": 1}, "repeats"), ("ball", {"level": 2}, "level"),
-     ("dark", {"repeats": 0}, "repeats"), ("flat", {"darks": -1}, "darks")],
-)  # fmt: skip
+    [
+        ("chart", {}, "target"),
+        ("flat", {"repeats": 1}, "repeats"),
+        ("ball", {"level": 2}, "level"),
+        ("dark", {"repeats": 0}, "repeats"),
+        ("flat", {"darks": -1}, "darks"),
+    ],
+)
 def test_a_wrong_target_is_refused(target, more, match):
     with pytest.raises(PlanError, match=match):
         gradient_calibration_plan(RIG, target, **more)

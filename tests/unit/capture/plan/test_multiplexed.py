@@ -187,8 +187,11 @@ def test_a_course_follows_exercise_for_a_minute_and_alcohol_for_an_hour():
     hour = course_plan(FLASH, state="alcohol", duration_s=3600, shot_period_s=300, before=3)
     assert [s.settings["start_s"] for s in timed_steps(hour)] == [300.0 * k for k in range(13)]
     assert [s.index["state"] for s in hour.steps if s.kind == "subject"][:4] == [
-        "neutral", "neutral", "neutral", "alcohol",
-    ]  # fmt: skip
+        "neutral",
+        "neutral",
+        "neutral",
+        "alcohol",
+    ]
     with pytest.raises(ReadOutError):
         course_plan(FLASH, shot_period_s=5.25)
 

@@ -39,9 +39,14 @@ def test_files_and_folders_are_synchronized_by_the_call_that_is_named(tmp_path, 
 
 def test_a_raw_file_is_on_the_disk_before_it_has_its_name(tmp_path, synced):
     raw.write_dng(
-        tmp_path / "a.dng", np.full((16, 16), 600, np.uint16), pattern="RGGB", black=512,
-        white=16383, step_id="S000", session_id="s",
-    )  # fmt: skip
+        tmp_path / "a.dng",
+        np.full((16, 16), 600, np.uint16),
+        pattern="RGGB",
+        black=512,
+        white=16383,
+        step_id="S000",
+        session_id="s",
+    )
     assert synced == [("fsync", (tmp_path / "a.dng").stat().st_ino)]
 
 

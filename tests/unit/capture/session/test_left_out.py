@@ -18,17 +18,25 @@ WHY = "the skin buckled"
 @pytest.fixture
 def session(tmp_path):
     with Session.create(
-        tmp_path / "s", plan=PLAN, rig=RIG, devices={}, subject=Subject("P042", ("research",)),
+        tmp_path / "s",
+        plan=PLAN,
+        rig=RIG,
+        devices={},
+        subject=Subject("P042", ("research",)),
         source="measured",
-    ) as made:  # fmt: skip
+    ) as made:
         yield made
 
 
 def commit(session, step_id):
     blob = raw.encode_dng(
-        np.full((10, 16), 600, np.uint16), pattern="RGGB", black=512, white=16383,
-        step_id=step_id, session_id=session.id,
-    )  # fmt: skip
+        np.full((10, 16), 600, np.uint16),
+        pattern="RGGB",
+        black=512,
+        white=16383,
+        step_id=step_id,
+        session_id=session.id,
+    )
     session.commit(step_id, "cam", blob, settings={}, actual={}, t_host_s=0.0)
 
 
@@ -60,8 +68,11 @@ def test_what_was_left_out_survives_an_interruption(session):
         commit_all(again)
         again.close()
     assert [r.step_id for r in Session.open(session.path).frames()] == [
-        "D000", "S000", "S001", "S002",
-    ]  # fmt: skip
+        "D000",
+        "S000",
+        "S001",
+        "S002",
+    ]
 
 
 def test_frames_of_a_step_that_is_left_out_afterwards_stay_and_do_not_count(session):
@@ -94,9 +105,13 @@ def test_a_step_left_out_is_neither_captured_nor_left_out_again(session):
 
 @pytest.mark.parametrize(
     ("steps", "reason", "error"),
-    [([], WHY, SessionError), (["S001", "S001"], WHY, SessionError), (["S001"], " ", SessionError),
-     (["S9"], WHY, PlanError)],
-)  # fmt: skip
+    [
+        ([], WHY, SessionError),
+        (["S001", "S001"], WHY, SessionError),
+        (["S001"], " ", SessionError),
+        (["S9"], WHY, PlanError),
+    ],
+)
 def test_what_cannot_be_left_out_leaves_no_trace(session, steps, reason, error):
     with pytest.raises(error):
         session.leave_out(steps, reason=reason, t_host_s=0.0)

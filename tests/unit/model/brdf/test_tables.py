@@ -25,8 +25,10 @@ def directions(rng, n, least=0.3):
 def test_the_basis_has_59_materials_on_the_grid_that_the_kernels_know(point_basis):
     assert point_basis.size == len(set(point_basis.names)) == 59
     assert point_basis.table.shape[:3] == (
-        nnls_kernels.NODES_D, nnls_kernels.NODES_PHI, nnls_kernels.NODES_H,
-    )  # fmt: skip
+        nnls_kernels.NODES_D,
+        nnls_kernels.NODES_PHI,
+        nnls_kernels.NODES_H,
+    )
     assert np.all(point_basis.table[..., 59:] == 0.0)
     tiny = point_basis.table[(point_basis.table > 0.0)].min()
     assert tiny >= np.float32(brdf_tables.LEAST)

@@ -44,9 +44,11 @@ def edge_profile(x_mm, media):
     reach, z = abs(x_mm), float(media.depth_mm)
     beyond, _ = quad(
         lambda r: 2.0 * r * np.arccos(reach / r) * float(dipole_sum.profile(r, media)),
-        reach, reach + 50.0 / float(media.sigma_tr_per_mm), limit=400,
+        reach,
+        reach + 50.0 / float(media.sigma_tr_per_mm),
+        limit=400,
         points=[reach + z, reach + 5.0 * z],
-    )  # fmt: skip
+    )
     return beyond if x_mm >= 0 else 1.0 - beyond
 
 
@@ -251,9 +253,14 @@ def test_every_source_is_in_one_leaf_and_nodes_hold_theirs():
 def test_faulty_inputs_are_named(change, says):
     points, area, light = _sheet()
     given = {
-        "source_mm": points, "source_area_mm2": area, "entered": light, "at_mm": points[:3],
-        "r_d": R_D, "translucency_mm": LENGTH_MM, **change,
-    }  # fmt: skip
+        "source_mm": points,
+        "source_area_mm2": area,
+        "entered": light,
+        "at_mm": points[:3],
+        "r_d": R_D,
+        "translucency_mm": LENGTH_MM,
+        **change,
+    }
     with pytest.raises(GatherError, match=says.replace("(", r"\(").replace(")", r"\)")):
         exitance(**given)
 

@@ -141,9 +141,12 @@ def test_weights_of_one_site_are_that_site_alone(foreheads, cheeks):
     only = np.zeros((2, 3, 3))
     only[1] = 0.3
     both = synthesis.grow(
-        {"forehead": foreheads, "cheek": cheeks}, 300, rng=np.random.default_rng(8),
-        regions=only, **knobs(),
-    )  # fmt: skip
+        {"forehead": foreheads, "cheek": cheeks},
+        300,
+        rng=np.random.default_rng(8),
+        regions=only,
+        **knobs(),
+    )
     assert abs(both.std() / np.std(cheeks) - 1.0) < 0.1
 
 
@@ -261,9 +264,13 @@ def test_a_map_is_written_where_it_is_asked_for(foreheads, tmp_path):
     )
     heard = []
     synthesis.grow(
-        foreheads, (300, 200), rng=np.random.default_rng(14), out=out,
-        progress=lambda *n: heard.append(n), **knobs(),
-    )  # fmt: skip
+        foreheads,
+        (300, 200),
+        rng=np.random.default_rng(14),
+        out=out,
+        progress=lambda *n: heard.append(n),
+        **knobs(),
+    )
     assert np.load(tmp_path / "map.npy", mmap_mode="r").std() > 1.0
     assert heard == [(1, 1)]
 
@@ -299,7 +306,7 @@ PATCH = np.random.default_rng(0).standard_normal((64, 64))
         ({"a": [PATCH]}, 64, {"regions": -np.ones((1, 3, 3))}, "finite weights"),
         ({"a": [PATCH]}, 64, {"regions": np.full((3, 3), -1)}, "no site anywhere"),
     ],
-)  # fmt: skip
+)
 def test_what_nothing_grows_from_is_refused_by_name(patches, size, changes, message):
     with pytest.raises(synthesis.SynthesisError, match=message):
         synthesis.grow(patches, size, rng=np.random.default_rng(0), **changes)

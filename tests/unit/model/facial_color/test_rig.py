@@ -146,9 +146,11 @@ def test_masked_pixels_never_leak(neutral):
     clean = HemoglobinRig.from_maps(neutral, {"state": state}, radius_px=RADIUS_PX, valid=~hole)
     for filler in (np.nan, np.inf, 1e9):
         dirty = HemoglobinRig.from_maps(
-            np.where(hole, filler, neutral), {"state": np.where(hole, filler, state)},
-            radius_px=RADIUS_PX, valid=~hole,
-        )  # fmt: skip
+            np.where(hole, filler, neutral),
+            {"state": np.where(hole, filler, state)},
+            radius_px=RADIUS_PX,
+            valid=~hole,
+        )
         found = dirty.evaluate({"state": 1.0})
         np.testing.assert_array_equal(found.valid, ~hole)
         np.testing.assert_array_equal(found.hemoglobin, clean.blend({"state": 1.0}))
@@ -161,9 +163,12 @@ def test_state_with_a_mask_of_its_own_is_compared_over_shared_pixels(neutral):
     mask = np.ones(neutral.shape, bool)
     mask[:, 50:] = False
     rig = HemoglobinRig.from_maps(
-        neutral, {"half": 1.4 * neutral + 0.01, "whole": 1.2 * neutral}, radius_px=RADIUS_PX,
-        valid={"half": mask}, stored_size=None,
-    )  # fmt: skip
+        neutral,
+        {"half": 1.4 * neutral + 0.01, "whole": 1.2 * neutral},
+        radius_px=RADIUS_PX,
+        valid={"half": mask},
+        stored_size=None,
+    )
     found = rig.evaluate({"half": 1.0})
     np.testing.assert_allclose(
         found.hemoglobin[found.valid], (1.4 * neutral + 0.01)[found.valid], atol=1e-12
@@ -232,9 +237,11 @@ def test_standard_error_holds_the_truth_that_eq_6_leaves_out(neutral, rng):
     }
     error = np.full(neutral.shape, noise)
     rig = HemoglobinRig.from_maps(
-        measured["neutral"], {"state": measured["state"]}, radius_px=16.0,
+        measured["neutral"],
+        {"state": measured["state"]},
+        radius_px=16.0,
         stderr={"neutral": error, "state": error},
-    )  # fmt: skip
+    )
     found = rig.evaluate({"state": 1.0})
     z = (found.hemoglobin - truth) / found.stderr
     # Variance: own^2 + (1.3 noise)^2 = 1.71; stated: with the state's noise once as seen in the
@@ -289,8 +296,7 @@ def test_rig_survives_its_folder(rig, tmp_path):
     maps, document = to_maps(rig)
     assert json.loads(document)["schema"] == "skinrig.facial-color/1"
     store.write(
-        tmp_path / "a",
-        SkinAppearance(maps, "simulated", files={"facial_color.json": document}),
+        tmp_path / "a", SkinAppearance(maps, "simulated", files={"facial_color.json": document})
     )
     read = store.read(tmp_path / "a")
     again = from_maps_and_document(read.maps, read.files["facial_color.json"])

@@ -20,9 +20,13 @@ def ball(rings=12, *, tube=False):
     """A closed ball or tube of 20 mm, split along a seam; latitude and longitude as its texture."""
     v, u = np.meshgrid(np.linspace(0.08, 0.92, rings), np.linspace(0.0, 1.0, 2 * rings + 1))
     points = 20.0 * np.stack(
-        [np.sin(np.pi * v) * np.cos(2 * np.pi * u), np.sin(np.pi * v) * np.sin(2 * np.pi * u),
-         np.cos(np.pi * v)], -1,
-    )  # fmt: skip
+        [
+            np.sin(np.pi * v) * np.cos(2 * np.pi * u),
+            np.sin(np.pi * v) * np.sin(2 * np.pi * u),
+            np.cos(np.pi * v),
+        ],
+        -1,
+    )
     if tube:
         turned = 2 * np.pi * u
         points = 20.0 * np.stack([np.cos(turned), np.sin(turned), 4.0 * v], -1)
@@ -161,8 +165,11 @@ def test_an_island_turned_mirrored_and_scaled_has_its_axes_turned_with_it(rng):
     ):
         found = strain(points, moved, faces, uv @ M.T)
         np.testing.assert_allclose(found.r_s, plain.r_s, atol=1e-12)
-        same_line(found.axis_s * found.uv_per_mm_s[:, None],
-                  plain.axis_s * plain.uv_per_mm_s[:, None] @ M.T, 1e-9)  # fmt: skip
+        same_line(
+            found.axis_s * found.uv_per_mm_s[:, None],
+            plain.axis_s * plain.uv_per_mm_s[:, None] @ M.T,
+            1e-9,
+        )
         assert found.uv_turned_share == 0.0
 
 

@@ -114,9 +114,12 @@ def test_the_papers_kernels_bring_lengths_nearer_to_neutral(profiles, stretch):
     alpha, sigma_um = microstructure.kernel_parameters(stretch)
     for profile in profiles:
         change = profile_length.length_change(
-            profile, spacing_um=SPACING_UM, stretch=stretch, alpha=float(alpha),
+            profile,
+            spacing_um=SPACING_UM,
+            stretch=stretch,
+            alpha=float(alpha),
             sigma_um=float(sigma_um),
-        )  # fmt: skip
+        )
         assert abs(change.convolved_ratio - 1.0) < abs(change.unchanged_ratio - 1.0)
 
 

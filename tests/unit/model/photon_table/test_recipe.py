@@ -42,9 +42,13 @@ def test_one_walk_serves_all_indices_and_absorptions(recipe):
     error = totals.std(axis=0, ddof=1) / np.sqrt(20)
     for e, eta in enumerate(recipe.ETAS):
         exact = adding_doubling.reflectance(
-            absorption[:, None], np.ones((3, 1)), np.full((3, 1), np.inf),
-            eta=float(eta), anisotropy=0.8, directions=24,
-        ).ravel()  # fmt: skip
+            absorption[:, None],
+            np.ones((3, 1)),
+            np.full((3, 1), np.inf),
+            eta=float(eta),
+            anisotropy=0.8,
+            directions=24,
+        ).ravel()
         # What returns within 0.005 transport lengths is not counted: less than 1e-3.
         gap = totals.mean(axis=0)[e] - exact
         assert np.all(gap < 4.0 * error[e])

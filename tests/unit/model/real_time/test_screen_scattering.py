@@ -106,6 +106,9 @@ def test_a_measured_albedo_is_blurred_twice_by_all_but_post_scatter_texturing():
 def test_variances_that_shrink_are_refused():
     with pytest.raises(ScreenScatteringError, match="growing"):
         scatter(
-            np.ones((2, 2, 3)), np.ones((2, 2)), variances_mm2=[1.0, 0.5],
-            weights=np.ones((2, 3)), focal_px=1.0,
-        )  # fmt: skip
+            np.ones((2, 2, 3)),
+            np.ones((2, 2)),
+            variances_mm2=[1.0, 0.5],
+            weights=np.ones((2, 3)),
+            focal_px=1.0,
+        )

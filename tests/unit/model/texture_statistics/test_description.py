@@ -158,9 +158,13 @@ def test_noise_becomes_the_texture_as_nearly_as_an_image_does(rng):
     assert from_noise.after[:, fine].mean() < 1.5 * from_image.after[:, fine].mean() + 0.01
     # independent of the source image
     blank = match(
-        np.zeros_like(other), vector, space=space, iterations=8, start="noise",
+        np.zeros_like(other),
+        vector,
+        space=space,
+        iterations=8,
+        start="noise",
         rng=np.random.default_rng(5),
-    )  # fmt: skip
+    )
     again = match(
         other, vector, space=space, iterations=8, start="noise", rng=np.random.default_rng(5)
     )

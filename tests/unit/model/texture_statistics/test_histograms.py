@@ -187,9 +187,10 @@ def test_group_histograms_are_means_over_images_not_over_texels(rng):
     mask[0, 0] = True
     large[~mask] = np.nan
     found = rgb_histograms(
-        [small, large, large], {"both": np.array([True, True, False]), "one": [False, True, False]},
+        [small, large, large],
+        {"both": np.array([True, True, False]), "one": [False, True, False]},
         [None, mask, mask],
-    )  # fmt: skip
+    )
     assert found.names == ("both", "one")
     assert found.mean.shape == (2, 3, 256)
     np.testing.assert_allclose(found.mean[0, :, [25, 230]], 0.5)

@@ -118,9 +118,13 @@ def test_as_many_threads_as_wanted_give_the_same_numbers(rng):
 
 @pytest.mark.parametrize(
     ("image", "wrong"),
-    [(np.zeros((0, 4)), "shape"), (np.zeros(4), "shape"), ([[np.nan, 1.0]], "finite"),
-     ([[np.inf, -np.inf]], "finite")],
-)  # fmt: skip
+    [
+        (np.zeros((0, 4)), "shape"),
+        (np.zeros(4), "shape"),
+        ([[np.nan, 1.0]], "finite"),
+        ([[np.inf, -np.inf]], "finite"),
+    ],
+)
 def test_what_is_no_image_is_named(image, wrong):
     with pytest.raises(PyramidError, match=wrong):
         analyze(image)

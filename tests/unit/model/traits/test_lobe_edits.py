@@ -160,8 +160,9 @@ def test_other_materials_are_refused(rng):
     samples = rng.random((6, 3))
     space = TraitSpace.fit(samples, {"oil": np.arange(6) < 3}, names=("a", "b", "c"))
     with pytest.raises(TraitError, match="materials"):
-        edit_weights(np.ones((2, 1)), np.ones((1, 3)), space, {"oil": 1.0},
-                     materials=("a", "c", "b"))  # fmt: skip
+        edit_weights(
+            np.ones((2, 1)), np.ones((1, 3)), space, {"oil": 1.0}, materials=("a", "c", "b")
+        )
 
 
 def test_lengths_are_those_of_what_is_reflected(rng):

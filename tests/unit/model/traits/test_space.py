@@ -103,9 +103,12 @@ def test_an_edit_of_amount_0_returns_the_sample_bit_for_bit(rng, space):
     samples = rng.random((20, 12))
     label = np.arange(20) < 8
     made = TraitSpace.fit(
-        samples, {"lotion": label}, space=space, metric=products(rng),
+        samples,
+        {"lotion": label},
+        space=space,
+        metric=products(rng),
         basis=rng.random((4, 12)) if space == "nmf" else None,
-    )  # fmt: skip
+    )
     strange = rng.random(12).astype(np.float32)
     for mode in ("linear", "convex"):
         same = made.edit(strange, {"lotion": 0.0}, mode=mode)
@@ -202,8 +205,10 @@ def test_a_trait_of_nobody_or_everybody_is_refused_by_name(rng, label, who):
 
 def test_groups_of_fewer_than_five_get_a_warning(rng):
     samples, _, _ = population(rng)
-    space = TraitSpace.fit(samples, {"rare": np.arange(40) < 4, "common": np.arange(40) >= 4,
-                                     "fine": np.arange(40) < 5})  # fmt: skip
+    space = TraitSpace.fit(
+        samples,
+        {"rare": np.arange(40) < 4, "common": np.arange(40) >= 4, "fine": np.arange(40) < 5},
+    )
     assert "only 4 faces with it" in space.trait("rare").warning
     assert "only 4 faces without it" in space.trait("common").warning
     assert "only" not in space.trait("fine").warning
@@ -239,8 +244,9 @@ def test_doubled_samples_and_constant_columns_add_no_component(rng):
     space = TraitSpace.fit(twice, {"tan": np.tile(label, 2)}, components=7)
     np.testing.assert_allclose(
         space.trait("tan").vector,
-        samples[label].mean(axis=0) - samples[~label].mean(axis=0), atol=1e-10,
-    )  # fmt: skip
+        samples[label].mean(axis=0) - samples[~label].mean(axis=0),
+        atol=1e-10,
+    )
     with pytest.raises(TraitError, match="expected 1 to 7"):
         TraitSpace.fit(twice, {"tan": np.tile(label, 2)}, components=8)
 

@@ -26,14 +26,19 @@ def library():
         {
             "albedo": TraitSpace.fit(albedo, {"tan": label}, continuous={"age": age}),
             "surface": TraitSpace.fit(
-                surface, {"lotion": label, "rare": np.arange(24) == 20}, metric=metric,
-                space="nmf", basis=np.eye(4), names=tuple("abcd"), seed=3,
+                surface,
+                {"lotion": label, "rare": np.arange(24) == 20},
+                metric=metric,
+                space="nmf",
+                basis=np.eye(4),
+                names=tuple("abcd"),
+                seed=3,
             ),
         },
         "simulated",
         parameters={"people": 24},
         files={"texture.npz": b"edges"},
-    )  # fmt: skip
+    )
 
 
 def test_a_library_comes_back_as_it_was_stored(library):

@@ -17,9 +17,10 @@ from model.wrinkles.partial_derivatives import Layer
 def face(rng):
     rows = dict.fromkeys(JIMENEZ2011.rows, (0.0,)) | {"lemon": (0.5,)}
     lemon = Layer(
-        rng.uniform(-0.3, 0.3, (4, 4, 2)).astype(np.float32), np.ones((1, 2, 2), np.float32),
+        rng.uniform(-0.3, 0.3, (4, 4, 2)).astype(np.float32),
+        np.ones((1, 2, 2), np.float32),
         ExpressionTable(("all",), rows, "drawn"),
-    )  # fmt: skip
+    )
     first = Layer(
         rng.uniform(-0.3, 0.3, (8, 8, 2)).astype(np.float32),
         rng.random((8, 4, 4), np.float32),
@@ -30,9 +31,12 @@ def face(rng):
     base = rng.uniform(-0.5, 0.5, (16, 12, 2)).astype(np.float32)
     base[3, 4] = np.nan
     return WrinkleModel(
-        base, (first, lemon), "signed", base_stderr=np.full((16, 12, 2), 0.02, np.float32),
+        base,
+        (first, lemon),
+        "signed",
+        base_stderr=np.full((16, 12, 2), 0.02, np.float32),
         weight_stderr={"joy": (0.1, math.inf, *[0.2] * 6)},
-    )  # fmt: skip
+    )
 
 
 def test_a_model_comes_back_from_its_folder(face, tmp_path):

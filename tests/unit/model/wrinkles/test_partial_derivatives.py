@@ -33,9 +33,11 @@ def bilinear(texture, shape):
             u = (x + 0.5) / shape[1] * w - 0.5
             j, i = int(np.floor(v)), int(np.floor(u))
             corners = [
-                (j, i, (1 - v + j) * (1 - u + i)), (j, i + 1, (1 - v + j) * (u - i)),
-                (j + 1, i, (v - j) * (1 - u + i)), (j + 1, i + 1, (v - j) * (u - i)),
-            ]  # fmt: skip
+                (j, i, (1 - v + j) * (1 - u + i)),
+                (j, i + 1, (1 - v + j) * (u - i)),
+                (j + 1, i, (v - j) * (1 - u + i)),
+                (j + 1, i + 1, (v - j) * (u - i)),
+            ]
             out[y, x] = sum(
                 part * texture[np.clip(a, 0, h - 1), np.clip(b, 0, w - 1)] for a, b, part in corners
             )
@@ -155,12 +157,24 @@ def test_texture_values_hold_minus_one_to_one_in_zero_to_one():
 def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
     assert tuple(JIMENEZ2011.rows) == ("joy", "surprise", "fear", "anger", "disgust", "sad")
     assert JIMENEZ2011.zones == (
-        "red", "green", "blue", "brown", "cyan", "magenta", "orange", "gray"
-    )  # fmt: skip
+        "red",
+        "green",
+        "blue",
+        "brown",
+        "cyan",
+        "magenta",
+        "orange",
+        "gray",
+    )
     sums = {name: round(sum(row), 9) for name, row in JIMENEZ2011.rows.items()}
     assert sums == {
-        "joy": 2.4, "surprise": 3.2, "fear": 3.1, "anger": -0.2, "disgust": 3.3, "sad": 3.0
-    }  # fmt: skip
+        "joy": 2.4,
+        "surprise": 3.2,
+        "fear": 3.1,
+        "anger": -0.2,
+        "disgust": 3.3,
+        "sad": 3.0,
+    }
     assert {row for row in ROW_OF_STATE.values() if row} == set(JIMENEZ2011.rows)
 
 
@@ -219,8 +233,10 @@ def test_a_table_comes_back_from_its_own_text():
     table = ExpressionTable(("a", "b"), {"wink": (0.1, -1 / 3)}, "mine\nof today")
     again = read_table(table.to_csv())
     assert (again.zones, dict(again.rows), again.source) == (
-        table.zones, dict(table.rows), table.source
-    )  # fmt: skip
+        table.zones,
+        dict(table.rows),
+        table.source,
+    )
 
 
 @pytest.mark.parametrize(
@@ -241,9 +257,13 @@ def test_a_broken_table_is_refused(text, says):
 
 @pytest.mark.parametrize(
     ("shape", "texels", "mask_texels"),
-    [((16, 16), (4, 4), (2, 2)), ((12, 9), (5, 7), (3, 2)), ((5, 6), (1, 1), (1, 3)),
-     ((7, 7), (7, 7), (7, 7))],
-)  # fmt: skip
+    [
+        ((16, 16), (4, 4), (2, 2)),
+        ((12, 9), (5, 7), (3, 2)),
+        ((5, 6), (1, 1), (1, 3)),
+        ((7, 7), (7, 7), (7, 7)),
+    ],
+)
 def test_the_sum_is_listing_1_1_s(rng, shape, texels, mask_texels):
     base, wrinkle = rng.uniform(-0.5, 0.5, (*shape, 2)), rng.uniform(-0.5, 0.5, (*texels, 2))
     masks = rng.random((8, *mask_texels))
@@ -325,9 +345,11 @@ def test_a_hole_in_the_base_is_a_zero_normal_and_its_neighbours_are_whole(rng):
 )
 def test_what_does_not_fit_is_refused(change, says):
     given = {
-        "base": np.zeros((4, 4, 2)), "wrinkle": np.zeros((2, 2, 2)), "masks": np.ones((8, 2, 2)),
+        "base": np.zeros((4, 4, 2)),
+        "wrinkle": np.zeros((2, 2, 2)),
+        "masks": np.ones((8, 2, 2)),
         "weights": {"joy": 1.0},
-    }  # fmt: skip
+    }
     with pytest.raises(WrinkleError, match=says):
         wrinkles.combine(**(given | change))
 

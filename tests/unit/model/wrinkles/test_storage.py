@@ -50,8 +50,9 @@ def test_the_bytes_counted_are_those_that_the_encoding_makes(rng, encoding, byte
     assert made[encoding] == storage.texture_bytes((32, 16), bytes_, in_blocks=encoding == "bc5")
 
 
-@pytest.mark.parametrize(("encoding", "largest"), [("float32", 1e-7), ("float16", 5e-4),
-                                                   ("unit8", 1.0 / 255 + 1e-6)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("encoding", "largest"), [("float32", 1e-7), ("float16", 5e-4), ("unit8", 1.0 / 255 + 1e-6)]
+)
 def test_a_stored_map_is_off_by_half_a_step_of_its_encoding(rng, encoding, largest):
     d = rng.uniform(-1, 1, (20, 20, 2))
     assert np.abs(storage.stored_map(d, encoding) - d).max() <= largest

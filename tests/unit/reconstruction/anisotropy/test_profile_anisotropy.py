@@ -65,9 +65,12 @@ def test_coefficients_that_are_a_tenth_off_hardly_change_the_ratio():
     truth, _ = turned_profiles(1.3, 0.7)
     for factor_a, factor_s in ((1.1, 1.0), (0.9, 1.0), (1.0, 1.1), (1.0, 0.9)):
         found = estimate_from_profiles(
-            SIXTEEN, RADIUS_MM, truth,
-            sigma_a_per_mm=factor_a * SIGMA_A, sigma_s_prime_per_mm=factor_s * SIGMA_S_PRIME,
-        )  # fmt: skip
+            SIXTEEN,
+            RADIUS_MM,
+            truth,
+            sigma_a_per_mm=factor_a * SIGMA_A,
+            sigma_s_prime_per_mm=factor_s * SIGMA_S_PRIME,
+        )
         assert np.log(found.ratio) == pytest.approx(np.log(1.3), rel=profile_comparison.MODEL_ERROR)
 
 

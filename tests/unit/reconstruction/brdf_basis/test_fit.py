@@ -25,9 +25,7 @@ def face():
 
 def samples_of(p, **changes):
     given = {"variance": p.variance, "valid": p.valid, **changes}
-    return brdf_basis.surface_samples(
-        p.f, p.light, p.view, p.normals, p.r_d, eta=1.3, **given
-    )  # fmt: skip
+    return brdf_basis.surface_samples(p.f, p.light, p.view, p.normals, p.r_d, eta=1.3, **given)
 
 
 def matrix(s, basis, point):
@@ -63,10 +61,12 @@ def test_a_mixture_comes_back_through_the_whole_convention(face, basis):
     rng = np.random.default_rng(9)
     truth = np.zeros((len(face.f), 59))
     truth[:, [7, 16, 40]] = rng.uniform(0.2, 1.0, (len(face.f), 3))
-    lobe = np.stack([
-        brdf_basis.evaluate(x, basis, to, at, n)
-        for x, to, at, n in zip(truth, face.light, face.view, face.normals, strict=True)
-    ])  # fmt: skip
+    lobe = np.stack(
+        [
+            brdf_basis.evaluate(x, basis, to, at, n)
+            for x, to, at, n in zip(truth, face.light, face.view, face.normals, strict=True)
+        ]
+    )
     through = np.ones(lobe.shape)
     for v in (face.light, face.view):
         cosine = np.clip(np.einsum("pmc,pc->pm", v, face.normals), 0.0, 1.0)
@@ -77,10 +77,14 @@ def test_a_mixture_comes_back_through_the_whole_convention(face, basis):
     )
     for compress in ("none", "cbrt"):
         found = brdf_basis.fit_weights(s, basis, compress=compress)
-        back = np.stack([
-            brdf_basis.evaluate(x, basis, to, at, n)
-            for x, to, at, n in zip(found.weights, face.light, face.view, face.normals, strict=True)
-        ])  # fmt: skip
+        back = np.stack(
+            [
+                brdf_basis.evaluate(x, basis, to, at, n)
+                for x, to, at, n in zip(
+                    found.weights, face.light, face.view, face.normals, strict=True
+                )
+            ]
+        )
         error = np.abs(back - lobe)[s.valid] / lobe[s.valid].mean()
         assert np.median(error) < 0.002
         # were F_r to multiply the tables once more, this would be near 1
@@ -93,10 +97,12 @@ def held_out(p, s, rng, basis, compress):
     found = brdf_basis.fit_weights(
         dataclasses.replace(s, valid=s.valid & ~out), basis, compress=compress
     )
-    surface = np.stack([
-        brdf_basis.evaluate(x, basis, to, at, n)
-        for x, to, at, n in zip(found.weights, p.light, p.view, p.normals, strict=True)
-    ])  # fmt: skip
+    surface = np.stack(
+        [
+            brdf_basis.evaluate(x, basis, to, at, n)
+            for x, to, at, n in zip(found.weights, p.light, p.view, p.normals, strict=True)
+        ]
+    )
     total = p.surface + 0.9 * p.r_d[:, 1:2] / np.pi
     root = np.cbrt(surface) - np.cbrt(p.surface)
     at = s.valid & out
@@ -118,16 +124,25 @@ def test_the_scale_s_standard_error_covers_the_truth(basis):
     rng = np.random.default_rng(14)
     p = brdf_truth.dome(150, r_d=brdf_truth.DARK_SKIN, noise=0.0, samples=300, rng=rng)
     lobe = brdf_basis.evaluate(
-        np.eye(59)[20], basis, p.light.reshape(-1, 3), p.view.reshape(-1, 3),
+        np.eye(59)[20],
+        basis,
+        p.light.reshape(-1, 3),
+        p.view.reshape(-1, 3),
         np.repeat(p.normals, p.light.shape[1], axis=0),
-    ).reshape(p.valid.shape)  # fmt: skip
+    ).reshape(p.valid.shape)
     sigma = 0.05 * lobe[..., None] + 0.002
     f = lobe[..., None] + sigma * rng.standard_normal((*lobe.shape, 3))
     zero = np.zeros_like(p.r_d)
     s = brdf_basis.surface_samples(
-        f, p.light, p.view, p.normals, zero, eta=1.3,
-        variance=np.broadcast_to(sigma**2, f.shape), valid=p.valid,
-    )  # fmt: skip
+        f,
+        p.light,
+        p.view,
+        p.normals,
+        zero,
+        eta=1.3,
+        variance=np.broadcast_to(sigma**2, f.shape),
+        valid=p.valid,
+    )
     only = brdf_tables.tabulate({"it": lambda to, at: basis.evaluate(to, at, [0, 0, 1.0])[..., 20]})
     found = brdf_basis.fit_weights(s, only, compress="none")
     z = (found.weights[:, 0] - 1.0) / found.stderr

@@ -22,8 +22,10 @@ def table():
 
 def smooth(rng, shape, length):
     """Draw a field of mean 0 and standard deviation 1 that changes over `length` pixels."""
-    waves = [np.fft.fftfreq(size)[:, None] if k == 0 else np.fft.fftfreq(size)[None, :]
-             for k, size in enumerate(shape)]  # fmt: skip
+    waves = [
+        np.fft.fftfreq(size)[:, None] if k == 0 else np.fft.fftfreq(size)[None, :]
+        for k, size in enumerate(shape)
+    ]
     low = np.exp(-2 * (np.pi * length) ** 2 * (waves[0] ** 2 + waves[1] ** 2))
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal(shape)) * low).real
     return (field - field.mean()) / field.std()
@@ -57,17 +59,27 @@ def spotted(table, melanin, mole_melanin, rng):
 
 @pytest.mark.parametrize(
     ("melanin", "mole_melanin", "explained_away"),
-    [(0.05, 0.1, True), (0.05, 0.12, True), (0.05, 0.2, True), (0.09, 0.15, True),
-     (0.09, 0.22, False), (0.02, 0.04, False)],
-)  # fmt: skip
+    [
+        (0.05, 0.1, True),
+        (0.05, 0.12, True),
+        (0.05, 0.2, True),
+        (0.09, 0.15, True),
+        (0.09, 0.22, False),
+        (0.02, 0.04, False),
+    ],
+)
 def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, explained_away, rng):
     """A face by itself does not hold some of the moles within 2.4 standard errors."""
     truth, moles, shades, rgb = spotted(table, melanin, mole_melanin, rng)
     variance, error = np.square(NOISE * rgb), 5e-5 * np.eye(3)
     face = of_colors(
-        rgb, table, prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
-        common_light=0.1, variance=variance, model_error=error,
-    )  # fmt: skip
+        rgb,
+        table,
+        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        common_light=0.1,
+        variance=variance,
+        model_error=error,
+    )
     prior = shading_prior.of_faces()
     by_face = weigh(rgb, table, prior=prior, face=face, variance=variance, model_error=error)
     spots = darker_than_around(rgb, variance=variance)
@@ -108,9 +120,13 @@ def test_lips_are_not_explained_away_as_usual_skin_with_less_blood(table, melani
     rgb = clean * (1 + NOISE * rng.standard_normal(clean.shape))
     variance, error, prior = np.square(NOISE * rgb), 5e-5 * np.eye(3), shading_prior.of_faces()
     face = of_colors(
-        rgb, table, prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
-        common_light=0.1, variance=variance, model_error=error,
-    )  # fmt: skip
+        rgb,
+        table,
+        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        common_light=0.1,
+        variance=variance,
+        model_error=error,
+    )
     by_face, alone = (
         weigh(rgb, table, prior=prior, face=one, variance=variance, model_error=error)
         for one in (face, None)
@@ -131,10 +147,12 @@ def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
     first = weigh(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
     second = weigh(0.5 * rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
     found = either(first, second, np.ones((1, 8), bool))
-    draws = np.concatenate([
-        rng.normal(each.melanin[0, 0], each.stderr_melanin[0, 0], 100_000)
-        for each in (first, second)
-    ])  # fmt: skip
+    draws = np.concatenate(
+        [
+            rng.normal(each.melanin[0, 0], each.stderr_melanin[0, 0], 100_000)
+            for each in (first, second)
+        ]
+    )
     np.testing.assert_allclose(found.melanin[0, 0], draws.mean(), rtol=0.02)
     np.testing.assert_allclose(found.stderr_melanin[0, 0], draws.std(), rtol=0.02)
 

@@ -67,9 +67,14 @@ def test_skin_that_does_not_belong_is_told_and_does_not_widen_the_rest(rng):
 def test_pixels_that_differ_by_their_errors_alone_have_the_least_spreads(rng):
     count = 3000
     found = fitted(
-        seen(np.full(count, -2.0), np.full(count, 0.1), np.full(count, 0.4), np.full(count, 0.05),
-             rng)
-    )  # fmt: skip
+        seen(
+            np.full(count, -2.0),
+            np.full(count, 0.1),
+            np.full(count, 0.4),
+            np.full(count, 0.05),
+            rng,
+        )
+    )
     assert LEAST_SPREAD[0] <= found.melanin.spread < 0.04
     assert found.blood.spread == pytest.approx(LEAST_SPREAD[1], rel=1e-3)
     assert found.melanin.unexpected == pytest.approx(UNEXPECTED, abs=0.005)
@@ -92,8 +97,7 @@ def test_common_errors_widen_by_their_root_sum_of_squares():
         )
 
     known = with_common_errors(
-        face(-3.0, 0.4),
-        [(face(-3.3, 0.4), face(-2.7, 0.4)), (face(-2.6, 0.38), face(-3.4, 0.42))],
+        face(-3.0, 0.4), [(face(-3.3, 0.4), face(-2.7, 0.4)), (face(-2.6, 0.38), face(-3.4, 0.42))]
     )
     assert known.melanin.stderr == pytest.approx(0.5)
     assert known.blood.stderr == pytest.approx(0.02)

@@ -131,9 +131,12 @@ def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_o
     for factor in (1.0, 2.0):
         seen = rgb * np.exp(factor * error)
         found = weigh(
-            seen, table, prior=lognormal(1.0, 0.6), variance=(1e-4 * seen) ** 2,
+            seen,
+            table,
+            prior=lognormal(1.0, 0.6),
+            variance=(1e-4 * seen) ** 2,
             model_error=covariance,
-        )  # fmt: skip
+        )
         inside = np.abs(found.melanin - 0.02) < found.stderr_melanin
         shares.append(inside.mean())
         if factor == 1.0:

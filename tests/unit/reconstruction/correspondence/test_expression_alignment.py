@@ -47,9 +47,11 @@ def alignment_of(source, valid=None, error=0.0, moving_shape=None):
 def test_a_picture_moved_to_the_right_is_found_to_the_right(rng):
     picture = skin(rng)
     found = alignment.align(
-        np.roll(picture, (2, 5), (0, 1)), picture,
-        landmarks_moving=marks((5.0, 2.0)), landmarks_neutral=marks(),
-    )  # fmt: skip
+        np.roll(picture, (2, 5), (0, 1)),
+        picture,
+        landmarks_moving=marks((5.0, 2.0)),
+        landmarks_neutral=marks(),
+    )
     inner = (slice(12, -12),) * 2
     gap = (found.source_px - identity())[inner]
     assert np.sqrt(((gap - [5.0, 2.0]) ** 2).sum(-1).mean()) < 0.1
@@ -61,9 +63,12 @@ def test_landmarks_a_few_pixels_off_are_corrected_by_the_flow(rng):
     picture = skin(rng)
     off = {name: (x + 2.0, y - 1.5) for name, (x, y) in marks((4.0, 0.0)).items()}
     found = alignment.align(
-        np.roll(picture, 4, 1), picture,
-        landmarks_moving=off, landmarks_neutral=marks(), landmark_stderr_px=2.0,
-    )  # fmt: skip
+        np.roll(picture, 4, 1),
+        picture,
+        landmarks_moving=off,
+        landmarks_neutral=marks(),
+        landmark_stderr_px=2.0,
+    )
     gap = (found.source_px - identity())[16:-16, 16:-16] - [4.0, 0.0]
     assert np.sqrt((gap**2).sum(-1).mean()) < 0.2
     # what the landmarks alone would have left
@@ -100,15 +105,23 @@ def test_where_landmarks_cross_over_the_map_folds_and_is_invalid(rng):
     left, right = "36 60", "60 60"
     crossed[left], crossed[right] = neutral[right], neutral[left]
     found = alignment.align(
-        picture, picture, landmarks_moving=crossed, landmarks_neutral=neutral,
-        landmark_stderr_px=0.05, largest_error_px=100.0,
-    )  # fmt: skip
+        picture,
+        picture,
+        landmarks_moving=crossed,
+        landmarks_neutral=neutral,
+        landmark_stderr_px=0.05,
+        largest_error_px=100.0,
+    )
     assert found.folded_fraction > 0.01
     assert not found.valid[60, 44:52].any()
     straight = alignment.align(
-        picture, picture, landmarks_moving=neutral, landmarks_neutral=neutral,
-        landmark_stderr_px=0.05, largest_error_px=100.0,
-    )  # fmt: skip
+        picture,
+        picture,
+        landmarks_moving=neutral,
+        landmarks_neutral=neutral,
+        landmark_stderr_px=0.05,
+        largest_error_px=100.0,
+    )
     assert straight.folded_fraction == 0.0
 
 
@@ -126,10 +139,11 @@ def test_skin_hidden_in_the_moving_picture_is_invalid(rng):
 def test_places_beyond_the_moving_picture_are_invalid(rng):
     picture = skin(rng)
     found = alignment.align(
-        picture[:, :70], picture,
+        picture[:, :70],
+        picture,
         landmarks_moving={k: v for k, v in marks().items() if v[0] < 65},
         landmarks_neutral=marks(),
-    )  # fmt: skip
+    )
     assert not found.valid[:, 71:].any()
     assert found.valid[12:-12, 12:58].all()
 
@@ -226,11 +240,13 @@ def test_arguments_that_do_not_fit_are_named(rng):
     picture = skin(rng, 40)
     cases = (
         ({"landmarks_moving": marks(side=40)}, "landmarks_neutral: got None"),
-        ({"landmarks_moving": {"a": (1.0, 2.0)}, "landmarks_neutral": {"a": (1.0, 2.0)}},
-         "1 names are in both pictures, expected at least 4"),
+        (
+            {"landmarks_moving": {"a": (1.0, 2.0)}, "landmarks_neutral": {"a": (1.0, 2.0)}},
+            "1 names are in both pictures, expected at least 4",
+        ),
         ({"valid_moving": np.ones((3, 3), bool)}, "valid_moving: got shape"),
         ({"valid_neutral": np.zeros((40, 40), bool)}, "neutral: has no valid pixel"),
-    )  # fmt: skip
+    )
     for given, message in cases:
         with pytest.raises(alignment.AlignmentError, match=message):
             alignment.align(picture, picture, **given)

@@ -120,9 +120,14 @@ def test_black_white_and_specular_only_surfaces_have_their_albedo():
         clean = albedo * clean_diffuse(p) / p.r_d[:, None] + p.surface[..., None]
         sigma = 0.01 * (clean + 0.02)
         found = estimate(
-            clean + sigma * rng.standard_normal(clean.shape), p.light, p.view, p.normals,
-            eta=1.3, variance=sigma**2, valid=p.valid,
-        )  # fmt: skip
+            clean + sigma * rng.standard_normal(clean.shape),
+            p.light,
+            p.view,
+            p.normals,
+            eta=1.3,
+            variance=sigma**2,
+            valid=p.valid,
+        )
         assert np.all(found.valid)
         # below the darkest skin's 3 %
         assert np.median(np.abs(found.r_d - albedo)) < 0.03 * (0.05 if albedo == 0.0 else 1.0)
@@ -137,9 +142,7 @@ def test_whatever_is_missing_is_masked_and_never_a_silent_nan():
     f[3] = 0.0
     f[4] = -f[4]
     with np.errstate(all="raise"):
-        found = estimate(
-            f, p.light, p.view, p.normals, eta=1.3, variance=p.variance, valid=valid
-        )  # fmt: skip
+        found = estimate(f, p.light, p.view, p.normals, eta=1.3, variance=p.variance, valid=valid)
     np.testing.assert_array_equal(found.valid, [False, False, valid[2, 0], True, True, True])
     np.testing.assert_array_equal(np.isfinite(found.r_d).all(axis=-1), found.valid)
     assert np.all(np.isfinite(found.stderr[found.valid]))
@@ -155,9 +158,12 @@ def test_grazing_light_alone_gives_no_estimate_and_duplicates_change_nothing():
     assert not np.any(estimate(p.f, light, p.view, p.normals, eta=1.3, variance=p.variance).valid)
     once = fitted(p)
     twice = estimate(
-        *(np.repeat(a, 2, axis=1) for a in (p.f, p.light, p.view)), p.normals, eta=1.3,
-        variance=np.repeat(p.variance, 2, axis=1), valid=np.repeat(p.valid, 2, axis=1),
-    )  # fmt: skip
+        *(np.repeat(a, 2, axis=1) for a in (p.f, p.light, p.view)),
+        p.normals,
+        eta=1.3,
+        variance=np.repeat(p.variance, 2, axis=1),
+        valid=np.repeat(p.valid, 2, axis=1),
+    )
     # Twice the samples make lobes more certain, and so may let one more in.
     np.testing.assert_allclose(twice.r_d, once.r_d, atol=2.0 * float(once.stderr.max()))
 
@@ -175,9 +181,11 @@ def test_leading_axes_broadcast_and_inputs_stay():
     before = p.f.copy()
     flat = fitted(p)
     folded = estimate(
-        *(a.reshape(2, 3, *a.shape[1:]) for a in (p.f, p.light, p.view, p.normals)), eta=1.3,
-        variance=p.variance.reshape(2, 3, -1, 3), valid=p.valid.reshape(2, 3, -1),
-    )  # fmt: skip
+        *(a.reshape(2, 3, *a.shape[1:]) for a in (p.f, p.light, p.view, p.normals)),
+        eta=1.3,
+        variance=p.variance.reshape(2, 3, -1, 3),
+        valid=p.valid.reshape(2, 3, -1),
+    )
     np.testing.assert_array_equal(folded.r_d.reshape(6, 3), flat.r_d)
     np.testing.assert_array_equal(p.f, before)
     one = estimate(p.f, p.light, p.view, p.normals[0], eta=1.3)
@@ -190,17 +198,29 @@ def test_samples_of_one_channel_need_no_axis_for_it(method):
     p = scene("light", points=6, samples=50)
     told = {"variance": p.variance[..., 1], "valid": p.valid}
     wanted = estimate(
-        p.f[..., 1:2], p.light, p.view, p.normals, eta=1.3, method=method,
-        variance=p.variance[..., 1:2], valid=p.valid,
-    )  # fmt: skip
+        p.f[..., 1:2],
+        p.light,
+        p.view,
+        p.normals,
+        eta=1.3,
+        method=method,
+        variance=p.variance[..., 1:2],
+        valid=p.valid,
+    )
     gray = estimate(p.f[..., 1], p.light, p.view, p.normals, eta=1.3, method=method, **told)
     np.testing.assert_array_equal(gray.r_d, wanted.r_d[:, 0])
     np.testing.assert_array_equal(gray.stderr, wanted.stderr[:, 0])
     np.testing.assert_array_equal(gray.valid, wanted.valid)
     point = estimate(
-        p.f[4, :, 1], p.light[4], p.view[4], p.normals[4], eta=1.3, method=method,
-        variance=p.variance[4, :, 1], valid=p.valid[4],
-    )  # fmt: skip
+        p.f[4, :, 1],
+        p.light[4],
+        p.view[4],
+        p.normals[4],
+        eta=1.3,
+        method=method,
+        variance=p.variance[4, :, 1],
+        valid=p.valid[4],
+    )
     assert point.r_d.shape == point.stderr.shape == point.valid.shape == ()
     assert point.r_d == gray.r_d[4]
     assert np.isfinite(reduced_albedo(point, eta=1.3).albedo_prime)
@@ -238,9 +258,7 @@ def test_points_without_samples_or_with_directions_that_are_none_are_masked(meth
 )
 def test_shapes_that_fit_nothing_are_named(change, says):
     p = scene("light", points=6, samples=50)
-    given = {
-        "brdf_samples": p.f, "light_dirs": p.light, "view_dirs": p.view, "normals": p.normals,
-    }  # fmt: skip
+    given = {"brdf_samples": p.f, "light_dirs": p.light, "view_dirs": p.view, "normals": p.normals}
     with pytest.raises(ValueError, match=says):
         estimate(**(given | change), eta=1.3)
 

@@ -51,8 +51,9 @@ def test_intervals_of_68_percent_hold_as_often_and_are_longer_above():
     rng, noise = np.random.default_rng(21), 1e-3
     clean, runs, held, longer = relaxing(PHASE, 1.0), 40, 0, []
     for _ in range(runs):
-        found = fit_cycle(PHASE, 0.03 + 0.01 * clean + noise * rng.standard_normal(22),
-                          cycle_s=CYCLE_S)  # fmt: skip
+        found = fit_cycle(
+            PHASE, 0.03 + 0.01 * clean + noise * rng.standard_normal(22), cycle_s=CYCLE_S
+        )
         low, high = found.interval_68_s
         assert found.interval_s[0] <= low <= found.time_constant_s <= high <= found.interval_s[1]
         if found.known == "estimated":
@@ -227,8 +228,12 @@ def test_a_bend_adds_to_an_interval_in_squares():
     rng = np.random.default_rng(6)
     seen = 0.044 - 0.015 * (1.0 - np.exp(-time / 20.0)) + 1e-4 * rng.standard_normal(time.size)
     plain, bent, twice = (fit_course(time, seen, bend=bend) for bend in (0.0, 0.05, 0.1))
-    for name, end in (("interval_s", 0), ("interval_s", 1), ("interval_68_s", 0),
-                      ("interval_68_s", 1)):  # fmt: skip
+    for name, end in (
+        ("interval_s", 0),
+        ("interval_s", 1),
+        ("interval_68_s", 0),
+        ("interval_68_s", 1),
+    ):
         shares = [
             np.log(getattr(fit, name)[end] / fit.time_constant_s) ** 2
             for fit in (plain, bent, twice)
@@ -274,12 +279,18 @@ def test_steps_and_changes_lie_within_their_errors():
     for _ in range(runs):
         step = spread * rng.standard_normal()
         found = fit_cycle(
-            PHASE, with_step(rng, constant_s=1.0, step=step), cycle_s=CYCLE_S,
+            PHASE,
+            with_step(rng, constant_s=1.0, step=step),
+            cycle_s=CYCLE_S,
             pose=PoseStep(MOVED, np.array([spread])),
-        )  # fmt: skip
+        )
         change = found.end[0] - found.start[0]
-        pulls.append([(found.step[0] - step) / found.stderr_step[0],
-                      (change - 0.01) / found.stderr_change[0]])  # fmt: skip
+        pulls.append(
+            [
+                (found.step[0] - step) / found.stderr_step[0],
+                (change - 0.01) / found.stderr_change[0],
+            ]
+        )
     squares = np.square(pulls).sum(axis=0)
     assert (squares < stats.chi2.ppf(0.999, runs)).all()
     # the delay is the same in all runs and near the middle of what it may be: less than its error

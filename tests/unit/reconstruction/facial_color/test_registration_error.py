@@ -19,10 +19,17 @@ def laid_over(error_px, size=SIZE):
     rows, columns = np.indices((size, size))
     everywhere = np.ones((size, size), bool)
     return Alignment(
-        np.stack([columns, rows], axis=-1).astype(np.float32), everywhere,
-        np.full((size, size), error_px, np.float32), np.zeros((size, size), np.float32),
-        everywhere, 0.0, {}, 0.0, "landmarks", (size, size),
-    )  # fmt: skip
+        np.stack([columns, rows], axis=-1).astype(np.float32),
+        everywhere,
+        np.full((size, size), error_px, np.float32),
+        np.zeros((size, size), np.float32),
+        everywhere,
+        0.0,
+        {},
+        0.0,
+        "landmarks",
+        (size, size),
+    )
 
 
 def skin(rng, size=SIZE):
@@ -161,9 +168,13 @@ def test_changes_of_a_misplaced_face_are_covered_and_are_not_without_its_own_err
     shares = []
     for own in (np.stack([0.0 * place, place]), None):
         found = shared_melanin.weigh(
-            rgb, table, prior=shading_prior.of_faces(), variance=variance, own_error=own,
+            rgb,
+            table,
+            prior=shading_prior.of_faces(),
+            variance=variance,
+            own_error=own,
             shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-        )  # fmt: skip
+        )
         good = found.valid_states[1] & ~found.misfits[1]
         shares.append(np.mean(np.abs(found.change[1]) < found.stderr_change[1], where=good))
     assert shares[0] > 0.6

@@ -143,10 +143,16 @@ def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
         found = shared_melanin.weigh(
             rgb, table, prior=prior, variance=variance, model_error=error, own_share=0.0
         )
-        return np.stack([
-            found.melanin, found.stderr_melanin, found.noise_stderr_melanin,
-            *found.hemoglobin, *found.stderr_hemoglobin, *found.stderr_change,
-        ])  # fmt: skip
+        return np.stack(
+            [
+                found.melanin,
+                found.stderr_melanin,
+                found.noise_stderr_melanin,
+                *found.hemoglobin,
+                *found.stderr_hemoglobin,
+                *found.stderr_change,
+            ]
+        )
 
     mixed = maps(np.where(rough[:, None, None], coarse, fine))
     np.testing.assert_allclose(mixed[:, ~rough], maps(fine)[:, ~rough], rtol=2e-3)
@@ -362,9 +368,13 @@ def test_pixels_of_one_face_tell_each_others_melanin_and_moles_stay_moles(table,
     errors = {}
     for one_face in (False, True):
         found = shared_melanin.weigh(
-            seen, table, prior=prior, variance=(3e-3 * clean) ** 2, one_face=one_face,
+            seen,
+            table,
+            prior=prior,
+            variance=(3e-3 * clean) ** 2,
+            one_face=one_face,
             model_error=model_error.color_errors().transport,
-        )  # fmt: skip
+        )
         usual = found.valid.copy()
         usual[mole] = False
         off = np.abs(found.melanin - melanin)

@@ -45,9 +45,21 @@ def unit(v):
 
 
 def pictures(
-    normals, lights, *, strength=None, alpha=0.2, diffuse=0.4, off_deg=0.0, leak=0.0, view=VIEW,
-    programmed=None, point_mm=None, distance_mm=np.inf, dark=0.0, polarized_exit=True,
-):  # fmt: skip
+    normals,
+    lights,
+    *,
+    strength=None,
+    alpha=0.2,
+    diffuse=0.4,
+    off_deg=0.0,
+    leak=0.0,
+    view=VIEW,
+    programmed=None,
+    point_mm=None,
+    distance_mm=np.inf,
+    dark=0.0,
+    polarized_exit=True,
+):
     """Return pictures by (pattern, polarizer), in units of a white diffuser in full light."""
     e = np.ones(len(lights)) if strength is None else np.asarray(strength)
     coordinates = lights if programmed is None else programmed
@@ -217,8 +229,15 @@ def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
         cov = np.linalg.inv(A.T @ W @ A)
         fit = cov @ A.T @ W @ y[there]
         np.testing.assert_allclose(out[:4, 0], fit[:4], rtol=1e-8, atol=1e-8)
-        for row, i, j in ((4, 0, 0), (5, 1, 1), (6, 2, 2), (7, 3, 3), (8, 1, 2), (9, 1, 3),
-                          (10, 2, 3)):  # fmt: skip
+        for row, i, j in (
+            (4, 0, 0),
+            (5, 1, 1),
+            (6, 2, 2),
+            (7, 3, 3),
+            (8, 1, 2),
+            (9, 1, 3),
+            (10, 2, 3),
+        ):
             np.testing.assert_allclose(out[row, 0], cov[i, j], rtol=1e-8, atol=1e-9)
         r = y[there] - A @ fit
         np.testing.assert_allclose(out[kernels.CHI, 0], r @ W @ r, rtol=1e-7, atol=1e-9)
@@ -297,9 +316,11 @@ def test_four_patterns_cost_error_as_announced(rng):
     errors, told = {}, {}
     for label, names in (("all", NAMES), ("four", ("full", "x", "y", "z"))):
         found = from_patterns(
-            only(images, names), lights=SphereLights(lights), alpha=0.3,
+            only(images, names),
+            lights=SphereLights(lights),
+            alpha=0.3,
             variance=SensorNoise(1e-7, 1e-7),
-        )  # fmt: skip
+        )
         errors[label], told[label] = error_deg(found, normals).mean(), found.stderr_rad.mean()
     assert errors["four"] > 1.3 * errors["all"]
     np.testing.assert_allclose(errors["four"] / errors["all"], told["four"] / told["all"], rtol=0.1)
@@ -336,9 +357,11 @@ def test_what_is_not_known_about_the_lights_is_in_the_standard_errors():
     for _ in range(24):
         strength = 1.0 + 0.05 * rng.standard_normal(len(lights))
         found = from_patterns(
-            pictures(normals, lights, strength=strength, alpha=0.3), lights=told, alpha=0.3,
+            pictures(normals, lights, strength=strength, alpha=0.3),
+            lights=told,
+            alpha=0.3,
             variance=1e-18,
-        )  # fmt: skip
+        )
         announced = np.mean(found.stderr_rad**2)
         ratios.append(np.mean(np.radians(error_deg(found, normals)) ** 2) / announced)
     ratios = np.array(ratios)
@@ -408,9 +431,11 @@ def test_points_away_from_the_middle_see_lights_and_camera_elsewhere(component):
     if component == "specular":
         kwargs["alpha"] = 0.3
     there = from_patterns(
-        images, view=np.broadcast_to(view, (16, 16, 3)),
-        points_mm=np.broadcast_to(point, (16, 16, 3)), **kwargs,
-    )  # fmt: skip
+        images,
+        view=np.broadcast_to(view, (16, 16, 3)),
+        points_mm=np.broadcast_to(point, (16, 16, 3)),
+        **kwargs,
+    )
     offset = (there.normals - normals).mean(axis=(0, 1))
     middle = from_patterns(images, **kwargs)
     before = (middle.normals - normals).mean(axis=(0, 1))
@@ -498,8 +523,11 @@ def test_a_mask_of_one_pixel_and_pictures_full_of_nan_are_survived(scene, option
 
 def test_lobes_beyond_the_horizon_are_no_normals():
     """What comes back from behind the surface, as from a neighbour's flank, has no normal."""
-    images = {(n, p): np.full((2, 2), 0.5) for n in ("full", "x", "y", "z")
-              for p in ("parallel", "crossed")}  # fmt: skip
+    images = {
+        (n, p): np.full((2, 2), 0.5)
+        for n in ("full", "x", "y", "z")
+        for p in ("parallel", "crossed")
+    }
     behind = unit(np.array([0.05, 0.0, -1.0]))
     for name, w in zip(("full", "x", "y", "z"), (1.0, *(1 + behind) / 2), strict=True):
         images[name, "parallel"] = images[name, "parallel"] + 0.1 * w

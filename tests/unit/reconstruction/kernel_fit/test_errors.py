@@ -114,9 +114,12 @@ def strained_pair(rng, side=96):
 
 
 TOLD = {
-    "stretch": 1.0, "pixel_um": 6.0, "alphas": ALPHAS, "sigmas_um": SIGMAS_UM,
+    "stretch": 1.0,
+    "pixel_um": 6.0,
+    "alphas": ALPHAS,
+    "sigmas_um": SIGMAS_UM,
     "search": "exhaustive",
-}  # fmt: skip
+}
 
 
 def test_one_piece_of_skin_tells_a_kernel_better_than_two(rng):

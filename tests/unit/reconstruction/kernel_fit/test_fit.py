@@ -200,9 +200,13 @@ def test_a_mask_hides_damage_from_the_fit(rng):
 
 def test_a_flat_patch_has_no_kernel():
     fit = fit_kernel(
-        np.zeros((40, 40)), nh.histogram(np.zeros((40, 40)), pixel=1.0),
-        stretch=0.9, axis="x", pixel_um=PIXEL_UM, **COARSE,
-    )  # fmt: skip
+        np.zeros((40, 40)),
+        nh.histogram(np.zeros((40, 40)), pixel=1.0),
+        stretch=0.9,
+        axis="x",
+        pixel_um=PIXEL_UM,
+        **COARSE,
+    )
     assert not fit.valid
     assert "flat" in fit.reason
     assert fit.alpha == 0.0
@@ -234,9 +238,14 @@ def test_sigma_far_below_a_pixel_is_a_tie_that_goes_to_the_gentlest_kernel(rng):
     target = convolved_histogram(height, 0.0, 1.0, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
     assert gaussian_weights(0.4 / PIXEL_UM).size == 1
     fit = fit_kernel(
-        height, target, stretch=1.0, axis="x", pixel_um=PIXEL_UM,
-        alphas=np.array([-2.0, -0.5, 0.3, 1.0]), sigmas_um=np.array([0.2, 0.4, 30.0]),
-    )  # fmt: skip
+        height,
+        target,
+        stretch=1.0,
+        axis="x",
+        pixel_um=PIXEL_UM,
+        alphas=np.array([-2.0, -0.5, 0.3, 1.0]),
+        sigmas_um=np.array([0.2, 0.4, 30.0]),
+    )
     assert (fit.alpha, fit.sigma_um, fit.distance) == (0.3, 0.2, 0.0)
     ties = fit.near_best[fit.near_best[:, 2] == 0.0]
     assert len(ties) == 8
@@ -254,15 +263,20 @@ def test_neutral_skin_has_the_neutral_kernel_and_a_wide_valley(rng):
 
 def test_tiny_maps_are_fitted_but_called_aliased(rng):
     fit = fit_kernel(
-        skin(16, rng)[:3, :3], nh.histogram(skin(64, rng), pixel=PIXEL_UM),
-        stretch=0.9, axis="y", pixel_um=PIXEL_UM, **COARSE,
-    )  # fmt: skip
+        skin(16, rng)[:3, :3],
+        nh.histogram(skin(64, rng), pixel=PIXEL_UM),
+        stretch=0.9,
+        axis="y",
+        pixel_um=PIXEL_UM,
+        **COARSE,
+    )
     assert fit.samples == 9
     assert fit.aliased
     assert not fit.valid
     with pytest.raises(KernelFitError, match="slope"):
-        fit_kernel(np.zeros((1, 5)), np.full((64, 64), 1 / 4096), stretch=1.0, axis="x",
-                   pixel_um=PIXEL_UM)  # fmt: skip
+        fit_kernel(
+            np.zeros((1, 5)), np.full((64, 64), 1 / 4096), stretch=1.0, axis="x", pixel_um=PIXEL_UM
+        )
 
 
 def test_a_finer_minimum_than_the_grid_is_refined(rng):
@@ -288,9 +302,13 @@ def test_standard_errors_tell_how_far_another_patch_is_off(rng):
     for _ in range(10):
         other = convolved(skin(128, rng), -0.8, 20.0, axis="x", pixel_um=PIXEL_UM)
         fit = fit_kernel(
-            skin(128, rng), nh.histogram(other, pixel=PIXEL_UM), stretch=1.0, axis="x",
-            pixel_um=PIXEL_UM, **grid,
-        )  # fmt: skip
+            skin(128, rng),
+            nh.histogram(other, pixel=PIXEL_UM),
+            stretch=1.0,
+            axis="x",
+            pixel_um=PIXEL_UM,
+            **grid,
+        )
         pulls.append((fit.alpha + 0.8) / fit.alpha_stderr)
     assert 0.1 < np.mean(np.square(pulls)) < 5.2
 
@@ -301,10 +319,12 @@ def test_both_axes_are_found_in_turn(rng):
     both = convolved(height, -0.8, 14.0, axis="x", pixel_um=PIXEL_UM)
     both = convolved(both, 0.6, 20.0, axis="y", pixel_um=PIXEL_UM)
     target = nh.histogram(both, pixel=(PIXEL_UM * 1.05, PIXEL_UM * 0.85))
-    one = fit_kernel(height, target, stretch=0.85, stretch_across=1.05, axis="x",
-                     pixel_um=PIXEL_UM, **COARSE)  # fmt: skip
-    fit = fit_two_axes(height, target, stretch=0.85, stretch_across=1.05, axis="x",
-                       pixel_um=PIXEL_UM, **COARSE)  # fmt: skip
+    one = fit_kernel(
+        height, target, stretch=0.85, stretch_across=1.05, axis="x", pixel_um=PIXEL_UM, **COARSE
+    )
+    fit = fit_two_axes(
+        height, target, stretch=0.85, stretch_across=1.05, axis="x", pixel_um=PIXEL_UM, **COARSE
+    )
     assert fit.settled
     assert (fit.along.alpha, fit.along.sigma_um) == (-0.8, 14.0)
     assert (fit.across.alpha, fit.across.sigma_um) == (0.6, 20.0)

@@ -67,9 +67,12 @@ def test_a_straight_line_is_not_broken(rng):
 
 def test_weights_leave_a_bad_point_out():
     points = forehead_points()
-    r, a, s = ([*values, bad] for values, bad in zip(
-        (points.stretch, points.alpha, points.sigma_um), (1.1, -2.0, 90.0), strict=True
-    ))  # fmt: skip
+    r, a, s = (
+        [*values, bad]
+        for values, bad in zip(
+            (points.stretch, points.alpha, points.sigma_um), (1.1, -2.0, 90.0), strict=True
+        )
+    )
     spoiled = fit_table(r, a, s)
     mended = fit_table(r, a, s, weights=[1.0] * 8 + [0.0])
     clean = fit_table(points.stretch, points.alpha, points.sigma_um)

@@ -33,10 +33,7 @@ class Pinhole:
         depth = -(local @ back)
         scale = np.where(depth > 0, FOCAL_PX / np.where(depth > 0, depth, 1.0), np.nan)
         return np.stack(
-            [
-                (WIDTH - 1) / 2 + scale * (local @ right),
-                (HEIGHT - 1) / 2 - scale * (local @ up),
-            ],
+            [(WIDTH - 1) / 2 + scale * (local @ right), (HEIGHT - 1) / 2 - scale * (local @ up)],
             axis=-1,
         )
 

@@ -31,8 +31,9 @@ def test_slopes_are_numpys_gradients_and_one_sided_beside_holes(rng):
 
 def test_a_list_of_rows_is_a_map():
     rows = [[0.0, 1.0, 2.0], [0.5, 1.5, 4.0]]
-    for ours, theirs in zip(slopes(rows, pixel=1.0), slopes(np.array(rows), pixel=1.0),
-                            strict=True):  # fmt: skip
+    for ours, theirs in zip(
+        slopes(rows, pixel=1.0), slopes(np.array(rows), pixel=1.0), strict=True
+    ):
         np.testing.assert_array_equal(ours, theirs)
     whole = [[0, 1, 2], [0, 1, 2]]
     assert slopes(whole, pixel=1)[0].tolist() == [[1.0] * 3] * 2

@@ -52,8 +52,10 @@ def test_standard_error_of_variances_is_their_scatter(rng):
 
 
 def test_effective_number_of_correlated_normals_tells_the_distance_of_two_patches(rng):
-    pairs = [[measure(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16)
-              for _ in range(2)] for _ in range(12)]  # fmt: skip
+    pairs = [
+        [measure(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16) for _ in range(2)]
+        for _ in range(12)
+    ]
     real = np.mean([nh.distance(a.histogram, b.histogram) for a, b in pairs])
     effective = [m.effective_samples for pair in pairs for m in pair]
     told = nh.noise_floor(pairs[0][0].histogram, float(np.mean(effective)))

@@ -110,8 +110,7 @@ def test_the_fourth_order_leaves_a_thirtieth_of_the_error_of_the_mean_of_two():
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize(
-    "mask",
-    ["disc", "parts", "pepper", "checkerboard", "necks", "odd rows", "one pixel", "spiral"],
+    "mask", ["disc", "parts", "pepper", "checkerboard", "necks", "odd rows", "one pixel", "spiral"]
 )
 def test_the_multigrid_solves_what_a_direct_solver_solves(mask, weighted, rng):
     rows, columns = 45, 62

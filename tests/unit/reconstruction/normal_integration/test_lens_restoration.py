@@ -108,8 +108,7 @@ def test_what_is_not_valid_stands_upright():
 
 
 @pytest.mark.parametrize(
-    ("lens", "valid", "words"),
-    [(Aperture(17.9, 30.0), ALL, "pixel_um"), (LENS, ~ALL, "valid")],
+    ("lens", "valid", "words"), [(Aperture(17.9, 30.0), ALL, "pixel_um"), (LENS, ~ALL, "valid")]
 )
 def test_what_cannot_be_restored_is_refused(lens, valid, words):
     with pytest.raises(RestorationError, match=words):

@@ -33,9 +33,7 @@ def face(points=40, seed=1):
 
 def told(normals, lights, noise=0.01, **more):
     lit = normals @ lights.T
-    return selection.information(
-        normals, lights, np.where(lit > 0.15, noise**2, np.inf), **more
-    )  # fmt: skip
+    return selection.information(normals, lights, np.where(lit > 0.15, noise**2, np.inf), **more)
 
 
 @pytest.mark.parametrize("count", [4, 8, 20])
@@ -123,8 +121,10 @@ def test_the_median_of_rayleigh_angles_is_that_of_draws():
 @pytest.mark.parametrize("broken", ["weight", "tilt", "negative", "shape"])
 def test_bad_information_is_refused_by_name(broken):
     good = told(face(3), dome(4))
-    fields = {name: getattr(good, name).copy() for name in
-              ("tilt", "weight", "reaches", "importance", "systematic_rad")}  # fmt: skip
+    fields = {
+        name: getattr(good, name).copy()
+        for name in ("tilt", "weight", "reaches", "importance", "systematic_rad")
+    }
     if broken == "negative":
         fields["importance"][0] = -1.0
     elif broken == "shape":

@@ -22,13 +22,20 @@ def graph(calls, gain=2):
     return [
         Stage("read", (), ("frames",), note("read", lambda: {"frames": 3})),
         Stage(
-            "scale", ("frames",), ("radiance",),
-            note("scale", lambda frames: {"radiance": gain * frames}), {"gain": gain},
+            "scale",
+            ("frames",),
+            ("radiance",),
+            note("scale", lambda frames: {"radiance": gain * frames}),
+            {"gain": gain},
         ),
-        Stage("invert", ("radiance",), ("map", "error"),
-              note("invert", lambda radiance: {"map": radiance + 1, "error": 0.1})),
+        Stage(
+            "invert",
+            ("radiance",),
+            ("map", "error"),
+            note("invert", lambda radiance: {"map": radiance + 1, "error": 0.1}),
+        ),
         Stage("other", ("frames",), ("unwanted",), note("other", lambda frames: {"unwanted": 0})),
-    ]  # fmt: skip
+    ]
 
 
 def test_only_the_ancestors_of_what_is_wanted_run():
@@ -109,12 +116,25 @@ def surface_graph(calls):
 
     return [
         Stage("samples", (), ("samples",), note("samples", lambda: {"samples": 4})),
-        Stage("normals", ("samples",), ("point_normals", "normals"),
-              note("normals", lambda samples: {"point_normals": samples, "normals": -samples})),
-        Stage("lobes", ("samples", "point_normals"), ("weight", "basis.npz"),
-              note("lobes", lambda samples, point_normals:
-                   {"weight": samples * point_normals, "basis.npz": b"table"})),
-    ]  # fmt: skip
+        Stage(
+            "normals",
+            ("samples",),
+            ("point_normals", "normals"),
+            note("normals", lambda samples: {"point_normals": samples, "normals": -samples}),
+        ),
+        Stage(
+            "lobes",
+            ("samples", "point_normals"),
+            ("weight", "basis.npz"),
+            note(
+                "lobes",
+                lambda samples, point_normals: {
+                    "weight": samples * point_normals,
+                    "basis.npz": b"table",
+                },
+            ),
+        ),
+    ]
 
 
 def test_a_stage_whose_map_is_kept_but_not_what_it_hands_on_runs_again():

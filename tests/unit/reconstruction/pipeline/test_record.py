@@ -28,12 +28,15 @@ def graph(gain=2.0):
     return [
         Stage("frames", (), ("light",), lambda: {"light": np.ones(3)}),
         Stage(
-            "separate", ("light",), ("diffuse",), lambda light: {"diffuse": gain * light},
+            "separate",
+            ("light",),
+            ("diffuse",),
+            lambda light: {"diffuse": gain * light},
             {"gain": gain},
         ),
         Stage("invert", ("diffuse",), ("melanin",), lambda diffuse: {"melanin": diffuse.sum()}),
         Stage("draw", ("diffuse",), ("picture",), lambda diffuse: {"picture": diffuse}),
-    ]  # fmt: skip
+    ]
 
 
 def done(entries):
@@ -47,9 +50,7 @@ def why(entries):
 def test_what_nothing_wanted_needs_is_skipped():
     outcome = stages.run(graph(), ["melanin"])
     entries = stage_record.record(graph(), outcome, {})
-    assert done(entries) == {
-        "frames": "run", "separate": "run", "invert": "run", "draw": "skipped"
-    }  # fmt: skip
+    assert done(entries) == {"frames": "run", "separate": "run", "invert": "run", "draw": "skipped"}
     assert why(entries)["draw"] == "nothing wanted depends on it"
     assert why(entries)["invert"] == "it was not made before"
     assert [len(entry["inputs"]) for entry in entries] == [64, 64, 64, 0]
@@ -62,8 +63,11 @@ def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
     again = stages.run(graph(), ["melanin"], cache=cache)
     entries = stage_record.record(graph(), again, first.keys)
     assert done(entries) == {
-        "frames": "skipped", "separate": "skipped", "invert": "reused", "draw": "skipped"
-    }  # fmt: skip
+        "frames": "skipped",
+        "separate": "skipped",
+        "invert": "reused",
+        "draw": "skipped",
+    }
     assert why(entries)["frames"] == "what depends on it was reused"
     assert why(entries)["invert"] == "its inputs are the same"
 

@@ -152,8 +152,13 @@ def test_a_twitch_is_no_motion_of_the_head_and_its_frame_not_usable(rng):
     )
     assert found.usable.tolist() == [True, True, True, False, True, True, True]
     assert found.covered([0.5, 2.5, 3.5, 4.5, 4.0, 9.0]).tolist() == [
-        True, False, False, True, True, False,
-    ]  # fmt: skip
+        True,
+        False,
+        False,
+        True,
+        True,
+        False,
+    ]
     turn, shift = found.at([3.0])
     np.testing.assert_allclose(
         shift[0], (found.translation_mm[2] + found.translation_mm[4]) / 2, atol=1e-12

@@ -16,9 +16,15 @@ RADIUS = 0.3 + 0.25 * np.arange(28)
 
 def closed(method, eta=1.4):
     return profile_model(
-        method, RADIUS, eta=eta, collection="all", core_mm=0.0, source_core_mm=0.0, g=0.8,
+        method,
+        RADIUS,
+        eta=eta,
+        collection="all",
+        core_mm=0.0,
+        source_core_mm=0.0,
+        g=0.8,
         g_error=0.0,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.4, 1.6])

@@ -23,9 +23,11 @@ def kriged(value, variance, strength):
     beta = np.linalg.solve(firm, lines.T @ inverse @ value)
     rest = value - lines @ beta
     likely = -0.5 * (
-        np.linalg.slogdet(kernel + np.diag(variance))[1] + np.linalg.slogdet(firm)[1]
-        + rest @ inverse @ rest + (np.log(strength / USUAL) / SPREAD) ** 2
-    )  # fmt: skip
+        np.linalg.slogdet(kernel + np.diag(variance))[1]
+        + np.linalg.slogdet(firm)[1]
+        + rest @ inverse @ rest
+        + (np.log(strength / USUAL) / SPREAD) ** 2
+    )
     left = lines - kernel @ inverse @ lines
     covariance = kernel - kernel @ inverse @ kernel + left @ np.linalg.solve(firm, left.T)
     return likely, lines @ beta + kernel @ inverse @ rest, covariance

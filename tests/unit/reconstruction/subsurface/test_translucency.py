@@ -200,8 +200,9 @@ def test_places_that_do_not_count_are_left_out_with_their_reasons():
     assert reasons["chin, channel 0"] == "not valid"
     assert found.valid.all()
     # the same as if they had never been there
-    kept = interpolate(sites_of_labels(NAMES)[[0, 2, 3]], SIGMA_TR[[0, 2, 3]],
-                       0.03 * SIGMA_TR[[0, 2, 3]], (16, 16))  # fmt: skip
+    kept = interpolate(
+        sites_of_labels(NAMES)[[0, 2, 3]], SIGMA_TR[[0, 2, 3]], 0.03 * SIGMA_TR[[0, 2, 3]], (16, 16)
+    )
     np.testing.assert_allclose(found.values[..., 1], kept.values[..., 1], rtol=1e-6)
 
 

@@ -153,9 +153,13 @@ def test_where_neighbors_happen_to_look_alike_the_albedo_is_known_no_better():
         values = np.tile(seen[:, None], (1, 3))
         point = PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool))
         found = surface_errors.of_albedo(point, plain(surface), surface, 2.0).stderr[:, 0]
-        own = 2.0 * surface_errors.UNRESOLVED_R_D_PX * surface_errors.change_per_mm(
-            values, surface.points_mm, surface.faces, point.valid, pixel_mm=2.0, rings=2
-        )[:, 0]  # fmt: skip
+        own = (
+            2.0
+            * surface_errors.UNRESOLVED_R_D_PX
+            * surface_errors.change_per_mm(
+                values, surface.points_mm, surface.faces, point.valid, pixel_mm=2.0, rings=2
+            )[:, 0]
+        )
         order = np.array_split(np.argsort(own), 3)
         hit, hit_alone = np.abs(seen - true) <= found, np.abs(seen - true) <= own
         inside.append([hit[part].mean() for part in order])

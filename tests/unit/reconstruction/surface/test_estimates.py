@@ -121,8 +121,7 @@ def test_normals_of_light_from_inside_the_skin_are_exact():
     assert_clean(found)
     # the boundary matters: light that it did not hold back gives other normals
     matte = dataclasses.replace(
-        samples,
-        f=samples.f / (through(samples.cos_light) * through(samples.cos_view))[..., None],
+        samples, f=samples.f / (through(samples.cos_light) * through(samples.cos_view))[..., None]
     )
     assert np.median(angle_deg(estimates.normals_from_shading(matte, truth), truth)) > 0.3
 
@@ -236,9 +235,15 @@ def test_views_aslant_whose_pixels_reach_beyond_the_point_count_less_in_the_albe
         return np.median(np.abs(r_d / R_D - 1.0))
 
     alike = diffuse_albedo.estimate(
-        darker.f, darker.light_dir, darker.view_dir, truth.astype(np.float32),
-        eta=fresnel.ETA_SKIN, variance=darker.variance, valid=darker.valid, normal_stderr_rad=1e-3,
-    )  # fmt: skip
+        darker.f,
+        darker.light_dir,
+        darker.view_dir,
+        truth.astype(np.float32),
+        eta=fresnel.ETA_SKIN,
+        variance=darker.variance,
+        valid=darker.valid,
+        normal_stderr_rad=1e-3,
+    )
     found = estimates.albedo(darker, known(truth), stderr_rad=1e-3)
     assert found.valid.all()
     assert off(found.values) < 0.75 * off(alike.r_d)

@@ -37,8 +37,10 @@ def scene(lobe, r_d, *, points=30, lights=24, seed=1, noise=NOISE):
     light, view = (np.broadcast_to(a, (points, 2 * lights, 3)).copy() for a in (light, view))
     cos_l, cos_v = (np.einsum("pmk,pk->pm", a, truth) for a in (light, view))
     scanned = np.einsum("pmk,pk->pm", light, scan)
-    through = np.prod([1 - fresnel.reflectance(np.clip(c, 0, 1), fresnel.ETA_SKIN)
-                       for c in (cos_l, cos_v)], axis=0)  # fmt: skip
+    through = np.prod(
+        [1 - fresnel.reflectance(np.clip(c, 0, 1), fresnel.ETA_SKIN) for c in (cos_l, cos_v)],
+        axis=0,
+    )
     brdf = r_d * through / np.pi + 0.8 * lobe.evaluate(light, view, truth[:, None])[..., 0]
     valid = (cos_l > 0.1) & (cos_v > 0.1) & (scanned > 0.1)
     f = np.where(valid, brdf * cos_l / np.where(valid, scanned, 1.0), 0.0)
@@ -48,12 +50,14 @@ def scene(lobe, r_d, *, points=30, lights=24, seed=1, noise=NOISE):
         f=np.repeat(f[..., None], 3, -1).astype(np.float32),
         # the three channels share one noise here: their mean has its variance
         variance=np.where(valid[..., None], 3 * sigma**2, np.inf).repeat(3, -1).astype(np.float32),
-        light_dir=light.astype(np.float32), view_dir=view.astype(np.float32),
+        light_dir=light.astype(np.float32),
+        view_dir=view.astype(np.float32),
         cos_light=np.where(valid, scanned, 1.0).astype(np.float32),
         cos_view=cos_v.astype(np.float32),
         light=np.repeat(np.arange(lights), 2).astype(np.int32),
-        view=np.tile(np.arange(2), lights).astype(np.int32), valid=valid,
-    )  # fmt: skip
+        view=np.tile(np.arange(2), lights).astype(np.int32),
+        valid=valid,
+    )
     return samples, truth, scan
 
 
@@ -61,9 +65,17 @@ def estimated(lobe, r_d, *, weight=0.8, steps=6, **more):
     samples, truth, scan = scene(lobe, r_d, **more)
     known = np.ones(len(truth), bool)
     found = model_normals.estimate(
-        samples, scan, known, np.full(len(truth), r_d), np.full((len(truth), 1), weight), lobe,
-        lobe_error=0.04, least_cos_light=0.15, least_cos_view=0.2, steps=steps,
-    )  # fmt: skip
+        samples,
+        scan,
+        known,
+        np.full(len(truth), r_d),
+        np.full((len(truth), 1), weight),
+        lobe,
+        lobe_error=0.04,
+        least_cos_light=0.15,
+        least_cos_view=0.2,
+        steps=steps,
+    )
     return found, truth, scan
 
 
@@ -102,9 +114,16 @@ def test_points_that_say_nothing_stay_and_are_not_valid(lobe):
     known = np.ones(len(truth), bool)
     known[5] = False
     found = model_normals.estimate(
-        samples, scan, known, np.full(len(truth), 0.3), np.full((len(truth), 1), 0.8), lobe,
-        lobe_error=0.04, least_cos_light=0.15, least_cos_view=0.2,
-    )  # fmt: skip
+        samples,
+        scan,
+        known,
+        np.full(len(truth), 0.3),
+        np.full((len(truth), 1), 0.8),
+        lobe,
+        lobe_error=0.04,
+        least_cos_light=0.15,
+        least_cos_view=0.2,
+    )
     assert not found.valid[[0, 1, 2, 5]].any()
     np.testing.assert_array_equal(found.normals[[0, 1, 2, 5]], scan[[0, 1, 2, 5]])
     assert np.isfinite(found.normals).all()
@@ -115,8 +134,14 @@ def test_points_that_say_nothing_stay_and_are_not_valid(lobe):
 def test_a_start_at_the_truth_is_not_left(lobe):
     samples, truth, _ = scene(lobe, 0.3, noise=1e-6)
     found = model_normals.estimate(
-        samples, truth, np.ones(len(truth), bool), np.full(len(truth), 0.3),
-        np.full((len(truth), 1), 0.8), lobe,
-        lobe_error=0.04, least_cos_light=0.15, least_cos_view=0.2,
-    )  # fmt: skip
+        samples,
+        truth,
+        np.ones(len(truth), bool),
+        np.full(len(truth), 0.3),
+        np.full((len(truth), 1), 0.8),
+        lobe,
+        lobe_error=0.04,
+        least_cos_light=0.15,
+        least_cos_view=0.2,
+    )
     assert np.degrees(found.moved_rad).max() < 0.2  # tables are interpolated otherwise in places

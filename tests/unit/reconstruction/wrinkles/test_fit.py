@@ -15,8 +15,16 @@ from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 
 SIDE = 128
-CENTRES = [(0.2, 0.15), (0.8, 0.15), (0.2, 0.4), (0.8, 0.4),
-           (0.2, 0.65), (0.8, 0.65), (0.3, 0.9), (0.7, 0.9)]  # fmt: skip
+CENTRES = [
+    (0.2, 0.15),
+    (0.8, 0.15),
+    (0.2, 0.4),
+    (0.8, 0.4),
+    (0.2, 0.65),
+    (0.8, 0.65),
+    (0.3, 0.9),
+    (0.7, 0.9),
+]
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,14 @@ ALONG = AnisotropicTissue(0.05, 7.5, strength=-1.2)
 
 def traced(tissue, azimuth_rad, *, seed, photons=40_000, fibres=FIBRES, **more):
     return anisotropic_profile(
-        tissue, fibres, azimuth_rad=azimuth_rad, photons=photons,
-        rng=np.random.default_rng(seed), threads=2, **more,
-    )  # fmt: skip
+        tissue,
+        fibres,
+        azimuth_rad=azimuth_rad,
+        photons=photons,
+        rng=np.random.default_rng(seed),
+        threads=2,
+        **more,
+    )
 
 
 def worst(one, other):
@@ -34,9 +39,12 @@ def worst(one, other):
 def test_without_a_preferred_direction_it_is_the_isotropic_walk(harmonics):
     run = traced(replace(ALONG, strength=0.0), (0.4,), seed=1, harmonics=harmonics)
     plain = fibre_profile(
-        LayerStack((Layer(inf, 0.05, 7.5, 0.8, 1.4),)), radii_mm=FIBRES.radii_mm,
-        photons=40_000, rng=np.random.default_rng(2), threads=2,
-    )  # fmt: skip
+        LayerStack((Layer(inf, 0.05, 7.5, 0.8, 1.4),)),
+        radii_mm=FIBRES.radii_mm,
+        photons=40_000,
+        rng=np.random.default_rng(2),
+        threads=2,
+    )
     z = (run.reflectance_per_mm2[:, 0] - plain.reflectance_per_mm2) / np.hypot(
         run.stderr[:, 0], plain.stderr
     )
@@ -66,12 +74,15 @@ def test_turning_the_tissue_turns_the_profile():
 def test_light_goes_both_ways_alike():
     """Helmholtz: a wide source with a wide cone and a thin fibre, or the fibres exchanged."""
     runs = [
-        traced(ALONG, (0.0, 1.0), seed=7 + k, photons=60_000,
-               fibres=Fibres((0.3, 0.8), detector[0], source[0], detector[1], source[1]))
-        for k, (source, detector) in enumerate(
-            (((0.4, 0.9), (0.2, 0.2)), ((0.2, 0.2), (0.4, 0.9)))
+        traced(
+            ALONG,
+            (0.0, 1.0),
+            seed=7 + k,
+            photons=60_000,
+            fibres=Fibres((0.3, 0.8), detector[0], source[0], detector[1], source[1]),
         )
-    ]  # fmt: skip
+        for k, (source, detector) in enumerate((((0.4, 0.9), (0.2, 0.2)), ((0.2, 0.2), (0.4, 0.9))))
+    ]
     assert worst(*runs) < 4.5
 
 

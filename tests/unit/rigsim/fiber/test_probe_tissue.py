@@ -69,8 +69,9 @@ def test_a_profile_under_suction_is_that_of_its_own_blood():
     spectral = profiles.spectral(
         probe_tissue.TissueOptics(optics.wavelength_nm, tuple(layers), None, 0.0)
     )
-    own = fibre_profile(spectral, radii_mm=RIG.probe.radius_mm, photons=12_000,
-                        rng=np.random.default_rng(9))  # fmt: skip
+    own = fibre_profile(
+        spectral, radii_mm=RIG.probe.radius_mm, photons=12_000, rng=np.random.default_rng(9)
+    )
 
     def worst(one):
         # within 3 mm: beyond it some errors are themselves told by a few photons

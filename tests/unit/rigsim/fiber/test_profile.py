@@ -64,9 +64,14 @@ FORWARD = LayerStack((Layer(inf, 0.1, 7.5, 0.85, 1.4),))
 def test_fibres_that_take_all_angles_see_the_exitance_over_their_cores(stack, twin, agree):
     # Independent runs; |z| < 4.5 for each of six radii: false alarms below 2e-3 (t, 19 dof).
     seen = fibre_profile(
-        stack, radii_mm=RADII_MM, photons=60_000, rng=np.random.default_rng(1),
-        numerical_aperture=1.0, source_numerical_aperture=0.0, threads=2,
-    )  # fmt: skip
+        stack,
+        radii_mm=RADII_MM,
+        photons=60_000,
+        rng=np.random.default_rng(1),
+        numerical_aperture=1.0,
+        source_numerical_aperture=0.0,
+        threads=2,
+    )
     mean, error = exit_profile(
         twin, RADII_MM, core_mm=0.2, source_core_mm=0.2, photons=200_000, seed=3
     )
@@ -97,9 +102,12 @@ def test_band_is_the_weighted_mean_of_its_wavelengths():
     stacks = tuple(LayerStack((Layer(inf, a, 7.5, 0.8, 1.4),)) for a in (0.05, 0.5))
     weights = np.array([[1.0, 0.25], [0.0, 0.75]])
     both = fibre_profile(
-        SpectralStack((650.0, 550.0), stacks, weights), radii_mm=RADII_MM, photons=60_000,
-        rng=np.random.default_rng(5), threads=2,
-    )  # fmt: skip
+        SpectralStack((650.0, 550.0), stacks, weights),
+        radii_mm=RADII_MM,
+        photons=60_000,
+        rng=np.random.default_rng(5),
+        threads=2,
+    )
     apart = [
         fibre_profile(
             stack, radii_mm=RADII_MM, photons=30_000, rng=np.random.default_rng(6), threads=2
@@ -138,9 +146,7 @@ def test_order_of_fibres_and_number_of_threads_change_nothing():
     ],
 )
 def test_impossible_requests_are_refused_by_name(request_, field):
-    arguments = {
-        "radii_mm": (0.3,), "photons": 100, "rng": np.random.default_rng(0), **request_
-    }  # fmt: skip
+    arguments = {"radii_mm": (0.3,), "photons": 100, "rng": np.random.default_rng(0), **request_}
     with pytest.raises(TransportError, match=field):
         fibre_profile(RED, **arguments)
 
@@ -172,9 +178,15 @@ def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2)
     """Standard errors between fibres that take all angles and the exitance of the plain walk."""
     stack = LayerStack((layer,))
     seen = fibre_profile(
-        stack, radii_mm=radii_mm, photons=photons, rng=np.random.default_rng(11), core_mm=core_mm,
-        numerical_aperture=1.0, source_numerical_aperture=0.0, threads=2,
-    )  # fmt: skip
+        stack,
+        radii_mm=radii_mm,
+        photons=photons,
+        rng=np.random.default_rng(11),
+        core_mm=core_mm,
+        numerical_aperture=1.0,
+        source_numerical_aperture=0.0,
+        threads=2,
+    )
     mean, error = exit_profile(
         stack, radii_mm, core_mm=core_mm, source_core_mm=0.2, photons=4 * photons, seed=12
     )
@@ -206,11 +218,14 @@ def test_vanishing_absorption_ends_and_changes_nothing_near_the_source():
     """A half-space without absorption keeps photons for ever; far ones end by roulette here."""
     runs = [
         fibre_profile(
-            LayerStack((Layer(inf, sigma_a, 7.5, 0.8, 1.4),)), radii_mm=(0.3, 2.0, 7.0),
-            photons=8000, rng=np.random.default_rng(13 + k), threads=2,
+            LayerStack((Layer(inf, sigma_a, 7.5, 0.8, 1.4),)),
+            radii_mm=(0.3, 2.0, 7.0),
+            photons=8000,
+            rng=np.random.default_rng(13 + k),
+            threads=2,
         )
         for k, sigma_a in enumerate((1e-5, 1e-12))
-    ]  # fmt: skip
+    ]
     both = np.hypot(runs[0].stderr, runs[1].stderr)
     difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
     assert np.abs(difference / both).max() < 4.5
@@ -228,11 +243,14 @@ def test_little_scattering_goes_as_its_amount():
     """Single scattering: half the scatterers, half the light (and 1 % of double scattering)."""
     one, half = (
         fibre_profile(
-            LayerStack((Layer(inf, 1.0, sigma_s, 0.0, 1.0),)), radii_mm=(0.3,), photons=200_000,
-            rng=np.random.default_rng(16), threads=2,
+            LayerStack((Layer(inf, 1.0, sigma_s, 0.0, 1.0),)),
+            radii_mm=(0.3,),
+            photons=200_000,
+            rng=np.random.default_rng(16),
+            threads=2,
         )
         for sigma_s in (2e-3, 1e-3)
-    )  # fmt: skip
+    )
     ratio = one.reflectance_per_mm2[0] / half.reflectance_per_mm2[0]
     error = ratio * np.hypot(
         one.stderr[0] / one.reflectance_per_mm2[0], half.stderr[0] / half.reflectance_per_mm2[0]
@@ -246,12 +264,16 @@ def test_absorbing_film_of_a_micrometre_weakens_light_twice():
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.0)
     runs = [
         fibre_profile(
-            LayerStack(layers), radii_mm=(0.3, 1.3), photons=40_000, threads=2,
-            rng=np.random.default_rng(seed), numerical_aperture=0.05,
+            LayerStack(layers),
+            radii_mm=(0.3, 1.3),
+            photons=40_000,
+            threads=2,
+            rng=np.random.default_rng(seed),
+            numerical_aperture=0.05,
             source_numerical_aperture=0.0,
         )
         for seed, layers in ((17, (tissue,)), (18, (Layer(0.001, 500.0, 0.0, 0.0, 1.0), tissue)))
-    ]  # fmt: skip
+    ]
     ratio = runs[1].reflectance_per_mm2 / runs[0].reflectance_per_mm2
     error = ratio * np.hypot(*(run.stderr / run.reflectance_per_mm2 for run in runs))
     assert np.abs((ratio - np.exp(-1.0)) / error).max() < 4.5
@@ -262,11 +284,14 @@ def test_film_of_tissue_on_the_same_tissue_changes_nothing():
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.4)
     runs = [
         fibre_profile(
-            LayerStack(layers), radii_mm=RADII_MM, photons=30_000, threads=2,
+            LayerStack(layers),
+            radii_mm=RADII_MM,
+            photons=30_000,
+            threads=2,
             rng=np.random.default_rng(seed),
         )
         for seed, layers in ((19, (tissue,)), (20, (Layer(0.001, 0.1, 7.5, 0.8, 1.4), tissue)))
-    ]  # fmt: skip
+    ]
     difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
     assert np.abs(difference / np.hypot(runs[0].stderr, runs[1].stderr)).max() < 4.5
 
@@ -277,12 +302,18 @@ def test_light_goes_both_ways_alike(stack):
     wide, thin = (0.4, 0.9), (0.1, 0.2)
     runs = [
         fibre_profile(
-            stack, radii_mm=(0.3, 0.8), photons=80_000, rng=np.random.default_rng(21 + k),
-            core_mm=detector[0], numerical_aperture=detector[1], source_core_mm=source[0],
-            source_numerical_aperture=source[1], threads=2,
+            stack,
+            radii_mm=(0.3, 0.8),
+            photons=80_000,
+            rng=np.random.default_rng(21 + k),
+            core_mm=detector[0],
+            numerical_aperture=detector[1],
+            source_core_mm=source[0],
+            source_numerical_aperture=source[1],
+            threads=2,
         )
         for k, (source, detector) in enumerate(((wide, thin), (thin, wide)))
-    ]  # fmt: skip
+    ]
     difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
     error = np.hypot(runs[0].stderr, runs[1].stderr)
     assert np.abs(difference / error).max() < 4.5

@@ -114,10 +114,17 @@ def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
     rest = FlashScene(rig, face, choice=EMBREE)
     assert rest.needs[WRINKLES].verdict == "unmodeled"
     moved, plain = (
-        FlashScene(rig, face, state="surprise", relief_shadows=on, choice=EMBREE, lateral=False,
-                   interreflections=False)
+        FlashScene(
+            rig,
+            face,
+            state="surprise",
+            relief_shadows=on,
+            choice=EMBREE,
+            lateral=False,
+            interreflections=False,
+        )
         for on in (None, False)
-    )  # fmt: skip
+    )
     assert moved.needs[WRINKLES].verdict == "built"
     assert plain.needs[WRINKLES].verdict == "asked"
     assert (moved.radiance() <= plain.radiance() + 1e-6).all()

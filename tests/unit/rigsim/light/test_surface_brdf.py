@@ -69,9 +69,10 @@ def test_r_d_is_what_eq_6_takes_the_minimum_of():
     total, specular = surface_brdf.evaluate(packed, UP, light, way)
     passed = [surface_brdf.boundary_transmittance(light[2], w[2]) for w in way]
     np.testing.assert_allclose(
-        math.pi * total / np.array(passed)[:, None], np.tile([0.6, 0.3, 0.05], (len(way), 1)),
+        math.pi * total / np.array(passed)[:, None],
+        np.tile([0.6, 0.3, 0.05], (len(way), 1)),
         rtol=1e-5,
-    )  # fmt: skip
+    )
     assert not specular.any()
 
 

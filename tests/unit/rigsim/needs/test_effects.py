@@ -28,8 +28,11 @@ pytestmark = pytest.mark.render
 
 def plate(*corners):
     faces = np.arange(4 * len(corners)).reshape(-1, 4)
-    uv = [(x + 0.05 + 0.5 * k, y) for k in range(len(corners)) for x, y in
-          ((0, 0), (0.4, 0), (0.4, 0.9), (0, 0.9))]  # fmt: skip
+    uv = [
+        (x + 0.05 + 0.5 * k, y)
+        for k in range(len(corners))
+        for x, y in ((0, 0), (0.4, 0), (0.4, 0.9), (0, 0.9))
+    ]
     triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
     return Caster(build_mesh(np.concatenate(corners).astype(float), triangles, uv))
 
@@ -106,8 +109,16 @@ def test_a_groove_hides_its_sky_as_two_walls_do():
     d = np.arange(8, 60)
     told = 0.5 * (1.0 - d / np.hypot(128.0, d))
     np.testing.assert_allclose(found[512, 128 + d], told, rtol=0.06)
-    assert hidden_share(np.zeros((4, 4), np.float32), np.float32([[[0, 0, 1]]]).repeat(4, 0)
-                        .repeat(4, 1), margin=0, pixel_um=1.0, sectors=8).max() == 0.0  # fmt: skip
+    assert (
+        hidden_share(
+            np.zeros((4, 4), np.float32),
+            np.float32([[[0, 0, 1]]]).repeat(4, 0).repeat(4, 1),
+            margin=0,
+            pixel_um=1.0,
+            sectors=8,
+        ).max()
+        == 0.0
+    )
 
 
 @pytest.fixture(scope="module")

@@ -87,9 +87,10 @@ def test_textures_are_what_the_face_is_made_of(person, tmp_path, rng, ending):
 
 def test_the_patch_and_the_tissue_are_of_the_same_person(person):
     ann = read(person("melanin = 0.1\nblood = 1.5"))
-    patch, plain = ann.patch("cheek", seed=1, size_mm=0.3), named("V").patch(
-        "cheek", seed=1, size_mm=0.3
-    )  # fmt: skip
+    patch, plain = (
+        ann.patch("cheek", seed=1, size_mm=0.3),
+        named("V").patch("cheek", seed=1, size_mm=0.3),
+    )
     assert patch.melanin_fraction == 0.1
     assert plain.melanin_fraction == pigment.MELANIN_PRESETS["V"]
     assert patch.albedo.mean() < plain.albedo.mean()
@@ -149,8 +150,11 @@ def test_what_is_wrong_with_a_file_is_named(person, tmp_path, text, said):
     np.savez(tmp_path / "several.npz", a=np.ones((64, 64)))
     (tmp_path / "several.npz").rename(tmp_path / "several.npy")
     for name, kind, side in (
-        ("header", "<f8", 10**6), ("large", "<f4", 8193), ("cut", "<f8", 64), ("objects", "|O", 64),
-    ):  # fmt: skip
+        ("header", "<f8", 10**6),
+        ("large", "<f4", 8193),
+        ("cut", "<f8", 64),
+        ("objects", "|O", 64),
+    ):
         with (tmp_path / f"{name}.npy").open("wb") as stream:
             header = {"descr": kind, "fortran_order": False, "shape": (side, side)}
             np.lib.format.write_array_header_1_0(stream, header)

@@ -36,10 +36,17 @@ def patch(height: Floats, *, layer_um: float = 8.0, texel_um: float = 10.0) -> M
     """Return a bare patch of uniform layer."""
     even = np.full(height.shape, 1.0, np.float32)
     return MicroSkin(
-        site="cheek", seed=0, preset="III", texel_um=texel_um,
-        height_um=height.astype(np.float32), albedo=0.3 * even, alpha=0.2 * even,
-        layer_um=layer_um * even, stiffness_ratio=2.0, poisson=0.2,
-    )  # fmt: skip
+        site="cheek",
+        seed=0,
+        preset="III",
+        texel_um=texel_um,
+        height_um=height.astype(np.float32),
+        albedo=0.3 * even,
+        alpha=0.2 * even,
+        layer_um=layer_um * even,
+        stiffness_ratio=2.0,
+        poisson=0.2,
+    )
 
 
 def slopes_along(state: StretchedSkin, half_mm: float = 0.35) -> Floats:
@@ -99,9 +106,7 @@ def test_the_membranes_energy_is_that_of_its_metric(rng: np.random.Generator) ->
     assert got == pytest.approx(expected, rel=1e-10)
 
 
-def test_a_squeeze_that_turns_an_element_over_costs_without_limit(
-    rng: np.random.Generator,
-) -> None:
+def test_a_squeeze_that_turns_an_element_over_costs_without_limit(rng: np.random.Generator) -> None:
     p = problem_of(rng)
     v = p.affine()
     v[0, 3, 3] += 30.0
@@ -120,9 +125,7 @@ def test_bending_costs_nothing_at_the_neutral_curvature(rng: np.random.Generator
     assert bending(w, p.neutral_um, p.bending_um3, 10.0, work, force) == pytest.approx(expected)
 
 
-def test_forces_are_the_energys_derivative_by_finite_differences(
-    rng: np.random.Generator,
-) -> None:
+def test_forces_are_the_energys_derivative_by_finite_differences(rng: np.random.Generator) -> None:
     p = problem_of(rng)
     v = p.affine() + 0.5 * rng.standard_normal((3, 12, 16))
     _, force = p.energy(v)
@@ -188,10 +191,13 @@ def test_shallow_relief_follows_the_closed_form_of_a_membrane_on_a_foundation(
     h = 0.02 * np.cos(K * texel * np.arange(count))[None, :].repeat(8, 0)
     even = np.ones_like(h)
     p = LayerProblem(
-        neutral_um=h, membrane_um=ratio / 3.0 * layer * even,
-        bending_um3=ratio / 9.0 * layer**3 * even, texel_um=texel,
-        gradient=np.diag([stretch, 1.0]), poisson=0.5,
-    )  # fmt: skip
+        neutral_um=h,
+        membrane_um=ratio / 3.0 * layer * even,
+        bending_um3=ratio / 9.0 * layer**3 * even,
+        texel_um=texel,
+        gradient=np.diag([stretch, 1.0]),
+        poisson=0.5,
+    )
     state, _ = find_equilibrium(p, tolerance=1e-5)
     # Incompressible: E = 1, mu = 1/3, z = 1/r; nominal N = mu t (1 - r^-4) per material slope.
     k_f = stretch * 2.0 / 3.0 * K / stretch
@@ -343,8 +349,10 @@ def test_a_single_furrow_across_the_jaws_opens_and_one_along_them_stays() -> Non
     across = patch(np.broadcast_to(furrow[None, :], (80, 80)))
     wide = deform(across, stretch=1.25, angle_deg=0.0, compensation="none")
     narrow = deform(across, stretch=0.8, angle_deg=0.0, compensation="none")
-    depth = [float(np.ptp(s.height_um[40])) for s in (narrow, deform(
-        across, stretch=1.0, angle_deg=0.0), wide)]  # fmt: skip
+    depth = [
+        float(np.ptp(s.height_um[40]))
+        for s in (narrow, deform(across, stretch=1.0, angle_deg=0.0), wide)
+    ]
     assert depth[0] > 1.05 * depth[1] > 1.05**2 * depth[2]
     # A furrow takes more of the stretch than its shoulders: points move away from its middle.
     moved = wide.displacement_um[40, :, 0]

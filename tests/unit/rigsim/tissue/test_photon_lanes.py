@@ -30,19 +30,26 @@ def smallest_p_value(stack, twin, photons=200_000):
     """Dr.Jit on `stack`, numba on `twin`: p of the largest z of all parts, Sidak-corrected."""
     runs = [
         transport(
-            each, photons=photons, rng=np.random.default_rng(seed), ring_edges_mm=RINGS_MM,
-            engine=engine, threads=2, batches=40,
+            each,
+            photons=photons,
+            rng=np.random.default_rng(seed),
+            ring_edges_mm=RINGS_MM,
+            engine=engine,
+            threads=2,
+            batches=40,
         )
         for each, seed, engine in ((stack, 1, "drjit"), (twin, 2, "numba"))
-    ]  # fmt: skip
+    ]
     value = [[r.reflectance, r.transmittance, *r.absorbed, *r.ring_reflectance] for r in runs]
     error = [
         [
-            r.reflectance_stderr, r.transmittance_stderr, *r.absorbed_stderr,
+            r.reflectance_stderr,
+            r.transmittance_stderr,
+            *r.absorbed_stderr,
             *r.ring_reflectance_stderr,
         ]
         for r in runs
-    ]  # fmt: skip
+    ]
     both = np.hypot(*error)
     z = np.abs(np.subtract(*value))[both > 0.0] / both[both > 0.0]
     return 1.0 - (1.0 - 2.0 * stats.t.sf(z.max(), 39)) ** z.size

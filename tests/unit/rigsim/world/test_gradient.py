@@ -117,9 +117,13 @@ def test_a_caliper_box_needs_a_caliper():
 
 def test_a_rig_with_a_caliper_begins_with_skin_at_rest():
     assert World(RIG, seed=4).grip_at(0.0) == GripState(
-        0.0, World(RIG, seed=4).skin.state.step, World(RIG, seed=4).skin.state.aperture_mm,
-        1.0, False, False,
-    )  # fmt: skip
+        0.0,
+        World(RIG, seed=4).skin.state.step,
+        World(RIG, seed=4).skin.state.aperture_mm,
+        1.0,
+        False,
+        False,
+    )
 
 
 @pytest.mark.parametrize(

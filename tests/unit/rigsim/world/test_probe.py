@@ -167,9 +167,15 @@ def test_a_probe_box_needs_a_probe():
 
 @pytest.mark.parametrize(
     "switches",
-    [{"pump_leak": -0.1}, {"shutter_stuck": 1.5}, {"shutter_jam": -1.0}, {"head_lifts_after": -1.0},
-     {"gauge_dead_after": -1.0}, {"camera_warms_after": -1.0}],
-)  # fmt: skip
+    [
+        {"pump_leak": -0.1},
+        {"shutter_stuck": 1.5},
+        {"shutter_jam": -1.0},
+        {"head_lifts_after": -1.0},
+        {"gauge_dead_after": -1.0},
+        {"camera_warms_after": -1.0},
+    ],
+)
 def test_switches_that_make_no_sense_are_named(switches):
     with pytest.raises(ValueError, match=next(iter(switches))):
         Faults(**switches)

@@ -196,9 +196,12 @@ def test_a_camera_warms_to_the_room_once_its_cooling_fails():
 
 def test_what_makes_no_sense_is_named():
     for field, value in (
-        ("cup_ml", 0.0), ("leak_ml_per_s_mbar", -1e-6), ("free_flow_ml_per_s", math.inf),
-        ("regulator_ml_per_s_mbar", 1e-3), ("skin_ml_per_mbar", math.nan),
-    ):  # fmt: skip
+        ("cup_ml", 0.0),
+        ("leak_ml_per_s_mbar", -1e-6),
+        ("free_flow_ml_per_s", math.inf),
+        ("regulator_ml_per_s_mbar", 1e-3),
+        ("skin_ml_per_mbar", math.nan),
+    ):
         with pytest.raises(SuctionError, match=field):
             dataclasses.replace(LAW, **{field: value})
     with pytest.raises(SuctionError, match="leak"):

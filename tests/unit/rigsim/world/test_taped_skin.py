@@ -11,9 +11,14 @@ from rigsim.world.taped_skin import TapedSkin, TapedSkinError, TapeMechanics, dr
 
 CALIPER = load_rig("gradient").caliper
 PLAIN = TapeMechanics(
-    stiffness_n=0.7, stiffening=5.0, buckles_at=0.73, detaches_at=1.30, tape_n_per_mm=6.0,
-    slips_at_n=0.09, hardening_n_per_mm=2.0,
-)  # fmt: skip
+    stiffness_n=0.7,
+    stiffening=5.0,
+    buckles_at=0.73,
+    detaches_at=1.30,
+    tape_n_per_mm=6.0,
+    slips_at_n=0.09,
+    hardening_n_per_mm=2.0,
+)
 RIGID = dataclasses.replace(PLAIN, tape_n_per_mm=math.inf, slips_at_n=math.inf)
 
 
@@ -158,7 +163,12 @@ def test_what_makes_no_sense_is_refused():
         skin.attach(180.0)
     with pytest.raises(TapedSkinError, match="stiffness"):
         draw_mechanics(0, angle_deg=0.0, stiffness=0.0)
-    for change in ({"buckles_at": 1.1}, {"detaches_at": 0.9}, {"stiffness_n": -1.0},
-                   {"hardening_n_per_mm": 0.0}, {"stiffening": math.nan}):  # fmt: skip
+    for change in (
+        {"buckles_at": 1.1},
+        {"detaches_at": 0.9},
+        {"stiffness_n": -1.0},
+        {"hardening_n_per_mm": 0.0},
+        {"stiffening": math.nan},
+    ):
         with pytest.raises(TapedSkinError, match=next(iter(change))):
             dataclasses.replace(PLAIN, **change)

@@ -52,9 +52,13 @@ def play(world, times, script):
 
 
 SCRIPT = [
-    (0.5, "SYST:ARM"), (0.6, "FLAS:LAMP ON,300"), (0.7, "FLAS:POW 0.7"), (1.2, "FLAS:FIRE a"),
-    (1.3, "FLAS:LAMP ON,500"), (2.0, "FLAS:CHAR?"),
-]  # fmt: skip
+    (0.5, "SYST:ARM"),
+    (0.6, "FLAS:LAMP ON,300"),
+    (0.7, "FLAS:POW 0.7"),
+    (1.2, "FLAS:FIRE a"),
+    (1.3, "FLAS:LAMP ON,500"),
+    (2.0, "FLAS:CHAR?"),
+]
 
 
 def test_one_big_step_equals_many_small_ones():
@@ -135,12 +139,16 @@ def test_cameras_of_a_world_without_a_name_are_found_by_its_box(url):
 @pytest.mark.parametrize(
     ("url", "match"),
     [
-        ("sim://toaster", "expected one of flash"), ("sim://flash?seed=-1", "seed"),
-        ("sim://flash?clock=fast", "clock"), ("sim://flash?dropp=1", "did you mean drop"),
-        ("sim://flash?seed=1&seed=2", "twice"), ("sim://flash?drop=2", "probability"),
-        ("sim://flash?seed", "bad query"), ("sim://flash?name=a&world=b", "world and name"),
+        ("sim://toaster", "expected one of flash"),
+        ("sim://flash?seed=-1", "seed"),
+        ("sim://flash?clock=fast", "clock"),
+        ("sim://flash?dropp=1", "did you mean drop"),
+        ("sim://flash?seed=1&seed=2", "twice"),
+        ("sim://flash?drop=2", "probability"),
+        ("sim://flash?seed", "bad query"),
+        ("sim://flash?name=a&world=b", "world and name"),
     ],
-)  # fmt: skip
+)
 def test_a_url_that_no_world_understands_is_named(url, match):
     with pytest.raises(ValueError, match=match):
         world_of_url(url)

@@ -31,10 +31,13 @@ def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
     with open(out / "histograms.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     share = {
-        group: sum(float(r["share"]) for r in rows if r["group"] == group
-                   and r["region"] == "face" and r["channel"] == "red")
+        group: sum(
+            float(r["share"])
+            for r in rows
+            if r["group"] == group and r["region"] == "face" and r["channel"] == "red"
+        )
         for group in told["groups"]
-    }  # fmt: skip
+    }
     np.testing.assert_allclose(list(share.values()), 1.0, rtol=1e-4)
     assert {path.name for path in out.iterdir()} == set(analysing_albedo.FILES)
     assert (out / "figure-16.png").read_bytes()[:4] == b"\x89PNG"

@@ -51,16 +51,22 @@ def test_samples_are_the_true_reflection_with_noise_of_the_stated_size(seen):
 def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
     """Root of the squared error over that of the surface term, in the pairs that were measured."""
     fit = brdf_space_datasets.fitted(seen, basis)
-    lobe = np.stack([
-        brdf_basis.evaluate(x, basis, to, at, n)
-        for x, to, at, n in zip(fit.weights, seen.light, seen.view, seen.normals, strict=True)
-    ])  # fmt: skip
+    lobe = np.stack(
+        [
+            brdf_basis.evaluate(x, basis, to, at, n)
+            for x, to, at, n in zip(fit.weights, seen.light, seen.view, seen.normals, strict=True)
+        ]
+    )
     assert np.linalg.norm(lobe - seen.surface) < 0.15 * np.linalg.norm(seen.surface)
     # another point's lobes do not
-    other = np.stack([
-        brdf_basis.evaluate(x, basis, to, at, n)
-        for x, to, at, n in zip(fit.weights[::-1], seen.light, seen.view, seen.normals, strict=True)
-    ])  # fmt: skip
+    other = np.stack(
+        [
+            brdf_basis.evaluate(x, basis, to, at, n)
+            for x, to, at, n in zip(
+                fit.weights[::-1], seen.light, seen.view, seen.normals, strict=True
+            )
+        ]
+    )
     assert np.linalg.norm(other - seen.surface) > 0.2 * np.linalg.norm(seen.surface)
 
 

@@ -14,9 +14,13 @@ from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, DynamicApp
 def part(value: float, name: str = "a", source: str = "measured") -> Part:
     maps = {f"map_{name}": SkinMap(np.full((4, 4), value, np.float32), "1")}
     return Part(
-        maps, {f"{name}.json": b"{}"}, {"value": value}, {"session": name}, source,
+        maps,
+        {f"{name}.json": b"{}"},
+        {"value": value},
+        {"session": name},
+        source,
         left_out=((name, "because"),),
-    )  # fmt: skip
+    )
 
 
 def test_a_part_replaces_its_older_self_and_keeps_the_others(tmp_path):
@@ -31,8 +35,9 @@ def test_a_part_replaces_its_older_self_and_keeps_the_others(tmp_path):
     assert parts[FACIAL_COLOR]["value"] == 3.0
     assert dict(appearance.inputs) == {"facial_color: session": "c", "microstructure: session": "b"}
     assert sorted(appearance.left_out) == [
-        ("facial_color: c", "because"), ("microstructure: b", "because"),
-    ]  # fmt: skip
+        ("facial_color: c", "because"),
+        ("microstructure: b", "because"),
+    ]
 
 
 def test_simulated_data_in_any_part_makes_the_whole_simulated(tmp_path):

@@ -37,9 +37,10 @@ def face(tmp_path):
     maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
     out = tmp_path / "moving"
     dynamic.add(
-        out, dynamic.FACIAL_COLOR,
+        out,
+        dynamic.FACIAL_COLOR,
         dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, {}, {}, "simulated"),
-    )  # fmt: skip
+    )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
     dynamic.add(

@@ -61,8 +61,15 @@ def test_vertices_beyond_the_fitted_range_are_counted_and_held_by_default(rng):
     held = apply_microstructure(square_mm(), {"far": 0.9}, height)
     assert held.report.outside_share == held.report.above_share == 1.0
     assert held.report.below_share == held.report.clipped_share == 0.0
-    end = convolve(height, (1, 0), (0, 1), *kernel_parameters(1.28)[:1],
-                   kernel_parameters(1.28)[1] * 0.1, 0.0, 1.0)  # fmt: skip
+    end = convolve(
+        height,
+        (1, 0),
+        (0, 1),
+        *kernel_parameters(1.28)[:1],
+        kernel_parameters(1.28)[1] * 0.1,
+        0.0,
+        1.0,
+    )
     np.testing.assert_allclose(held.height, end, atol=1e-4)
     gone_on = apply_microstructure(square_mm(), {"far": 0.9}, height, extrapolate="formula")
     assert gone_on.report.clipped_share == 1.0

@@ -87,8 +87,9 @@ def test_the_squashed_sphere_is_smooth_along_its_length_and_rough_across(states,
     along, across = moved.roughness("front")
     assert across / along > 1.2 * np.divide(*fixed.roughness("front")[::-1])
     swapped = spheres.deform(SPHERE, relief, (0.8, 1.25, 1.0))
-    np.testing.assert_allclose(np.abs(swapped.strain.axes[middle, middle]), np.eye(2)[::-1],
-                               atol=0.05)  # fmt: skip
+    np.testing.assert_allclose(
+        np.abs(swapped.strain.axes[middle, middle]), np.eye(2)[::-1], atol=0.05
+    )
 
 
 def test_grown_patches_keep_their_slopes_over_the_chart(rng):

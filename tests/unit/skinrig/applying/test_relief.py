@@ -28,8 +28,10 @@ def folder(tmp_path):
         maps[f"microrelief_{site}"] = relief_map(seed)
         files[f"kernel_table_{site}.json"] = FOREHEAD.to_json().encode()
         sites[site] = {
-            "pixel_um": 20.0, "map": f"microrelief_{site}", "table": f"kernel_table_{site}.json",
-        }  # fmt: skip
+            "pixel_um": 20.0,
+            "map": f"microrelief_{site}",
+            "table": f"kernel_table_{site}.json",
+        }
     part = dynamic.Part(maps, files, {"sites": sites}, {}, "measured")
     dynamic.add(tmp_path / "moving", dynamic.MICROSTRUCTURE, part)
     return tmp_path / "moving"
@@ -47,9 +49,13 @@ def sheet(tmp_path):
     drawn[0, :, 0] = 0.2 * vertices[:, 0]
     path = tmp_path / "sheet.npz"
     np.savez(
-        path, vertices_mm=vertices, uv=uv, faces=faces.astype(np.int32),
-        shape_names=np.array(["drawn"]), shape_deltas_mm=drawn,
-    )  # fmt: skip
+        path,
+        vertices_mm=vertices,
+        uv=uv,
+        faces=faces.astype(np.int32),
+        shape_names=np.array(["drawn"]),
+        shape_deltas_mm=drawn,
+    )
     return path
 
 

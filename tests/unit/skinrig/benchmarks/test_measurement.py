@@ -134,15 +134,20 @@ def test_each_condition_has_a_front_and_a_knee_of_its_own():
 
 def test_a_document_says_how_much_larger_errors_are_on_dark_skin():
     stage = StageBenchmark(
-        "s", "rms, %", "truth", 0.0, (point(1, 1),),
+        "s",
+        "rms, %",
+        "truth",
+        0.0,
+        (point(1, 1),),
         by_band={"light": BandError(2.0, (1.0, 4.0)), "dark": BandError(6.0, (4.0, 8.0), 3.0)},
-    )  # fmt: skip
+    )
     told = to_document([stage])["stages"]["s"]
     assert [one["band"] for one in told["by_band"]] == ["light", "dark"]
     assert told["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
     assert [row[1:7] for row in bench_table.bands({"stages": {"s": told}})] == [
-        ("light", 2.0, 1.0, 4.0, "", 1.0), ("dark", 6.0, 4.0, 8.0, 3.0, 3.0),
-    ]  # fmt: skip
+        ("light", 2.0, 1.0, 4.0, "", 1.0),
+        ("dark", 6.0, 4.0, 8.0, 3.0, 3.0),
+    ]
 
 
 def test_memory_that_was_not_measured_has_its_reason():

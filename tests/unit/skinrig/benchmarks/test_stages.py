@@ -65,8 +65,10 @@ def test_every_stage_is_measured_small_and_then_the_quickest_at_full_size(calls,
     small = [(name, "small") for name in NAMES]
     assert calls[1:] == [*small, ("b", "full"), ("c", "full")]
     assert {n: s["size"] for n, s in document["stages"].items()} == {
-        "a": "small", "b": "full", "c": "full",
-    }  # fmt: skip
+        "a": "small",
+        "b": "full",
+        "c": "full",
+    }
     assert document["not_judged"] == ["a"]
     assert document["stages"]["a"]["limits"] == []
     assert document["passed"]

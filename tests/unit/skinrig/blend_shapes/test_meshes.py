@@ -61,10 +61,17 @@ def gltf_document(*, sparse=True):
         {"bufferView": 1, "componentType": 5123, "count": 4, "type": "VEC2", "normalized": True},
         {"bufferView": 2, "componentType": 5121, "count": 6, "type": "SCALAR"},
         {"bufferView": 3, "componentType": 5126, "count": 4, "type": "VEC3"},
-        {"componentType": 5126, "count": 4, "type": "VEC3",
-         "sparse": {"count": 1, "indices": {"bufferView": 4, "componentType": 5123},
-                    "values": {"bufferView": 5}}},
-    ]  # fmt: skip
+        {
+            "componentType": 5126,
+            "count": 4,
+            "type": "VEC3",
+            "sparse": {
+                "count": 1,
+                "indices": {"bufferView": 4, "componentType": 5123},
+                "values": {"bufferView": 5},
+            },
+        },
+    ]
     primitive = {
         "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
         "indices": 2,
@@ -79,13 +86,16 @@ def gltf_document(*, sparse=True):
         ],
         "meshes": [
             {"name": "teeth", "primitives": [{"attributes": {"POSITION": 0}}]},
-            {"name": "face", "primitives": [primitive],
-             "extras": {"targetNames": ["pull", "lift"]}},
+            {
+                "name": "face",
+                "primitives": [primitive],
+                "extras": {"targetNames": ["pull", "lift"]},
+            },
         ],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(data)}],
-    }, data  # fmt: skip
+    }, data
 
 
 def glb(document, data):

@@ -15,9 +15,13 @@ from model import photon_table
 from skinrig.calibrating.phantom_reflectance import expected_reflectance
 
 GRAY = PhantomCertificate(
-    eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,), sigma_s_prime_per_mm=(1.0,),
+    eta=1.4,
+    g=0.8,
+    wavelength_nm=(550.0,),
+    sigma_a_per_mm=(0.01,),
+    sigma_s_prime_per_mm=(1.0,),
     uncertainty=CertificateUncertainty(0.03, 0.02),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +36,21 @@ def test_a_gray_phantom_gives_the_tables_reflectance_in_every_band(rig):
     )
     np.testing.assert_allclose(expected.per_mm2, np.repeat(single[:, None], 3, axis=1), rtol=1e-9)
     flat = dataclasses.replace(
-        GRAY, wavelength_nm=(400.0, 700.0), sigma_a_per_mm=(0.01, 0.01),
+        GRAY,
+        wavelength_nm=(400.0, 700.0),
+        sigma_a_per_mm=(0.01, 0.01),
         sigma_s_prime_per_mm=(1.0, 1.0),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(expected_reflectance(flat, rig).per_mm2, expected.per_mm2, rtol=1e-9)
 
 
 def test_a_phantom_that_absorbs_blue_gives_less_of_it(rig):
     paper = dataclasses.replace(
-        GRAY, wavelength_nm=(400.0, 700.0), sigma_a_per_mm=(0.1, 0.002),
+        GRAY,
+        wavelength_nm=(400.0, 700.0),
+        sigma_a_per_mm=(0.1, 0.002),
         sigma_s_prime_per_mm=(1.0, 1.0),
-    )  # fmt: skip
+    )
     far = expected_reflectance(paper, rig).per_mm2[-1]
     assert far[0] > far[1] > far[2]
 
@@ -63,8 +71,10 @@ def test_a_phantom_outside_of_the_table_is_refused(rig):
     with pytest.raises(CertificateError, match="eta"):
         expected_reflectance(dataclasses.replace(GRAY, eta=1.9), rig)
     short = dataclasses.replace(
-        GRAY, wavelength_nm=(500.0, 600.0), sigma_a_per_mm=(0.01, 0.01),
+        GRAY,
+        wavelength_nm=(500.0, 600.0),
+        sigma_a_per_mm=(0.01, 0.01),
         sigma_s_prime_per_mm=(1.0, 1.0),
-    )  # fmt: skip
+    )
     with pytest.raises(CertificateError, match="400"):
         expected_reflectance(short, rig)

@@ -120,9 +120,13 @@ def test_a_first_step_that_fails_does_not_speak_of_resuming(tmp_path, sim, capsy
 def test_what_is_not_the_sessions_own_is_never_removed(tmp_path):
     path = tmp_path / "s"
     session = Session.create(
-        path, plan=flash_plan(RIG), rig=RIG, devices={},
-        subject=acquisition.Subject("p"), source="measured",
-    )  # fmt: skip
+        path,
+        plan=flash_plan(RIG),
+        rig=RIG,
+        devices={},
+        subject=acquisition.Subject("p"),
+        source="measured",
+    )
     session.release()
     (path / "frames" / "diary.txt").write_text("mine")
     acquisition.remove_unused(path, with_folder=True)

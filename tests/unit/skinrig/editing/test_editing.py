@@ -92,9 +92,10 @@ def test_an_edit_and_its_opposite_return_the_source_within_the_error_that_is_tol
     for k in range(4):
         name = f"basis_weight_{k}"
         np.testing.assert_allclose(
-            back.appearance.maps[name].values[good], source.appearance.maps[name].values[good],
+            back.appearance.maps[name].values[good],
+            source.appearance.maps[name].values[good],
             atol=0.02,
-        )  # fmt: skip
+        )
     assert back.record["before"]["traits"] == {"tan": 0.8, "oily": 0.6}
 
 
@@ -105,10 +106,14 @@ def test_oil_changes_the_lobes_as_it_did_in_the_population_and_not_the_albedo(so
     assert ("lobe_residual", "is of the lobes before the edit") in done.appearance.left_out
     good = source.r_d.valid
     change = [
-        float((done.appearance.maps[f"basis_weight_{k}"].values
-               - source.appearance.maps[f"basis_weight_{k}"].values)[good].mean())
+        float(
+            (
+                done.appearance.maps[f"basis_weight_{k}"].values
+                - source.appearance.maps[f"basis_weight_{k}"].values
+            )[good].mean()
+        )
         for k in range(4)
-    ]  # fmt: skip
+    ]
     assert abs(change[0] - 0.3) < 0.06
     assert abs(change[3] + 0.6 * 0.35) < 0.08
     lobes = lobes_of(done.appearance)  # maps and file go together
@@ -121,8 +126,9 @@ def test_a_mask_keeps_every_bit_where_it_is_black(traits, source, library, tmp_p
     mask = np.zeros(shape, np.uint8)
     mask[10:40, 8:24] = 255
     (tmp_path / "mask.png").write_bytes(png.encode(mask))
-    order = Order(traits=traits, mask=tmp_path / "mask.png",
-                  spots=(SpotOrder("freckles", 1.0, 3.0),))  # fmt: skip
+    order = Order(
+        traits=traits, mask=tmp_path / "mask.png", spots=(SpotOrder("freckles", 1.0, 3.0),)
+    )
     done = editing.edited(source, order, library)
     most = 0.0
     for name in set(done.changed) & set(source.appearance.maps) - {"lobe_residual"}:
@@ -337,8 +343,9 @@ def test_landmarks_of_a_table_in_texels_are_those_of_the_mesh(source, tmp_path):
 
 
 def test_a_map_without_error_or_mask_is_edited_too(source, library):
-    bare = {n: SkinMap(m.values, m.unit) for n, m in source.appearance.maps.items()
-            if n != "position"}  # fmt: skip
+    bare = {
+        n: SkinMap(m.values, m.unit) for n, m in source.appearance.maps.items() if n != "position"
+    }
     maps = {**bare, "position": source.appearance.maps["position"]}
     face = dataclasses.replace(source, appearance=dataclasses.replace(source.appearance, maps=maps))
     done = editing.edited(face, Order(traits={"tan": 1.0}), library)

@@ -46,17 +46,20 @@ def scene(table, melanin, stderr):
     diffuse = SkinMap(color, "1", 0.005 * color)
     estimate = SkinMap(np.full(shape, melanin), UNITS["melanin"], np.full(shape, stderr))
     truths = {
-        "melanin": melanin, "melanin_blurred": melanin, "hemoglobin": 0.05,
+        "melanin": melanin,
+        "melanin_blurred": melanin,
+        "hemoglobin": 0.05,
         "hemoglobin_blurred": 0.05,
-    }  # fmt: skip
+    }
     truth = SkinAppearance(
         {k: SkinMap(np.full(shape, v), UNITS[k.split("_")[0]]) for k, v in truths.items()},
         "simulated",
     )
     found = SkinAppearance(
-        {"diffuse": diffuse, "melanin": estimate}, "simulated",
+        {"diffuse": diffuse, "melanin": estimate},
+        "simulated",
         parameters={"color_table": {"camera": CAMERA, "illuminant": LIGHT}},
-    )  # fmt: skip
+    )
     return found, truth
 
 
@@ -64,9 +67,12 @@ def test_the_bound_of_maps_is_that_at_the_truth(table, rng):
     found, truth = scene(table, 0.02, 0.01)
     bounds = cramer_rao(found, truth)
     expected, _ = relative_bounds(
-        table, np.array([0.02]), np.array([0.05]), np.full((1, 3), 0.005**2),
+        table,
+        np.array([0.02]),
+        np.array([0.05]),
+        np.full((1, 3), 0.005**2),
         shading_spread=shading_prior.of_faces().spread,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(bounds["melanin"], expected[0], rtol=1e-3)
     assert cramer_rao(SkinAppearance({}, "simulated"), truth) == {}
 

@@ -100,7 +100,11 @@ def shapes_file(tmp_path_factory):
     mesh = bulging_mesh(shapes=True)
     path = tmp_path_factory.mktemp("mesh") / "shapes.npz"
     np.savez(
-        path, vertices_mm=mesh.vertices_mm, faces=mesh.faces, uv=mesh.uv,
-        shape_names=np.array(list(mesh.shapes)), shape_deltas_mm=np.stack([*mesh.shapes.values()]),
-    )  # fmt: skip
+        path,
+        vertices_mm=mesh.vertices_mm,
+        faces=mesh.faces,
+        uv=mesh.uv,
+        shape_names=np.array(list(mesh.shapes)),
+        shape_deltas_mm=np.stack([*mesh.shapes.values()]),
+    )
     return path

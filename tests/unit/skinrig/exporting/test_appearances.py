@@ -100,8 +100,9 @@ def test_a_damaged_date_is_no_consent(patch):
 def test_the_texture_that_colors_are_put_on_must_be_free_too(measured, face_folder, tmp_path):
     order = Delivery(onto=measured)
     with pytest.raises(ConsentError, match="P042"):
-        export_appearance(face_folder, tmp_path / "out", to="maps", delivery=order, use="film",
-                          today=DAY)  # fmt: skip
+        export_appearance(
+            face_folder, tmp_path / "out", to="maps", delivery=order, use="film", today=DAY
+        )
 
 
 @pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "usd"])
@@ -158,19 +159,33 @@ def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_
 
     rig = load_rig("flash").resized(16)
     with Session.create(
-        tmp_path / "s", plan=flash_plan(rig, darks=2), rig=rig, devices={},
-        subject=Subject("P042", ("research",), LAST), source="measured",
-    ) as made:  # fmt: skip
+        tmp_path / "s",
+        plan=flash_plan(rig, darks=2),
+        rig=rig,
+        devices={},
+        subject=Subject("P042", ("research",), LAST),
+        source="measured",
+    ) as made:
         for number, (step, camera) in enumerate(made.todo()):
             blob = raw.encode_dng(
-                np.full((10, 16), 600 + 300 * number, np.uint16), pattern="RGGB", black=512,
-                white=16383, step_id=step.id, session_id=made.id, exposure_s=0.01, iso=100,
+                np.full((10, 16), 600 + 300 * number, np.uint16),
+                pattern="RGGB",
+                black=512,
+                white=16383,
+                step_id=step.id,
+                session_id=made.id,
+                exposure_s=0.01,
+                iso=100,
                 noise_profile=(1e-5, 1e-8),
-            )  # fmt: skip
+            )
             made.commit(
-                step.id, camera, blob, settings=step.settings, t_host_s=1.0 + number,
+                step.id,
+                camera,
+                blob,
+                settings=step.settings,
+                t_host_s=1.0 + number,
                 actual={"light": "flash", "iso": 100},
-            )  # fmt: skip
+            )
         made.close()
 
     def told():
@@ -206,18 +221,23 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
     maps["melanin"] = SkinMap(np.full((16, 16), 0.04), "volume fraction of the epidermis")
     told = {"consent_scope": ["research"], "consent_expires": None}
     part = {
-        "maps": sorted(maps), "files": ["facial_color.json"], "source": "measured",
+        "maps": sorted(maps),
+        "files": ["facial_color.json"],
+        "source": "measured",
         consent.KEY: [{"pseudonym": "rig", **told}],
-    }  # fmt: skip
+    }
     made = SkinAppearance(
-        maps, "measured", {"kind": "dynamic", "parts": {"facial_color": part}},
+        maps,
+        "measured",
+        {"kind": "dynamic", "parts": {"facial_color": part}},
         files={"facial_color.json": document},
-    )  # fmt: skip
+    )
     store.write(tmp_path / "moving", made)
     onto = SkinAppearance(
-        {"hemoglobin": maps["hemoglobin"], "melanin": maps["melanin"]}, "measured",
+        {"hemoglobin": maps["hemoglobin"], "melanin": maps["melanin"]},
+        "measured",
         {consent.KEY: [{"pseudonym": "other", **told}]},
-    )  # fmt: skip
+    )
     expression = applying.Expression({"smile": 1.0}, onto=applying.OtherFace(onto))
     applying.apply_expression(tmp_path / "moving", expression, out=tmp_path / "shown")
     shown = consent.recorded(store.read(tmp_path / "shown"))

@@ -101,10 +101,11 @@ def test_wrinkles_of_one_silent_session_leave_for_nothing(dome, smiling, tmp_pat
 
 def test_fitted_microstructure_leaves_within_the_consent_alone(tmp_path, rng):
     caliper = SkinAppearance(
-        {"height_a000_n0": SkinMap(rng.normal(0.0, 9.0, (32, 32)), "um")}, "measured",
+        {"height_a000_n0": SkinMap(rng.normal(0.0, 9.0, (32, 32)), "um")},
+        "measured",
         {"states": ["a000_n0"], "pixel_um": 6.0, consent.KEY: [NARROW]},
         files={"kernels.json": b'{"fits": []}'},
-    )  # fmt: skip
+    )
     store.write(tmp_path / "cheek", caliper)
     fit_microstructure([tmp_path / "cheek"], out=tmp_path / "moving", paper_table=True)
     refused_beyond(tmp_path / "moving", tmp_path, "maps")
@@ -121,13 +122,18 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
     create = Session.create
     narrow = Subject("P042", ("research",), date(2030, 1, 1))
     monkeypatch.setattr(
-        Session, "create",
+        Session,
+        "create",
         lambda *a, **k: create(*a, **{**k, "source": "measured", "subject": narrow}),
-    )  # fmt: skip
+    )
     simulate_session(
-        "flash", tmp_path / "session-face", subject="II", states=("neutral", "anger"),
-        width_px=WIDTH_PX, seed=4,
-    )  # fmt: skip
+        "flash",
+        tmp_path / "session-face",
+        subject="II",
+        states=("neutral", "anger"),
+        width_px=WIDTH_PX,
+        seed=4,
+    )
     monkeypatch.undo()
     simulate_session("flash", tmp_path / "white", target="white", width_px=WIDTH_PX, seed=4)
     calibrate("white", [tmp_path / "white"], tmp_path / "calibration")
@@ -137,8 +143,12 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
         points = store.read_document(tmp_path / name).parameters["landmarks_px"]
         rows = [f"{n},{x},{y}" for n, (x, y) in points.items()]
         (marks / f"{state}.csv").write_text("\n".join(["name,x,y", *rows]) + "\n")
-    fit_facial_color([tmp_path / "session-face"], out=tmp_path / "moving", landmarks=marks,
-                     calibration=tmp_path / "calibration")  # fmt: skip
+    fit_facial_color(
+        [tmp_path / "session-face"],
+        out=tmp_path / "moving",
+        landmarks=marks,
+        calibration=tmp_path / "calibration",
+    )
     (part,) = parts_of(store.read(tmp_path / "moving")).values()
     assert part["source"] == "measured"
     refused_beyond(tmp_path / "moving", tmp_path, "metahuman")
@@ -160,9 +170,11 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
         one = store.read(path)
         record = {**NARROW, "pseudonym": f"P{k:03d}"}
         store.write(
-            path, dataclasses.replace(one, source="measured",
-                                      parameters={**one.parameters, consent.KEY: [record]}),
-        )  # fmt: skip
+            path,
+            dataclasses.replace(
+                one, source="measured", parameters={**one.parameters, consent.KEY: [record]}
+            ),
+        )
     space = tmp_path / "traits.npz"
     argv = ["fit", "traits", *map(str, paths), "--labels", str(labels), "--out", str(space)]
     assert main(argv) == 0

@@ -27,8 +27,10 @@ def test_an_exr_holds_every_value_exactly_and_says_its_unit(tmp_path, ramp):
         header = dict(file.header())
         pixels = file.channels()["RGB"].pixels.copy()
     assert (header["unit"], header["colorSpace"], header["comments"]) == (
-        "mm", "data", "of the patch",
-    )  # fmt: skip
+        "mm",
+        "data",
+        "of the patch",
+    )
     assert np.array_equal(pixels, ramp)
     assert "chromaticities" not in header
 

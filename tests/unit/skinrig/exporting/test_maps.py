@@ -39,8 +39,10 @@ def picture(rng):
             "picture": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
             "diffuse": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
         },
-        "simulated", {"assumed": ["an even light"]}, {"session": "abc"},
-    )  # fmt: skip
+        "simulated",
+        {"assumed": ["an even light"]},
+        {"session": "abc"},
+    )
 
 
 def test_every_map_is_there_with_its_values_and_a_record(picture, tmp_path):

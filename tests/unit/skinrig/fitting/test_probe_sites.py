@@ -12,9 +12,7 @@ from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import ProbeSiteError
 
 CHANNELS = ("red", "green", "blue")
-MEASURED = {
-    "forehead": (0.50, 0.90, 1.50), "cheek": (0.62, 1.10, 1.60), "chin": (0.70, 1.30, 1.90),
-}  # fmt: skip
+MEASURED = {"forehead": (0.50, 0.90, 1.50), "cheek": (0.62, 1.10, 1.60), "chin": (0.70, 1.30, 1.90)}
 
 
 def face(side=65, *, flat=False):
@@ -29,11 +27,16 @@ def face(side=65, *, flat=False):
 
 def probe(measured=MEASURED, stderr=0.02, files=None):
     rows = [
-        {"site": site, "channel": channel, "sigma_tr_per_mm": value,
-         "sigma_tr_stderr": None if value is None else stderr * value, "measurements": 3}
+        {
+            "site": site,
+            "channel": channel,
+            "sigma_tr_per_mm": value,
+            "sigma_tr_stderr": None if value is None else stderr * value,
+            "measurements": 3,
+        }
         for site, values in measured.items()
         for channel, value in zip(CHANNELS, values, strict=True)
-    ]  # fmt: skip
+    ]
     document = json.dumps({"schema": "skinrig.subsurface/1", "sites": rows}).encode()
     return SkinAppearance(
         {}, "measured", files={"subsurface.json": document} if files is None else files

@@ -130,9 +130,11 @@ def test_chromophores_are_reconstructed_from_crossed_frames_alone(rig, tmp_path)
     calibrate("white", [tmp_path / "session-white"], tmp_path / "calibration")
     simulate_session("flash", tmp_path / "session-face", subject="II", width_px=128, plan=plan)
     pipeline.reconstruct(
-        tmp_path / "session-face", want=("melanin",), out=tmp_path / "appearance",
+        tmp_path / "session-face",
+        want=("melanin",),
+        out=tmp_path / "appearance",
         calibration=tmp_path / "calibration",
-    )  # fmt: skip
+    )
     made = store.read(tmp_path / "appearance").maps["melanin"]
     assert made.valid.mean() > 0.1
     # the preset's melanin is 0.014; a face varies by tan, freckles and lips

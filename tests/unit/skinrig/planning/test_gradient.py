@@ -44,8 +44,9 @@ def test_complements_and_longer_exposures_lower_the_error(look):
 
 def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
-    assert main(["plan", "gradient", "--want", "normals<=2.5deg", "--out", str(file),
-                 "--json"]) == 0  # fmt: skip
+    assert (
+        main(["plan", "gradient", "--want", "normals<=2.5deg", "--out", str(file), "--json"]) == 0
+    )
     document = json.loads(capsys.readouterr().out)
     plan = Plan.from_json(file.read_text())
     assert document["reached"]

@@ -112,8 +112,19 @@ def test_the_median_of_errors_about_offsets_is_that_of_draws(rng):
 def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(dome_sight, "POINTS", 300)
     file = tmp_path / "plan.json"
-    code = main(["plan", "dome", "--want", "normals<=1.5deg", "--width", "320", "--out", str(file),
-                 "--json"])  # fmt: skip
+    code = main(
+        [
+            "plan",
+            "dome",
+            "--want",
+            "normals<=1.5deg",
+            "--width",
+            "320",
+            "--out",
+            str(file),
+            "--json",
+        ]
+    )
     document = json.loads(capsys.readouterr().out)
     assert code == 0
     assert document["schema"] == plans.SCHEMA
@@ -134,8 +145,12 @@ def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, cap
 
 def test_what_is_out_of_reach_says_why(capsys, monkeypatch):
     monkeypatch.setattr(dome_sight, "POINTS", 200)
-    assert main(["plan", "dome", "--want", "normals<=0.05deg", "--width", "320",
-                 "--most-lights", "25"]) == 1  # fmt: skip
+    assert (
+        main(
+            ["plan", "dome", "--want", "normals<=0.05deg", "--width", "320", "--most-lights", "25"]
+        )
+        == 1
+    )
     said = capsys.readouterr().out
     assert "NOT REACHED" in said
     assert "more pixels would help" in said

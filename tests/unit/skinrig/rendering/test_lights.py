@@ -50,8 +50,10 @@ def test_lights_are_read_from_words(stage, words, place, direction, color):
     lamp = stage.light(words)
     assert lamp.intensity == color
     assert (lamp.position_mm is None) == (place is None)
-    np.testing.assert_allclose(lamp.position_mm if direction is None else lamp.direction,
-                               place if direction is None else direction)  # fmt: skip
+    np.testing.assert_allclose(
+        lamp.position_mm if direction is None else lamp.direction,
+        place if direction is None else direction,
+    )
 
 
 @pytest.mark.parametrize("words", ["L999", "1,2", "at:1,2", "1,1,2*x", "1,1,2*-1", "0,0,nan"])

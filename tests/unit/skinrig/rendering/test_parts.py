@@ -183,7 +183,9 @@ def test_a_rendering_replaces_an_older_one_and_nothing_else(tmp_path):
 def test_a_rendering_that_fails_to_be_written_leaves_nothing(tmp_path):
     with pytest.raises(TypeError):
         folder.write(
-            tmp_path / "x", images={"a": np.zeros((2, 2, 3), np.float32)},
-            pictures={"b": None}, document={},
-        )  # fmt: skip
+            tmp_path / "x",
+            images={"a": np.zeros((2, 2, 3), np.float32)},
+            pictures={"b": None},
+            document={},
+        )
     assert list(tmp_path.iterdir()) == []

@@ -122,9 +122,12 @@ def test_the_surface_term_is_that_of_the_tables_at_a_known_pixel(shiny):
     camera = front_camera()
     light = np.array([0.5, 0.2, 0.8])
     seen = render(
-        model_on(mesh, shiny, r_d=(0, 0, 0), weight=0.7), mesh, camera,
-        Light(name="a", direction=tuple(light)), subpixels=1,
-    )  # fmt: skip
+        model_on(mesh, shiny, r_d=(0, 0, 0), weight=0.7),
+        mesh,
+        camera,
+        Light(name="a", direction=tuple(light)),
+        subpixels=1,
+    )
     light /= np.linalg.norm(light)
     row, column = 10, 20
     view = -camera.rays([[column, row]])[0]
@@ -273,9 +276,11 @@ def test_texels_without_a_measurement_are_told_from_those_with_one(matt):
     r_d = model.r_d.copy()
     r_d[:, 20:] = 0.25
     seen = render(
-        dataclasses.replace(model, valid=valid, r_d=r_d), mesh, front_camera(33, 8.0),
+        dataclasses.replace(model, valid=valid, r_d=r_d),
+        mesh,
+        front_camera(33, 8.0),
         Light(name="a", direction=(0, 0, 1)),
-    )  # fmt: skip
+    )
     right = seen.uv[..., 0] > 22 / 32
     left = (seen.uv[..., 0] < 19 / 32) & (seen.coverage > 0.999)
     assert not seen.covered[right].any()
@@ -359,9 +364,13 @@ def test_extreme_skin_gives_finite_pictures_in_proportion_to_its_albedo(matt, r_
     depth = np.full_like(model.translucency_mm, 1.0 / sigma_tr)
     model = dataclasses.replace(model, translucency_mm=depth)
     seen = render(
-        model, mesh, front_camera(5), Light(name="a", direction=(0, 0, 1)), subsurface="dipole",
+        model,
+        mesh,
+        front_camera(5),
+        Light(name="a", direction=(0, 0, 1)),
+        subsurface="dipole",
         subpixels=1,
-    )  # fmt: skip
+    )
     passed = transmitted(1.0) ** 2
     expected = np.array([r_d, 0.5, 0.1]) * passed
     np.testing.assert_allclose(middle(seen.radiance), expected, rtol=0.01, atol=1e-9)

@@ -30,17 +30,25 @@ def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), wo
     session = folder / "session"
     (session / "frames").mkdir(parents=True)
     (session / "session.json").write_text(
-        json.dumps({"plan": {"rig": "dome"}, "created_at": f"{captured}T10:00:00+00:00",
-                    "source": "simulated", "seed": 0})
-    )  # fmt: skip
+        json.dumps(
+            {
+                "plan": {"rig": "dome"},
+                "created_at": f"{captured}T10:00:00+00:00",
+                "source": "simulated",
+                "seed": 0,
+            }
+        )
+    )
     digest = hashlib.sha256((calibration / "geometry.json").read_bytes()).hexdigest()
     store.write(
         folder / "maps",
         SkinAppearance(
-            {"melanin": SkinMap(np.full((4, 4), 0.1), UNITS["melanin"])}, "simulated",
-            parameters={"session": "session"}, inputs={"calibration geometry": digest},
+            {"melanin": SkinMap(np.full((4, 4), 0.1), UNITS["melanin"])},
+            "simulated",
+            parameters={"session": "session"},
+            inputs={"calibration geometry": digest},
         ),
-    )  # fmt: skip
+    )
     return folder
 
 

@@ -73,10 +73,13 @@ def html(tmp_path_factory):
     found = SkinMap(melanin + rng.normal(0, 0.004, melanin.shape), UNITS["melanin"], stderr)
     store.write(
         tmp_path / "maps",
-        SkinAppearance({"melanin": found, "picture": SkinMap(np.ones((30, 40, 3)), "1")},
-                       "simulated", parameters={"truth": "truth"},
-                       left_out=(("gloss", "no parallel frames"),)),
-    )  # fmt: skip
+        SkinAppearance(
+            {"melanin": found, "picture": SkinMap(np.ones((30, 40, 3)), "1")},
+            "simulated",
+            parameters={"truth": "truth"},
+            left_out=(("gloss", "no parallel frames"),),
+        ),
+    )
     store.write(
         tmp_path / "truth", SkinAppearance(truth, "simulated", parameters={"kind": "truth"})
     )
@@ -190,8 +193,9 @@ def test_lines_of_a_simplified_plot_stay_where_they_were():
     path = '<path d="M 10.004 20.006 \nL 30.5 40 \n" style="fill: none; stroke: #123456"/>'
     other = path.replace("10.004", "11").replace("30.5", "31")
     drawn = f'<svg width="9pt"><g id="g_1">{path}{other}</g></svg>'
-    found = re.search(r'<path d="([^"]*)" fill="none" stroke="#123456"/>', svg.simplified(
-        drawn, alt="lines"))  # fmt: skip
+    found = re.search(
+        r'<path d="([^"]*)" fill="none" stroke="#123456"/>', svg.simplified(drawn, alt="lines")
+    )
     assert found[1] == "M10 20.01L30.5 40M11 20.01L31 40"
 
 

@@ -29,8 +29,10 @@ def folder(tmp_path, rng):
             left_out=(("tsumura", "not wanted"),),
         ),
     )
-    maps = {n: SkinMap(truth, UNITS["melanin"] if n == "melanin" else "1")
-            for n in ("melanin", "melanin_blurred")}  # fmt: skip
+    maps = {
+        n: SkinMap(truth, UNITS["melanin"] if n == "melanin" else "1")
+        for n in ("melanin", "melanin_blurred")
+    }
     store.write(
         tmp_path / "truth-flash", SkinAppearance(maps, "simulated", parameters={"kind": "truth"})
     )
@@ -100,8 +102,12 @@ def test_a_map_of_rounding_alone_does_not_look_like_structure(rng):
 
 
 def test_a_medium_is_not_counted_as_a_person(tmp_path):
-    fits = {"sites": [{"site": "cheek", "sigma_tr_per_mm": value, "sigma_tr_stderr": 0.01}
-                      for value in (0.5, 0.7, 0.9)]}  # fmt: skip
+    fits = {
+        "sites": [
+            {"site": "cheek", "sigma_tr_per_mm": value, "sigma_tr_stderr": 0.01}
+            for value in (0.5, 0.7, 0.9)
+        ]
+    }
     files = {SUBSURFACE_FILE: json.dumps(fits).encode()}
     truths, appearances = {}, {}
     for subject in ("III", "homogeneous:0.08,1.2"):

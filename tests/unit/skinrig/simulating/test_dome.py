@@ -100,12 +100,16 @@ def test_a_simulation_goes_on_where_it_was_stopped_with_the_same_settings_only(t
 
 @pytest.mark.parametrize(
     ("more", "match"),
-    [({"target": "chart"}, "charuco, mirror, white, dark"),
-     ({"states": ("anger", "fear")}, "states: got anger, fear"),
-     ({"states": ("angry",)}, "state: got 'angry'"),
-     ({"states": ("anger",), "target": "mirror"}, "a target has none"),
-     ({"repeats": 2}, "repeats"), ({"size": "huge"}, "size"), ({"seed": -1}, "seed")],
-)  # fmt: skip
+    [
+        ({"target": "chart"}, "charuco, mirror, white, dark"),
+        ({"states": ("anger", "fear")}, "states: got anger, fear"),
+        ({"states": ("angry",)}, "state: got 'angry'"),
+        ({"states": ("anger",), "target": "mirror"}, "a target has none"),
+        ({"repeats": 2}, "repeats"),
+        ({"size": "huge"}, "size"),
+        ({"seed": -1}, "seed"),
+    ],
+)
 def test_what_the_dome_cannot_do_is_refused_before_a_folder_is_made(tmp_path, more, match):
     with pytest.raises(SimulationError, match=match):
         simulate_session("dome", tmp_path / "s", **more)
@@ -125,9 +129,8 @@ def test_flicker_and_dose_are_said_before_anything_is_captured(tmp_path, capsys)
     assert "light dose: at most 0.439 Ws from one LED" in text
     lines = []
     simulate_session(
-        "dome", tmp_path / "s", target="dark", lights=8, views=1, width_px=32,
-        progress=lines.append,
-    )  # fmt: skip
+        "dome", tmp_path / "s", target="dark", lights=8, views=1, width_px=32, progress=lines.append
+    )
     assert lines[0].startswith("flicker at the eyes: 0.0 flashes")
     assert lines[1].startswith("light dose: at most 0 Ws")
 
@@ -152,9 +155,14 @@ def test_a_faces_session_holds_a_scan_and_its_truth_lies_beside(tmp_path):
     from model import store
 
     done = simulate_session(
-        "dome", tmp_path / "session-face", lights=12, views=2, width_px=64, seed=1,
+        "dome",
+        tmp_path / "session-face",
+        lights=12,
+        views=2,
+        width_px=64,
+        seed=1,
         leave_out=("subsurface", "interreflections"),
-    )  # fmt: skip
+    )
     session = Session.open(done.session)
     assert session.attachments() == ("scan.ply",)
     assert session.attachment("scan.ply").startswith(b"ply")

@@ -10,9 +10,13 @@ from skinrig.simulating.simulation import simulate_session
 
 def test_where_a_face_stands_is_in_its_session_and_its_truth(tmp_path):
     done = simulate_session(
-        "flash", tmp_path / "session-far", subject="II", width_px=64, nearer_mm=-40.0,
+        "flash",
+        tmp_path / "session-far",
+        subject="II",
+        width_px=64,
+        nearer_mm=-40.0,
         leave_out=("lateral", "interreflections", "optics"),
-    )  # fmt: skip
+    )
     asked = Session.open(done.session).manifest.extra["simulation"]
     truth = store.read(done.truth)
     assert asked["nearer_mm"] == -40.0

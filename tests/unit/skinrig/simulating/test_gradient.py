@@ -86,12 +86,16 @@ def test_targets_are_simulated_without_a_truth(target, tmp_path):
 @pytest.mark.parametrize(
     ("more", "match"),
     [
-        ({"target": "chart"}, "target"), ({"states": ("smile",)}, "states"),
+        ({"target": "chart"}, "target"),
+        ({"states": ("smile",)}, "states"),
         ({"move": True}, "move"),
-        ({"lights": 5}, "lights"), ({"target": "flat", "site": "chin"}, "site"),
-        ({"site": "nose"}, "site"), ({"angles": (30.0,)}, "angles"), ({"steps": (1, 2)}, "steps"),
+        ({"lights": 5}, "lights"),
+        ({"target": "flat", "site": "chin"}, "site"),
+        ({"site": "nose"}, "site"),
+        ({"angles": (30.0,)}, "angles"),
+        ({"steps": (1, 2)}, "steps"),
     ],
-)  # fmt: skip
+)
 def test_what_the_rig_does_not_know_is_refused_before_anything_is_made(more, match, tmp_path):
     out = tmp_path / "session-no"
     with pytest.raises(ValueError, match=match):

@@ -35,13 +35,15 @@ def test_effects_left_out_of_the_flash_rig_are_told_under_their_names(tmp_path):
 
 @pytest.mark.parametrize(
     ("rig", "more", "match"),
-    [("flash", {"leave_out": ("shadow",)}, "'shadow', expected of the flash rig one of lat"),
-     ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
-     ("probe", {"leave_out": ("optics",)}, "none: its scenes build all"),
-     ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface was asked for, too"),
-     ("flash", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
-     ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target")],
-)  # fmt: skip
+    [
+        ("flash", {"leave_out": ("shadow",)}, "'shadow', expected of the flash rig one of lat"),
+        ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
+        ("probe", {"leave_out": ("optics",)}, "none: its scenes build all"),
+        ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface was asked for, too"),
+        ("flash", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
+        ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
+    ],
+)
 def test_what_cannot_be_left_out_is_refused_before_a_folder_is_made(tmp_path, rig, more, match):
     with pytest.raises(SimulationError, match=match):
         simulate_session(rig, tmp_path / "s", **more)

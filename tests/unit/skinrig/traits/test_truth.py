@@ -48,8 +48,10 @@ def test_lotion_sharpens_what_the_surface_reflects():
     assert change.radiance[(cos_h > 0.8) & (cos_h < 0.93)].mean() < 0.0
     # and a basis' sharp lobe points along this change, a wide one against it
     basis = brdf_tables.default()
-    sharp, wide = (np.array([name == which for name in basis.names], float)
-                   for which in ("ggx 0.14 eta 1.4", "beckmann 0.4"))  # fmt: skip
+    sharp, wide = (
+        np.array([name == which for name in basis.names], float)
+        for which in ("ggx 0.14 eta 1.4", "beckmann 0.4")
+    )
     assert change.cosine(sharp - wide, basis) > 0.5 > 0.0 > change.cosine(wide - sharp, basis)
 
 

@@ -211,9 +211,11 @@ def procedural_source() -> SceneSource:
     from skinrig.viewer.scene import ViewerMesh
 
     mesh = ViewerMesh(
-        np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32), np.zeros((3, 2), np.float32),
+        np.eye(3, dtype=np.float32),
+        np.eye(3, dtype=np.float32),
+        np.zeros((3, 2), np.float32),
         np.array([[0, 1, 2]], np.int32),
-    )  # fmt: skip
+    )
     return SceneSource("procedural", mesh, 64)
 
 
@@ -230,18 +232,32 @@ def test_filling_keeps_what_is_known_and_continues_it():
 def test_presets_name_only_what_a_face_has():
     found = presets.presets(["anger", "surprise", "exercise"])
     assert list(found) == [
-        "neutral", "surprise", "anger", "anger and surprise", "after exercise", "exercise",
-    ]  # fmt: skip
+        "neutral",
+        "surprise",
+        "anger",
+        "anger and surprise",
+        "after exercise",
+        "exercise",
+    ]
     assert found["after exercise"] == {"anger": 1.0, "surprise": 1.0, "exercise": 1.0}
 
 
 def test_shapes_of_single_muscles_make_the_six_emotions():
     names = [
         f"{unit}_{side}"
-        for unit in ("mouthSmile", "cheekSquint", "browInnerUp", "browOuterUp", "browDown",
-                     "eyeWide", "noseSneer", "mouthFrown", "mouthStretch")
+        for unit in (
+            "mouthSmile",
+            "cheekSquint",
+            "browInnerUp",
+            "browOuterUp",
+            "browDown",
+            "eyeWide",
+            "noseSneer",
+            "mouthFrown",
+            "mouthStretch",
+        )
         for side in "LR"
-    ] + ["jawOpen", "mouthPucker"]  # fmt: skip
+    ] + ["jawOpen", "mouthPucker"]
     found = presets.presets(names)
     assert set(presets.EMOTIONS) <= set(found)
     assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())

@@ -53,9 +53,14 @@ class Bench:
     def __init__(self, tmp_path, plan, rig=RIG, seed=SEED, **faults):
         self.rig, self.plan = rig, plan
         self.session = Session.create(
-            tmp_path / "s", plan=plan, rig=rig, devices={}, subject=Subject("p"),
-            source="simulated", seed=seed,
-        )  # fmt: skip
+            tmp_path / "s",
+            plan=plan,
+            rig=rig,
+            devices={},
+            subject=Subject("p"),
+            source="simulated",
+            seed=seed,
+        )
         self.asked = []
         self.world = None
         self.build(seed, **faults)
@@ -76,9 +81,14 @@ class Bench:
     def run(self, **more):
         words = {"eyes": "closed", "force_limit_n": 2.0, "prompt": self.asked.append, **more}
         return run_plan(
-            self.plan, self.rig, boxes={"gradient_sphere": self.sphere, "caliper": self.caliper},
-            cameras=self.cameras, session=self.session, clock=lambda: 1.0, **words,
-        )  # fmt: skip
+            self.plan,
+            self.rig,
+            boxes={"gradient_sphere": self.sphere, "caliper": self.caliper},
+            cameras=self.cameras,
+            session=self.session,
+            clock=lambda: 1.0,
+            **words,
+        )
 
     def resume(self):
         path = self.session.path
@@ -189,9 +199,7 @@ def test_each_angle_is_taped_by_itself(make):
     bench = make(short(angles=(0, 90), steps=(-1, 0)))
     bench.run()
     assert bench.asked == ["tape the skin at 0 degrees", "tape the skin at 90 degrees"]
-    assert check_frames(bench.session) == {
-        "a000_n0": 1, "a000_m1": 1, "a090_n0": 2, "a090_m1": 2,
-    }  # fmt: skip
+    assert check_frames(bench.session) == {"a000_n0": 1, "a000_m1": 1, "a090_n0": 2, "a090_m1": 2}
 
 
 @pytest.mark.long
@@ -449,11 +457,15 @@ def test_a_lost_box_ends_dark_and_released_and_what_was_kept_is_safe(make):
 @pytest.mark.parametrize(
     "faults",
     [
-        {"drop_frame": 0.15}, {"wrong_camera": 0.15}, {"wrong_exposure": 0.15}, {"stale": 1.0},
-        {"drift_ppm": 150.0}, {"drop": 5e-4, "flip": 5e-4, "lose_answer": 0.03, "cut": 0.01},
+        {"drop_frame": 0.15},
+        {"wrong_camera": 0.15},
+        {"wrong_exposure": 0.15},
+        {"stale": 1.0},
+        {"drift_ppm": 150.0},
+        {"drop": 5e-4, "flip": 5e-4, "lose_answer": 0.03, "cut": 0.01},
     ],
     ids=lambda faults: next(iter(faults)),
-)  # fmt: skip
+)
 def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
     bench = make(short(steps=(-1, 1)), **faults)
     done = bench.run()
@@ -555,9 +567,14 @@ def test_a_capture_of_skin_without_its_caliper_is_refused(make):
     bench = make()
     with pytest.raises(AcquisitionError, match=r"caliper.*--port caliper=URL"):
         run_plan(
-            bench.plan, RIG, boxes={"gradient_sphere": bench.sphere}, cameras=bench.cameras,
-            session=bench.session, eyes="closed", force_limit_n=1.0,
-        )  # fmt: skip
+            bench.plan,
+            RIG,
+            boxes={"gradient_sphere": bench.sphere},
+            cameras=bench.cameras,
+            session=bench.session,
+            eyes="closed",
+            force_limit_n=1.0,
+        )
     assert untouched(bench)
 
 

@@ -84,9 +84,14 @@ class Bench:
         self.rig, self.plan = rig, plan
         self.scene = scene or Witness()
         self.session = Session.create(
-            tmp_path / "s", plan=plan, rig=rig, devices={}, subject=Subject("p"),
-            source="simulated", seed=SEED,
-        )  # fmt: skip
+            tmp_path / "s",
+            plan=plan,
+            rig=rig,
+            devices={},
+            subject=Subject("p"),
+            source="simulated",
+            seed=SEED,
+        )
         self.asked, self.told = [], []
         self.world = None
         self.build(**faults)
@@ -107,9 +112,14 @@ class Bench:
     def run(self, **more):
         words = {"prompt": self.asked.append, "progress": self.told.append, **more}
         return run_plan(
-            self.plan, self.rig, boxes={"probe": self.box}, cameras=self.cameras,
-            session=self.session, clock=lambda: 1.0, **words,
-        )  # fmt: skip
+            self.plan,
+            self.rig,
+            boxes={"probe": self.box},
+            cameras=self.cameras,
+            session=self.session,
+            clock=lambda: 1.0,
+            **words,
+        )
 
     def resume(self):
         path = self.session.path
@@ -148,9 +158,14 @@ def make(tmp_path):
 
 def short(sites=("cheek",), brackets=6, longest_s=0.5, step_ev=1.0, darks=1, **more):
     return probe_plan(
-        RIG, sites=sites, brackets=brackets, longest_s=longest_s, step_ev=step_ev, darks=darks,
+        RIG,
+        sites=sites,
+        brackets=brackets,
+        longest_s=longest_s,
+        step_ev=step_ev,
+        darks=darks,
         **more,
-    )  # fmt: skip
+    )
 
 
 def check_frames(session):
@@ -190,9 +205,11 @@ def test_every_frame_shows_its_light_and_the_head_held_where_it_was_placed(make)
     done = bench.run(all_brackets=True)
     assert (done.frames, done.retakes, done.stale) == (len(bench.plan.steps), 0, 0)
     assert check_frames(bench.session) == {
-        "forehead at 0 degrees": 1, "forehead at 180 degrees": 2,
-        "chin at 0 degrees": 3, "chin at 180 degrees": 4,
-    }  # fmt: skip
+        "forehead at 0 degrees": 1,
+        "forehead at 180 degrees": 2,
+        "chin at 0 degrees": 3,
+        "chin at 180 degrees": 4,
+    }
     assert bench.placings == [
         "place the head on the forehead at 0 degrees",
         "place the head on the forehead at 180 degrees",
@@ -462,9 +479,15 @@ def test_a_camera_without_a_trigger_line_is_refused_before_anything_is_lit(make)
     bench = make()
     info = bench.cameras["cam"].info
     bench.cameras["cam"]._info = type(info)(
-        info.serial, info.model, info.width_px, info.height_px, info.pattern, info.black,
-        info.white, (Trigger.SOFTWARE,),
-    )  # fmt: skip
+        info.serial,
+        info.model,
+        info.width_px,
+        info.height_px,
+        info.pattern,
+        info.black,
+        info.white,
+        (Trigger.SOFTWARE,),
+    )
     with pytest.raises(CameraError, match="trigger line"):
         bench.run()
     assert bench.placings == []
@@ -525,12 +548,18 @@ def kill_at(bench, owner, name, number):
 @pytest.mark.parametrize(
     ("owner", "name", "number"),
     [
-        ("session", "commit", 1), ("session", "commit", 4), ("session", "commit", 6),
-        ("session", "commit", 9), ("box", "open_shutter", 1), ("box", "open_shutter", 4),
-        ("box", "open_shutter", 6), ("box", "suck", 2), ("session", "leave_out", 1),
+        ("session", "commit", 1),
+        ("session", "commit", 4),
+        ("session", "commit", 6),
+        ("session", "commit", 9),
+        ("box", "open_shutter", 1),
+        ("box", "open_shutter", 4),
+        ("box", "open_shutter", 6),
+        ("box", "suck", 2),
+        ("session", "leave_out", 1),
         ("session", "leave_out", 2),
     ],
-)  # fmt: skip
+)
 def test_a_capture_is_resumed_wherever_it_was_cut(make, owner, name, number):
     bench = make(short(sites=("forehead", "cheek"), brackets=8, longest_s=2.0), Witness(20.0, 7.0))
     kill_at(bench, getattr(bench, owner), name, number)

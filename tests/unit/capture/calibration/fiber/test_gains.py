@@ -70,9 +70,14 @@ class Probe:
         full = np.zeros((28, 3), bool)
         full[list(saturated)] = True
         return FibreReadings(
-            NAMES, np.where(full, 0, signal), np.where(full, 0, variance), ~full, full,
-            np.zeros((28, 3)), (1.0,),
-        )  # fmt: skip
+            NAMES,
+            np.where(full, 0, signal),
+            np.where(full, 0, variance),
+            ~full,
+            full,
+            np.zeros((28, 3)),
+            (1.0,),
+        )
 
     def masks(self, **about):
         return {i: self.read(PHANTOM, only=i, **about) for i in range(28)}
@@ -80,9 +85,13 @@ class Probe:
     def calibrate(self, *, expected=None, level=1.0, masks=None, **about):
         expected = expected or ExpectedReflectance(PHANTOM, np.zeros((28, 3)))
         return calibrate_fibres(
-            self.read(PHANTOM, level=level, **about), self.masks() if masks is None else masks,
-            spots=spots(), radius_mm=RADIUS, expected=expected, level=level,
-        )  # fmt: skip
+            self.read(PHANTOM, level=level, **about),
+            self.masks() if masks is None else masks,
+            spots=spots(),
+            radius_mm=RADIUS,
+            expected=expected,
+            level=level,
+        )
 
 
 def away(found, truth):
@@ -241,9 +250,14 @@ def test_readings_of_another_probe_are_refused(rng):
     calibration = probe.calibrate()
     readings = probe.read(SKIN)
     other = FibreReadings(
-        tuple(reversed(NAMES)), readings.signal, readings.variance, readings.valid,
-        readings.saturated, readings.around, (1.0,),
-    )  # fmt: skip
+        tuple(reversed(NAMES)),
+        readings.signal,
+        readings.variance,
+        readings.valid,
+        readings.saturated,
+        readings.around,
+        (1.0,),
+    )
     with pytest.raises(FibreError, match="expected those of the calibration"):
         calibration.reflectance(other)
     with pytest.raises(FibreError, match="level: got 0"):

@@ -18,8 +18,16 @@ FALSE_ALARM = 1e-5
 
 def spots_of(camera, aperture_px=17.0):
     row = np.full(28, 13.0)
-    return FibreSpots(camera.names, camera.places, np.full((28, 2), 0.02), row, 0.01 * row,
-                      0.1 * row, np.ones(28, bool), aperture_px)  # fmt: skip
+    return FibreSpots(
+        camera.names,
+        camera.places,
+        np.full((28, 2), 0.02),
+        row,
+        0.01 * row,
+        0.1 * row,
+        np.ones(28, bool),
+        aperture_px,
+    )
 
 
 def read(camera, frames, times, darks, **about):
@@ -74,8 +82,9 @@ def test_light_below_the_dark_signal_is_read_without_bias(fibre_camera, brackets
 
 def test_no_light_gives_both_signs_with_a_variance(fibre_camera, brackets_s):
     camera = fibre_camera(np.random.default_rng(3))
-    readings = read(camera, camera.series(np.zeros((28, 3)), brackets_s), brackets_s,
-                    camera.darks())  # fmt: skip
+    readings = read(
+        camera, camera.series(np.zeros((28, 3)), brackets_s), brackets_s, camera.darks()
+    )
     assert readings.valid.all()
     assert not readings.detected.any()
     negative = int((readings.signal < 0).sum())
@@ -194,9 +203,13 @@ def test_bright_light_is_merged_as_by_the_merge_of_brackets(bench, all_brackets_
     merged = merge_series(frames, all_brackets_s, darks=darks, noise=camera.noise)
     noise = camera.noise
     radiance, variance, _ = hdr.merge(
-        frames, all_brackets_s, gain=noise.gain_e_per_dn, read_noise=noise.read_noise_e,
-        black=noise.black_dn, white=noise.white_dn,
-    )  # fmt: skip
+        frames,
+        all_brackets_s,
+        gain=noise.gain_e_per_dn,
+        read_noise=noise.read_noise_e,
+        black=noise.black_dn,
+        white=noise.white_dn,
+    )
     bright = merged.valid & (radiance > 1e4)
     assert bright.sum() > 5000
     gap = (merged.rate * noise.span_dn - radiance)[bright] / np.sqrt(variance[bright])

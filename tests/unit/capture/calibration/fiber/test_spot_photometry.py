@@ -104,9 +104,12 @@ def test_the_light_that_a_perfect_lens_spreads_beyond_the_disc_is_known():
     np.divide(2 * j1(v), v, out=pattern, where=v > 0)
     pattern = pattern**2 * np.pi / (4 * airy_px**2)
     part = Shot(
-        pattern.astype(np.float32), np.full(v.shape, 1e-4, np.float32), np.ones(v.shape, bool),
-        1.0, 0.0,
-    )  # fmt: skip
+        pattern.astype(np.float32),
+        np.full(v.shape, 1e-4, np.float32),
+        np.ones(v.shape, bool),
+        1.0,
+        0.0,
+    )
     flux = measure_flux(part, np.array([[100.0, 100.0]]), aperture_px=np.array([aperture]))
     assert flux.value[0] == pytest.approx(float(share_within(aperture, airy_px)), abs=2e-3)
     assert flux.value[0] < 0.99
@@ -120,9 +123,12 @@ def test_frames_of_color_cameras_are_refused():
 
 def test_dark_and_flat_are_taken_off():
     frame = RawFrame(
-        cfa=np.full((4, 4), 164, np.uint16), pattern="MONO", black=(64.0,), white=1064,
+        cfa=np.full((4, 4), 164, np.uint16),
+        pattern="MONO",
+        black=(64.0,),
+        white=1064,
         noise_profile=(1e-3, 1e-5),
-    )  # fmt: skip
+    )
     part = shot(frame, amount_s=1.0, reading_deg=0.0, dark=np.full((4, 4), 0.02), flat=0.5)
     np.testing.assert_allclose(part.signal, 0.16, rtol=1e-6)
     np.testing.assert_allclose(part.variance, (1e-4 + 1e-5) / 0.25, rtol=1e-5)

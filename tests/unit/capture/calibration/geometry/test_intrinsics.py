@@ -94,9 +94,13 @@ def test_a_lens_without_inverse_is_refused():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("rotation", 2 * np.eye(3)), ("matrix", -np.eye(3)), ("distortion", [np.nan] * 5),
-     ("translation_mm", [0.0, 0.0])],
-)  # fmt: skip
+    [
+        ("rotation", 2 * np.eye(3)),
+        ("matrix", -np.eye(3)),
+        ("distortion", [np.nan] * 5),
+        ("translation_mm", [0.0, 0.0]),
+    ],
+)
 def test_what_is_no_camera_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
         dataclasses.replace(CameraPose.nominal(DOME.views[0]), **{field: value})
@@ -116,11 +120,14 @@ def test_cameras_survive_their_calibration(tmp_path):
     }
     store.save(
         geometry.to_calibration(
-            poses, rig=rig.name, source="simulated", created=date(2026, 11, 21),
+            poses,
+            rig=rig.name,
+            source="simulated",
+            created=date(2026, 11, 21),
             reprojection_px={"C01": 0.1, "C07": 0.2},
         ),
         tmp_path,
-    )  # fmt: skip
+    )
     loaded = store.load(tmp_path, "geometry")
     again = geometry.poses_from(loaded, rig)
     for name, camera in poses.items():
@@ -140,8 +147,11 @@ def test_the_derivatives_of_the_bundle_are_those_of_the_projection(rng):
     start = geometry.nominal_cameras(DOME.subset(views=["C02"]))
     problem = bundle._Problem(
         {("C02", 1): Sighting(np.arange(24), np.zeros((24, 2)))},
-        BOARD, start, bundle.LensPrior(), "cameras",
-    )  # fmt: skip
+        BOARD,
+        start,
+        bundle.LensPrior(),
+        "cameras",
+    )
     for k, derivative in [(k, of_camera[..., k]) for k in range(15)] + [
         (15 + k, of_place[..., k]) for k in range(6)
     ]:
@@ -163,10 +173,13 @@ def test_a_bundle_finds_cameras_within_their_errors(rng, gauge):
     squares, degrees = 0.0, 0
     for _ in range(4):
         true = {
-            name: shifted(bent(camera, 0.3 * LENS * rng.standard_normal()),
-                          rng.normal(0, 2, 3), rng.normal(0, 0.005, 3))
+            name: shifted(
+                bent(camera, 0.3 * LENS * rng.standard_normal()),
+                rng.normal(0, 2, 3),
+                rng.normal(0, 0.005, 3),
+            )
             for name, camera in nominal.items()
-        }  # fmt: skip
+        }
         seen = sightings_of(true, boards_in_view(rng, 8), rng, 0.1)
         found = bundle.adjust(seen, BOARD, nominal, gauge=gauge)
         assert found.sigma_px == pytest.approx(0.1, rel=0.1)

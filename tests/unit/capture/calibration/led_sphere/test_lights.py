@@ -20,19 +20,32 @@ def table(rng):
     n = len(nominal.names)
     valid = rng.random(n) > 0.1
     return dataclasses.replace(
-        nominal, directions_stderr=rng.uniform(0, 1e-3, (n, 3)),
-        intensities=rng.uniform(0.5, 1.5, n), intensities_stderr=rng.uniform(0, 0.01, n),
-        seen=np.ones(n, bool), valid=valid, dead=valid & (rng.random(n) > 0.9),
-    )  # fmt: skip
+        nominal,
+        directions_stderr=rng.uniform(0, 1e-3, (n, 3)),
+        intensities=rng.uniform(0.5, 1.5, n),
+        intensities_stderr=rng.uniform(0, 0.01, n),
+        seen=np.ones(n, bool),
+        valid=valid,
+        dead=valid & (rng.random(n) > 0.9),
+    )
 
 
 def films(rng):
     n = len(RIG.lights)
     return SphereFilms(
         tuple(light.name for light in RIG.lights),
-        *rng.uniform(0, 0.01, (4, n)), *rng.uniform(-0.01, 0.01, (1, n)),
-        *rng.uniform(0, 0.01, (1, n)), np.ones(n, bool), 0.01, 0.001, 5e-4, 1e-5, 3e-4, 1e-5, 1.4,
-    )  # fmt: skip
+        *rng.uniform(0, 0.01, (4, n)),
+        *rng.uniform(-0.01, 0.01, (1, n)),
+        *rng.uniform(0, 0.01, (1, n)),
+        np.ones(n, bool),
+        0.01,
+        0.001,
+        5e-4,
+        1e-5,
+        3e-4,
+        1e-5,
+        1.4,
+    )
 
 
 def written(folder, rng):
@@ -47,8 +60,15 @@ def written(folder, rng):
 def test_a_sphere_is_read_as_it_was_written(tmp_path, rng):
     lights, leaks = written(tmp_path, rng)
     found = SphereCalibration.load(tmp_path, RIG, on=MADE)
-    for name in ("directions", "directions_stderr", "intensities", "intensities_stderr",
-                 "seen", "valid", "dead"):  # fmt: skip
+    for name in (
+        "directions",
+        "directions_stderr",
+        "intensities",
+        "intensities_stderr",
+        "seen",
+        "valid",
+        "dead",
+    ):
         np.testing.assert_array_equal(getattr(found.lights, name), getattr(lights, name))
     for field in dataclasses.fields(SphereFilms):
         np.testing.assert_array_equal(getattr(found.films, field.name), getattr(leaks, field.name))

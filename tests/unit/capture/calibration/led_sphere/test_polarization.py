@@ -33,8 +33,9 @@ SKIN = reflection(
 )
 
 
-def spots(rng, *, zero_deg, turn_deg, light_leak=1 / 2000, analyser_leak=1 / 3000,
-          series=BOTH_SIDES):  # fmt: skip
+def spots(
+    rng, *, zero_deg, turn_deg, light_leak=1 / 2000, analyser_leak=1 / 3000, series=BOTH_SIDES
+):
     """Return readings, rates, variances, which are good, and the truth."""
     turn = np.radians(rng.normal(0.0, turn_deg, len(PLACE)))
     strength = 1.3e7 * rng.normal(1.0, 0.1, len(PLACE))  # photo-electrons at amount 1

@@ -44,9 +44,14 @@ def test_the_nominal_table_is_that_of_the_rig():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("intensity", -np.ones((150, 3))), ("position_mm", np.zeros((3, 3))), ("valid", np.ones(2)),
-     ("axis", np.zeros((150, 3))), ("names", ("L",) * 150)],
-)  # fmt: skip
+    [
+        ("intensity", -np.ones((150, 3))),
+        ("position_mm", np.zeros((3, 3))),
+        ("valid", np.ones(2)),
+        ("axis", np.zeros((150, 3))),
+        ("names", ("L",) * 150),
+    ],
+)
 def test_tables_that_contradict_themselves_are_refused(field, value):
     with pytest.raises(ValueError, match="LightTable"):
         dataclasses.replace(LightTable.nominal(DOME), **{field: value})
@@ -121,9 +126,14 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
     spheres, seen = {}, []
     for number, center in enumerate([[-85.0, 45, 30], [85.0, -45, -30], [0.0, 0, 20]]):
         spheres[number] = SpherePlace(
-            np.array(center) + rng.normal(0, 0.01, 3), RADIUS_MM, 1e-4 * np.eye(3), 0.1, 50.0,
-            0.01, views,
-        )  # fmt: skip
+            np.array(center) + rng.normal(0, 0.01, 3),
+            RADIUS_MM,
+            1e-4 * np.eye(3),
+            0.1,
+            50.0,
+            0.01,
+            views,
+        )
         for view in views:
             pixels = mirror_sphere.reflection_pixels(
                 CAMERAS[view], np.array(center), RADIUS_MM, np.array(list(true.values()))
@@ -207,9 +217,18 @@ def plate_samples(rng, table, *, poses, gains, noise):
                 white = 0.99 * gain * shapes[k][:, None] * table.intensity[k]
                 signal = 0.05 * white * (1 + noise * rng.standard_normal(white.shape))
                 rows.append(
-                    PlateSamples(view, name, 0.05, rotation, np.arange(24), points, pixels, signal,
-                                 (noise * white * 0.05) ** 2 + 1e-12)
-                )  # fmt: skip
+                    PlateSamples(
+                        view,
+                        name,
+                        0.05,
+                        rotation,
+                        np.arange(24),
+                        points,
+                        pixels,
+                        signal,
+                        (noise * white * 0.05) ** 2 + 1e-12,
+                    )
+                )
     return rows
 
 
@@ -241,9 +260,10 @@ def test_a_shading_that_is_anothers_is_named(rng):
     crossed = [dataclasses.replace(s, light=names.get(s.light, s.light)) for s in samples]
     dark = [
         dataclasses.replace(s, signal=1e-6 * rng.standard_normal(s.signal.shape))
-        if s.light == off else s
+        if s.light == off
+        else s
         for s in crossed
-    ]  # fmt: skip
+    ]
     answers, dead = light_fit.check_order(dark, table)
     assert answers == names
     assert dead == (off,)

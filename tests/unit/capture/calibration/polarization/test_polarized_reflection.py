@@ -23,9 +23,13 @@ def by_ball(eta=1.52, lights=RIG.lights):
     place = np.array([light.position_mm for light in lights])
     shown = mirrored(CAMERA, BALL, 6.0, place)
     return Reflection.of(
-        lights, CAMERA, VIEW.analyser_axis_deg, eta,
-        to_light=shown.to_light, to_camera=shown.to_camera,
-    )  # fmt: skip
+        lights,
+        CAMERA,
+        VIEW.analyser_axis_deg,
+        eta,
+        to_light=shown.to_light,
+        to_camera=shown.to_camera,
+    )
 
 
 def by_skin(eta=1.4):
@@ -82,16 +86,24 @@ def test_the_simulators_own_reflection_agrees():
         shadowed = 2 / (1 + np.sqrt(1 + alpha**2 * (1 - cosine**2) / cosine**2))
         lobe = shadowed**2 / (np.pi * alpha**2) / (4 * cosine)
         stokes = shading.specular_stokes(
-            facet[None], reflection.to_light[k][None], reflection.to_camera[k][None], alpha,
-            eta=1.52, light_absorbs=absorbing_axis(light), image_right=[1.0, 0.0, 0.0],
+            facet[None],
+            reflection.to_light[k][None],
+            reflection.to_camera[k][None],
+            alpha,
+            eta=1.52,
+            light_absorbs=absorbing_axis(light),
+            image_right=[1.0, 0.0, 0.0],
             extinction=2000.0,
-        )  # fmt: skip
+        )
         for e, reading in enumerate(readings):
             behind = shading.analyse(
-                stokes, reflection.to_camera[k][None],
-                passes_deg=VIEW.analyser_axis_deg + reading + 0.7, image_right=[1.0, 0.0, 0.0],
-                image_up=[0.0, 1.0, 0.0], extinction=3000.0,
-            )  # fmt: skip
+                stokes,
+                reflection.to_camera[k][None],
+                passes_deg=VIEW.analyser_axis_deg + reading + 0.7,
+                image_right=[1.0, 0.0, 0.0],
+                image_up=[0.0, 1.0, 0.0],
+                extinction=3000.0,
+            )
             theirs[e, k] = 2 * behind[0] / lobe  # a film passes half of unpolarized light
     # the simulator works in single precision
     np.testing.assert_allclose(ours, theirs, atol=1e-6 * theirs.max(), rtol=3e-4)
@@ -105,7 +117,9 @@ def test_lights_without_polarizers_are_named():
 
 def test_cross_products_are_numpy_s_bit_by_bit(rng):
     first, second = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
-    np.testing.assert_array_equal(polarized_reflection._cross(first, second),
-                                  np.cross(first, second))  # fmt: skip
-    np.testing.assert_array_equal(polarized_reflection._cross(first, second[0]),
-                                  np.cross(first, second[0]))  # fmt: skip
+    np.testing.assert_array_equal(
+        polarized_reflection._cross(first, second), np.cross(first, second)
+    )
+    np.testing.assert_array_equal(
+        polarized_reflection._cross(first, second[0]), np.cross(first, second[0])
+    )

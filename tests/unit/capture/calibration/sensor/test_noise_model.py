@@ -237,11 +237,7 @@ def _frames(n, value=600):
     ("pairs", "darks", "says"),
     [
         (lambda: [FlatPair(*_frames(2), 1.0)] * 4, lambda: _frames(2), "amounts of light"),
-        (
-            lambda: [FlatPair(*_frames(2), x) for x in (1.0, 2.0, 3.0)],
-            lambda: _frames(1),
-            "darks",
-        ),
+        (lambda: [FlatPair(*_frames(2), x) for x in (1.0, 2.0, 3.0)], lambda: _frames(1), "darks"),
         (
             lambda: [FlatPair(*_frames(2), x) for x in (1.0, 2.0, 3.0)],
             lambda: [np.zeros((64, 66), np.uint16)] * 2,

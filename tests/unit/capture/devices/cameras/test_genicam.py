@@ -48,8 +48,20 @@ def error(name):
 class Node:
     """A feature, as GenApi shows it."""
 
-    def __init__(self, value=None, *, choices=(), access=RW, low=None, high=None, inc=None, unit="",
-                 do=None, read=None, numbers=None):  # fmt: skip
+    def __init__(
+        self,
+        value=None,
+        *,
+        choices=(),
+        access=RW,
+        low=None,
+        high=None,
+        inc=None,
+        unit="",
+        do=None,
+        read=None,
+        numbers=None,
+    ):
         self._value, self._read, self._do, self._numbers = value, read, do, numbers
         self._names, self._access = list(choices), access
         self.min, self.max, self._inc, self.unit = low, high, inc, unit
@@ -105,7 +117,9 @@ class Body:
         self.nodes = {
             "DeviceSerialNumber": Node(serial, access=RO),
             "DeviceModelName": Node("Body 12µ", access=RO),
-            "Width": Node(6), "Height": Node(4), "PayloadSize": Node(48, access=RO),
+            "Width": Node(6),
+            "Height": Node(4),
+            "PayloadSize": Node(48, access=RO),
             "PixelFormat": Node("Mono8", choices=list(NUMBERS), numbers=NUMBERS),
             "ExposureTime": Node(5000.0, low=20.0, high=1e6, inc=20.0),
             "Gain": Node(3.0, low=0.0, high=24.0, unit="dB"),
@@ -123,7 +137,7 @@ class Body:
             "TriggerSoftware": Node(do=lambda: self.released_by("Software")),
             "TimestampLatch": Node(do=self.latch),
             "TimestampLatchValue": Node(access=RO, read=lambda: self.latched_ns),
-        }  # fmt: skip
+        }
 
     def now_s(self):
         return self.clock.now + 5000.0  # counts from when it was switched on
@@ -145,12 +159,18 @@ class Body:
         width, height = self.nodes["Width"].value, self.nodes["Height"].value
         values = np.full((height, width), 64 + self.shots, "u1" if name.endswith("8") else "<u2")
         fields = {
-            "payload_type": 1, "pixel_format": NUMBERS[name], "width": width, "height": height,
-            "raw_buffer": values.tobytes(), "image_offset": 0, "padding_x": 0,
-            "pixel_endianness": 1, "frame_id": self.shots,
+            "payload_type": 1,
+            "pixel_format": NUMBERS[name],
+            "width": width,
+            "height": height,
+            "raw_buffer": values.tobytes(),
+            "image_offset": 0,
+            "padding_x": 0,
+            "pixel_endianness": 1,
+            "frame_id": self.shots,
             "timestamp_ns": round(1e9 * (self.now_s() + self.ahead_s)),
             "parent": SimpleNamespace(queue_buffer=self.requeued.append),
-        }  # fmt: skip
+        }
         self.buffers.append(SimpleNamespace(**(fields | changes)))
 
 
@@ -246,9 +266,10 @@ def bus(clock, body, tmp_path, monkeypatch):
             opened.remove(self.path)
 
     core = SimpleNamespace(
-        Harvester=Harvester, ParameterSet=dict,
+        Harvester=Harvester,
+        ParameterSet=dict,
         ParameterKey=SimpleNamespace(ENABLE_AUTO_CHUNK_DATA_UPDATE="chunks"),
-    )  # fmt: skip
+    )
     library = genicam_producer.Library(core, (GenericError,))
     monkeypatch.setattr(genicam, "load_library", lambda url: library)
     monkeypatch.setattr(genicam.GenicamCamera.__init__, "__kwdefaults__", {"clock": clock})
@@ -422,9 +443,15 @@ def test_frames_of_a_sequence_find_their_rows_of_light_by_the_cameras_clock(came
         body.released_by("Line2")
     del body.buffers[2]
     stream = FrameStream(
-        "cam", camera, row_times_s=times, dwell_s=1.0 / 12.0, clock=offset, want=WANT, lag_s=0.0,
+        "cam",
+        camera,
+        row_times_s=times,
+        dwell_s=1.0 / 12.0,
+        clock=offset,
+        want=WANT,
+        lag_s=0.0,
         timeout_s=1.0,
-    )  # fmt: skip
+    )
     frames = stream.until(5)
     assert {row: int(frame.image[0, 0]) for row, frame in frames.items()} == {
         row: 65 + row for row in (0, 1, 3, 4, 5)
@@ -626,7 +653,7 @@ def having(**changed):
         (having(GammaEnable=Node(True, access=RO)), "GammaEnable.*cannot be set"),
         (having(BalanceRatio=Node(2.0, low=2.0, high=4.0)), "BalanceRatio of Red: got 2"),
     ],
-)  # fmt: skip
+)
 def test_a_camera_whose_frames_could_not_be_believed_is_refused_and_let_go(
     bus, body, change, message
 ):
@@ -638,9 +665,20 @@ def test_a_camera_whose_frames_could_not_be_believed_is_refused_and_let_go(
 
 @pytest.mark.parametrize(
     "rest",
-    ["", "?black=3", "B2?format=RGB8", "B2?format=", "B2?iso=0", "B2?iso=x", "B2?black=nan",
-     "B2?black=-1", "B2?gain=3", "B2?line", "B2?line=Line1&line=Line2"],
-)  # fmt: skip
+    [
+        "",
+        "?black=3",
+        "B2?format=RGB8",
+        "B2?format=",
+        "B2?iso=0",
+        "B2?iso=x",
+        "B2?black=nan",
+        "B2?black=-1",
+        "B2?gain=3",
+        "B2?line",
+        "B2?line=Line1&line=Line2",
+    ],
+)
 def test_an_address_that_says_something_else_is_refused(rest):
     with pytest.raises(CameraUrlError, match="expected genicam:SERIAL"):
         genicam.parse_address(rest)
@@ -656,10 +694,13 @@ def test_a_format_or_line_that_it_lacks_is_named_with_those_it_has(bus):
 def test_every_error_of_the_library_is_one_of_a_camera():
     library = genicam_producer.Library(None, (GenericError,))
     kinds = {
-        "AccessException": CameraError, "ResourceInUseException": CameraBusy,
-        "AccessDeniedException": CameraBusy, "IoException": LinkLost, "TimeoutException": LinkLost,
+        "AccessException": CameraError,
+        "ResourceInUseException": CameraBusy,
+        "AccessDeniedException": CameraBusy,
+        "IoException": LinkLost,
+        "TimeoutException": LinkLost,
         "GenericException": LinkLost,
-    }  # fmt: skip
+    }
     for (name, kind), doing in itertools.product(kinds.items(), ["a", "b"]):
         with pytest.raises(kind, match=doing), library.translated(doing):
             raise error(name)

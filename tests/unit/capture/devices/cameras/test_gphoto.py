@@ -71,10 +71,15 @@ class Body:
         self.shots += not self.stuck
         top, _, bottom = self.tree["shutterspeed"].value.partition("/")
         self.files["capt0000.nef"] = raw.encode_dng(  # one name for all: the camera's memory
-            np.full((16, 16), 600 + self.shots, np.uint16), pattern="RGGB", black=512,
-            white=16383, exposure_s=float(top) / float(bottom), camera_model="Body",
-            iso=int(self.tree["iso"].value), camera_serial=self.serial,
-        )  # fmt: skip
+            np.full((16, 16), 600 + self.shots, np.uint16),
+            pattern="RGGB",
+            black=512,
+            white=16383,
+            exposure_s=float(top) / float(bottom),
+            camera_model="Body",
+            iso=int(self.tree["iso"].value),
+            camera_serial=self.serial,
+        )
         return SimpleNamespace(folder="/", name="capt0000.nef")
 
     def edge(self):
@@ -134,10 +139,14 @@ def library(*bodies, clock):
             return self.index(address)
 
     return SimpleNamespace(
-        Camera=Camera, PortInfoList=PortInfoList, GPhoto2Error=GPhoto2Error,
-        GP_CAPTURE_IMAGE="image", GP_FILE_TYPE_NORMAL="normal", GP_EVENT_TIMEOUT="timeout",
+        Camera=Camera,
+        PortInfoList=PortInfoList,
+        GPhoto2Error=GPhoto2Error,
+        GP_CAPTURE_IMAGE="image",
+        GP_FILE_TYPE_NORMAL="normal",
+        GP_EVENT_TIMEOUT="timeout",
         GP_EVENT_FILE_ADDED="file",
-    )  # fmt: skip
+    )
 
 
 class Clock:

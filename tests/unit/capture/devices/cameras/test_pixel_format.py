@@ -80,9 +80,21 @@ def test_the_filter_array_is_that_of_the_name(corner):
 
 
 @pytest.mark.parametrize(
-    "name", ["", "RGB8", "YUV422_8", "Mono8s", "Mono9", "BayerRG8p", "Mono16p", "Mono14Packed",
-             "BayerXX8", "Mono12c3p", "bayerrg12"],
-)  # fmt: skip
+    "name",
+    [
+        "",
+        "RGB8",
+        "YUV422_8",
+        "Mono8s",
+        "Mono9",
+        "BayerRG8p",
+        "Mono16p",
+        "Mono14Packed",
+        "BayerXX8",
+        "Mono12c3p",
+        "bayerrg12",
+    ],
+)
 def test_other_formats_are_not_raw(name):
     assert pixel_format.parse(name) is None
 

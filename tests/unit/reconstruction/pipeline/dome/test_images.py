@@ -37,10 +37,15 @@ def mosaic(rate, seconds, rng, *, ambient=0.0):
 
 def make(path, rng, *, ambient=0.0, darks=0, profile=True):
     steps = [
-        Step(f"O{k}", "olat", {"light": "L000", "exposure": k, "pass": 0},
-             {"light": "L000", "exposure_s": s, "level": 1.0}, ("C00",))
+        Step(
+            f"O{k}",
+            "olat",
+            {"light": "L000", "exposure": k, "pass": 0},
+            {"light": "L000", "exposure_s": s, "level": 1.0},
+            ("C00",),
+        )
         for k, s in enumerate((LONG_S, SHORT_S))
-    ]  # fmt: skip
+    ]
     steps += [
         Step(f"D{k}", "dark", {"repeat": k}, {"exposure_s": LONG_S}, ("C00",)) for k in range(darks)
     ]
@@ -48,19 +53,29 @@ def make(path, rng, *, ambient=0.0, darks=0, profile=True):
         VIEW.gain_e_per_dn, VIEW.read_noise_e, black=VIEW.black_level, white=VIEW.white_level
     )
     with Session.create(
-        path, plan=Plan("dome", tuple(steps)), rig=RIG, devices={},
-        subject=Subject("P1", ("research",)), source="simulated", seed=0,
+        path,
+        plan=Plan("dome", tuple(steps)),
+        rig=RIG,
+        devices={},
+        subject=Subject("P1", ("research",)),
+        source="simulated",
+        seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),
-    ) as session:  # fmt: skip
+    ) as session:
         for step in steps:
             seconds = float(step.settings["exposure_s"])
             lit = RATE if step.kind == "olat" else np.zeros(3)
             blob = raw.encode_dng(
-                mosaic(lit, seconds, rng, ambient=ambient), pattern=VIEW.cfa,
-                black=VIEW.black_level, white=VIEW.white_level, exposure_s=seconds,
-                noise_profile=noise if profile else None, camera_serial=VIEW.serial,
-                step_id=step.id, session_id=session.id,
-            )  # fmt: skip
+                mosaic(lit, seconds, rng, ambient=ambient),
+                pattern=VIEW.cfa,
+                black=VIEW.black_level,
+                white=VIEW.white_level,
+                exposure_s=seconds,
+                noise_profile=noise if profile else None,
+                camera_serial=VIEW.serial,
+                step_id=step.id,
+                session_id=session.id,
+            )
             session.commit(
                 step.id, "C00", blob, settings=step.settings, actual={}, t_box_s=1.5, t_host_s=2.0
             )

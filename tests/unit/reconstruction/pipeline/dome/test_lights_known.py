@@ -22,21 +22,36 @@ TODAY = date(2026, 11, 21)
 def session(tmp_path):
     view = RIG.views[0]
     steps = tuple(
-        Step(f"O{light.name}", "olat", {"light": light.name, "exposure": 0, "pass": 0},
-             {"light": light.name, "exposure_s": 0.06, "level": 1.0}, ("C00",))
+        Step(
+            f"O{light.name}",
+            "olat",
+            {"light": light.name, "exposure": 0, "pass": 0},
+            {"light": light.name, "exposure_s": 0.06, "level": 1.0},
+            ("C00",),
+        )
         for light in RIG.lights
-    )  # fmt: skip
+    )
     with Session.create(
-        tmp_path / "session", plan=Plan("dome", steps), rig=RIG, devices={},
-        subject=Subject("P1", ("research",)), source="simulated", seed=0,
+        tmp_path / "session",
+        plan=Plan("dome", steps),
+        rig=RIG,
+        devices={},
+        subject=Subject("P1", ("research",)),
+        source="simulated",
+        seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),
-    ) as session:  # fmt: skip
+    ) as session:
         for step in steps:
             blob = raw.encode_dng(
-                np.full((view.height_px, view.width_px), 900, np.uint16), pattern=view.cfa,
-                black=view.black_level, white=view.white_level, exposure_s=0.06,
-                camera_serial=view.serial, step_id=step.id, session_id=session.id,
-            )  # fmt: skip
+                np.full((view.height_px, view.width_px), 900, np.uint16),
+                pattern=view.cfa,
+                black=view.black_level,
+                white=view.white_level,
+                exposure_s=0.06,
+                camera_serial=view.serial,
+                step_id=step.id,
+                session_id=session.id,
+            )
             session.commit(step.id, "C00", blob, settings=step.settings, actual={}, t_host_s=2.0)
         session.close()
     return Session.open(tmp_path / "session")

@@ -18,9 +18,7 @@ RIG = load_rig("dome")
 VIEWS = sorted(RIG.views, key=lambda view: -view.position_mm[2])[:3]
 RIG = RIG.subset(views=[view.name for view in VIEWS]).resized(360)
 CAMERAS = [CameraPose.nominal(view) for view in RIG.views]
-PIXEL_MM = 2.0 * np.median(
-    [np.linalg.norm(c.center_mm) / c.matrix[0, 0] for c in CAMERAS]
-)  # fmt: skip
+PIXEL_MM = 2.0 * np.median([np.linalg.norm(c.center_mm) / c.matrix[0, 0] for c in CAMERAS])
 WAVES = np.random.default_rng(5).normal(0.0, 0.3, (12, 3))
 PHASES = np.random.default_rng(6).uniform(0.0, 2 * np.pi, 12)
 TIMES_S = (0.0, 5.0, 10.0, 15.0, 20.0)
@@ -87,10 +85,13 @@ class Shots:
 
     def read(self, record):
         return RawFrame(
-            cfa=self._frames[record.file], pattern="RGGB", black=(160.0,) * 4, white=4095,
+            cfa=self._frames[record.file],
+            pattern="RGGB",
+            black=(160.0,) * 4,
+            white=4095,
             noise_profile=(1e-4, 1e-7),
             exposure_s=0.1,
-        )  # fmt: skip
+        )
 
 
 IMAGES = SimpleNamespace(

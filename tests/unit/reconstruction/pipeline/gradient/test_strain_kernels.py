@@ -62,8 +62,12 @@ def as_map(height):
     return SkinMap(height.astype(np.float32), "um", stderr, np.ones(height.shape, bool))
 
 
-KNOWN = {(0.0, 1): (1.1, 0.6, 16.0), (0.0, -1): (0.9, -0.8, 16.0), (90.0, 1): (1.1, 0.6, 16.0),
-         (90.0, -1): (0.9, -0.8, 16.0)}  # fmt: skip
+KNOWN = {
+    (0.0, 1): (1.1, 0.6, 16.0),
+    (0.0, -1): (0.9, -0.8, 16.0),
+    (90.0, 1): (1.1, 0.6, 16.0),
+    (90.0, -1): (0.9, -0.8, 16.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +110,9 @@ def test_errors_of_variances_hold_what_pictures_hide(fitted):
     for row in histogram_document(strains, counted)["states"]:
         one = counted[row["name"]]
         for axis, value, scatter in (
-            ("s", one.variance_x, one.stderr_x), ("t", one.variance_y, one.stderr_y),
-        ):  # fmt: skip
+            ("s", one.variance_x, one.stderr_x),
+            ("t", one.variance_y, one.stderr_y),
+        ):
             assert row[f"variance_{axis}_stderr"] > HIDDEN * value
             assert row[f"variance_{axis}_stderr"] ** 2 == pytest.approx(
                 scatter**2 + (HIDDEN * value) ** 2
@@ -164,9 +169,8 @@ def test_progress_is_told_and_the_direction_does_not_matter_here(fitted):
 def test_a_state_near_neutral_or_without_strain_has_no_kernel(relief):
     lost = state(0.0, 2, 1.2)
     lost = StateStrain(
-        lost.state, 1.2,
-        Strain(np.eye(2), np.zeros(2), np.full((6, 6), np.inf), math.inf, 0, False),
-    )  # fmt: skip
+        lost.state, 1.2, Strain(np.eye(2), np.zeros(2), np.full((6, 6), np.inf), math.inf, 0, False)
+    )
     strains = [state(0.0, 0, 1.0), state(0.0, 1, 1.004), lost]
     heights = {each.state.name: as_map(middle(relief)) for each in strains}
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
@@ -181,9 +185,7 @@ def test_only_skin_that_both_states_show_is_counted(relief):
     heights = {each.state.name: as_map(middle(relief)) for each in strains}
     half = np.zeros((SIDE, SIDE), bool)
     half[:, : SIDE // 2] = True
-    heights["a000_n0"] = SkinMap(
-        heights["a000_n0"].values, "um", heights["a000_n0"].stderr, half
-    )  # fmt: skip
+    heights["a000_n0"] = SkinMap(heights["a000_n0"].values, "um", heights["a000_n0"].stderr, half)
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
     # of the stretched state only what the left half of the neutral one has become
     assert counted[wide.state.name].samples == pytest.approx(SIDE * SIDE / 2, rel=0.05)

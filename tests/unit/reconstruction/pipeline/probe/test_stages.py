@@ -21,9 +21,13 @@ SIGMA_TR = math.sqrt(3 * MEDIUM[0] * sum(MEDIUM))
 
 def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None):
     value = photon_table.reflectance(
-        RADIUS, *MEDIUM, g=0.825, collection="fibre", core_mm=PROBE.fibres[0].core_mm,
+        RADIUS,
+        *MEDIUM,
+        g=0.825,
+        collection="fibre",
+        core_mm=PROBE.fibres[0].core_mm,
         source_core_mm=PROBE.source_core_mm,
-    )  # fmt: skip
+    )
     value = np.repeat(scale * value[:, None], 3, axis=1)
     if rng is not None:
         value = value * (1 + noise * rng.standard_normal(value.shape))
@@ -31,10 +35,15 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
     return probe_stages.Profile(
         Measurement(Placement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
         FibreReflectance(
-            tuple(fibre.name for fibre in PROBE.fibres), RADIUS, value, (noise * value) ** 2,
-            (value * slope)[None], np.ones(value.shape, bool), np.zeros(value.shape, bool),
+            tuple(fibre.name for fibre in PROBE.fibres),
+            RADIUS,
+            value,
+            (noise * value) ** 2,
+            (value * slope)[None],
+            np.ones(value.shape, bool),
+            np.zeros(value.shape, bool),
         ),
-    )  # fmt: skip
+    )
 
 
 def documents(profiles):
@@ -72,9 +81,10 @@ def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing
     low, high = wide["interval_per_mm"]
     assert math.log(high / low) == pytest.approx(
         math.log(narrow["interval_per_mm"][1] / narrow["interval_per_mm"][0])
-        * wide["sigma_tr_stderr"] / narrow["sigma_tr_stderr"],
+        * wide["sigma_tr_stderr"]
+        / narrow["sigma_tr_stderr"],
         rel=1e-6,
-    )  # fmt: skip
+    )
 
 
 def test_repeats_average_their_own_errors_but_not_the_phantoms():

@@ -57,10 +57,12 @@ def test_a_dome_is_built_the_same_in_every_subset_and_near_its_drawing():
     whole, part = build(load_rig("dome"), seed=4), build(RIG, seed=4)
     assert whole.rig.view("C10").position_mm == part.rig.view("C10").position_mm
     assert whole.rig.light("L033") == part.rig.light("L033")
-    shift = np.array([
-        np.subtract(a.position_mm, b.position_mm)
-        for a, b in zip(whole.rig.lights, whole.nominal.lights, strict=True)
-    ])  # fmt: skip
+    shift = np.array(
+        [
+            np.subtract(a.position_mm, b.position_mm)
+            for a, b in zip(whole.rig.lights, whole.nominal.lights, strict=True)
+        ]
+    )
     # 450 normal numbers of deviation 2.5: the root mean square is within 4.5 sigma of that
     assert np.sqrt(np.mean(shift**2)) == pytest.approx(2.5, rel=4.5 / np.sqrt(900))
     exact = build(RIG, seed=4, tolerances=EXACT)
@@ -124,9 +126,14 @@ def test_the_light_of_an_led_in_a_ball_is_conserved():
     radiance L and radius a at d as an image that is smaller by about r / (2 d)."""
     scene = TargetScene("mirror", build(RIG, seed=1, tolerances=EXACT), seed=1)
     view = RIG.view("C07")
-    frontal = int(np.argmin([
-        np.linalg.norm(np.subtract(light.position_mm, view.position_mm)) for light in RIG.lights
-    ]))  # fmt: skip
+    frontal = int(
+        np.argmin(
+            [
+                np.linalg.norm(np.subtract(light.position_mm, view.position_mm))
+                for light in RIG.lights
+            ]
+        )
+    )
     image = scene.light("C07", lit(frontal))[..., 1].astype(float)
     ball = scene.ball_mm(0)
     eye, lamp = np.array(view.position_mm), np.array(RIG.lights[frontal].position_mm)

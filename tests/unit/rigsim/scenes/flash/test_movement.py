@@ -142,8 +142,7 @@ def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face, tired
     scene = scene_of(rig, half, "exercise")
     assert scene.subject is half
     np.testing.assert_array_equal(
-        scene.truth()["hemoglobin_at_rest"],
-        tired.truth()["hemoglobin_at_rest"],
+        scene.truth()["hemoglobin_at_rest"], tired.truth()["hemoglobin_at_rest"]
     )
 
 

@@ -155,8 +155,15 @@ def test_no_light_gives_a_dark_frame(scene):
 
 
 def test_a_jump_of_20_pixels_moves_the_picture_by_20_pixels(rig, skin):
-    still = PatchMotion(0, angle_um=0.0, angle_turn_deg=0.0, state_um=0.0, state_turn_deg=0.0,
-                        drift_um=0.0, jumps_um={1.0: (120.0, 0.0)})  # fmt: skip
+    still = PatchMotion(
+        0,
+        angle_um=0.0,
+        angle_turn_deg=0.0,
+        state_um=0.0,
+        state_turn_deg=0.0,
+        drift_um=0.0,
+        jumps_um={1.0: (120.0, 0.0)},
+    )
     scene = GradientScene(rig, skin, motion=still, table_size=33)
     before = scene.radiance("full", grip=NEUTRAL, t_s=0.5)
     after = scene.radiance("full", grip=NEUTRAL, t_s=1.5)

@@ -27,8 +27,16 @@ RIG = load_rig("probe")
 VIEW = RIG.views[0]
 AIR = HeadState("", 0.0, False, 0.0, 5.0)
 CHEEK = HeadState("cheek", 0.0, True, 60.0, 5.0)
-NOMINAL = ProbeTolerances(gain=0.0, place_px=0.0, shift_px=0.0, turn_deg=0.0, radius=0.0,
-                          crosstalk=0.0, wings=0.0, veil=0.0)  # fmt: skip
+NOMINAL = ProbeTolerances(
+    gain=0.0,
+    place_px=0.0,
+    shift_px=0.0,
+    turn_deg=0.0,
+    radius=0.0,
+    crosstalk=0.0,
+    wings=0.0,
+    veil=0.0,
+)
 AREA_PX = math.pi * (SPOT_RADIUS_PX**2 + ProbeTolerances().edge_px ** 2)
 FALSE_ALARM = 4.0  # standard deviations: 6e-5 of normal values lie beyond
 
@@ -81,8 +89,9 @@ def test_wings_and_veil_add_what_they_say():
 
 
 def test_spots_stand_where_they_were_built_off_the_drawing(scene):
-    images = unit_images(dataclasses.replace(scene.build, wings=0.0, veil=0.0,
-                                             unevenness=np.zeros((28, 3))), VIEW)  # fmt: skip
+    images = unit_images(
+        dataclasses.replace(scene.build, wings=0.0, veil=0.0, unevenness=np.zeros((28, 3))), VIEW
+    )
     y, x = np.mgrid[: VIEW.height_px, : VIEW.width_px]
     flux = images.sum(axis=(1, 2))
     found = np.stack([(images * x).sum(axis=(1, 2)), (images * y).sum(axis=(1, 2))], axis=1)
@@ -112,8 +121,9 @@ def test_a_frame_is_linear_in_light_up_to_rounding(noiseless):
 def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
     """The sum over a spot's pixels of each color is R_f times gain, white and unit image."""
     exposure_s = 0.008
-    frame = noiseless.exposure("cam", pops=lit(exposure_s), exposure_s=exposure_s, seed=5,
-                               head=CHEEK)  # fmt: skip
+    frame = noiseless.exposure(
+        "cam", pops=lit(exposure_s), exposure_s=exposure_s, seed=5, head=CHEEK
+    )
     reflectance = noiseless.profile(CHEEK).reflectance_per_mm2
     taken = noiseless.build.crosstalk @ (noiseless.build.gain[:, None] * reflectance)
     light = METER_RATE_PER_S * exposure_s * taken * noiseless.white
@@ -136,8 +146,9 @@ def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
 
 def test_noise_is_that_of_electrons(scene):
     """Differences of equal frames, without the source's ripple, which is common to all pixels."""
-    steady = ProbeScene(RIG, scene.tissue, photons=1,
-                        build=dataclasses.replace(scene.build, ripple=0.0))  # fmt: skip
+    steady = ProbeScene(
+        RIG, scene.tissue, photons=1, build=dataclasses.replace(scene.build, ripple=0.0)
+    )
     first, second = (
         steady.exposure("cam", pops=lit(1.0), exposure_s=1.0, seed=s, head=CHEEK).astype(float)
         for s in (1, 2)
@@ -156,11 +167,13 @@ def test_dark_current_doubles_every_six_and_a_half_kelvin(scene):
     assert [s.dark_e_per_s / DARK_E_PER_S for s in sensors] == pytest.approx([1.0, 2.0, 4.0])
     cold, warm = (
         np.median(
-            scene.exposure("cam", pops=[], exposure_s=30.0, seed=1,
-                           head=dataclasses.replace(CHEEK, camera_c=c)).astype(float), axis=None
+            scene.exposure(
+                "cam", pops=[], exposure_s=30.0, seed=1, head=dataclasses.replace(CHEEK, camera_c=c)
+            ).astype(float),
+            axis=None,
         )
         for c in (5.0, 31.0)
-    )  # fmt: skip
+    )
     assert warm - cold == pytest.approx(DARK_E_PER_S * 30.0 * 15.0 / VIEW.gain_e_per_dn, rel=0.04)
 
 
@@ -186,8 +199,10 @@ def test_covered_fibres_pass_a_hundred_thousandth(scene):
 
 
 def test_a_head_in_the_air_sees_the_room_and_not_the_source(scene):
-    lights = [scene.exposure("cam", pops=pops, exposure_s=1.0, seed=1, head=AIR).astype(float)
-              for pops in (lit(1.0), [])]  # fmt: skip
+    lights = [
+        scene.exposure("cam", pops=pops, exposure_s=1.0, seed=1, head=AIR).astype(float)
+        for pops in (lit(1.0), [])
+    ]
     assert (lights[0] == lights[1]).mean() > 0.2
     x, y = scene.build.spot_px[27].round().astype(int)
     middle = lights[1][y - 4 : y + 4, x - 4 : x + 4].mean() - VIEW.black_level
@@ -198,10 +213,12 @@ def test_a_head_in_the_air_sees_the_room_and_not_the_source(scene):
 
 def test_equal_seeds_give_equal_frames_whatever_came_before(scene):
     other = ProbeScene(RIG, scene.tissue, build=scene.build, photons=1)
-    scene.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=9,
-                   head=dataclasses.replace(CHEEK, site="chin"))  # fmt: skip
-    frames = [s.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=4, head=CHEEK)
-              for s in (scene, other)]  # fmt: skip
+    scene.exposure(
+        "cam", pops=lit(0.1), exposure_s=0.1, seed=9, head=dataclasses.replace(CHEEK, site="chin")
+    )
+    frames = [
+        s.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=4, head=CHEEK) for s in (scene, other)
+    ]
     np.testing.assert_array_equal(*frames)
     again = scene.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=5, head=CHEEK)
     assert (frames[0] != again).any()
@@ -213,8 +230,9 @@ def test_what_makes_no_sense_is_refused(scene):
     with pytest.raises(SceneError, match="level"):
         scene.exposure("cam", pops=lit(1.0, level=1.5), exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="end after its beginning"):
-        scene.exposure("cam", pops=[SourceLight(1.0, 1.0, 0.5, None)], exposure_s=1.0, seed=0,
-                       head=CHEEK)  # fmt: skip
+        scene.exposure(
+            "cam", pops=[SourceLight(1.0, 1.0, 0.5, None)], exposure_s=1.0, seed=0, head=CHEEK
+        )
     with pytest.raises(SceneError, match="fibre: got 28"):
         scene.exposure("cam", pops=lit(1.0, fibre=28), exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="contact probe"):

@@ -29,9 +29,12 @@ def test_the_stored_profile_is_that_of_photons_traced_for_it(sigma_a, scattering
     """28 z values; photons of their own with fibres of their own size against scaled points."""
     layer = Layer(inf, sigma_a, scattering / 0.2, 0.8, 1.4)
     traced = fibre_profile(
-        LayerStack((layer,)), radii_mm=FIBRES.radii_mm, photons=15_000,
-        rng=np.random.default_rng(7), batches=40,
-    )  # fmt: skip
+        LayerStack((layer,)),
+        radii_mm=FIBRES.radii_mm,
+        photons=15_000,
+        rng=np.random.default_rng(7),
+        batches=40,
+    )
     value, error = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
     z = (traced.reflectance_per_mm2 - value) / np.hypot(traced.stderr, error)
     assert np.abs(z).max() < FALSE_ALARM

@@ -9,8 +9,10 @@ from skinrig.benchmarks.gradient_rig import synthesis
 
 @pytest.fixture
 def patches(rng):
-    return [np.exp(gaussian_filter(rng.standard_normal((160, 160)), 2.0) * 8).astype(np.float32)
-            for _ in range(2)]  # fmt: skip
+    return [
+        np.exp(gaussian_filter(rng.standard_normal((160, 160)), 2.0) * 8).astype(np.float32)
+        for _ in range(2)
+    ]
 
 
 def test_blended_tiles_keep_the_histogram_of_heights(patches, rng):
@@ -37,7 +39,9 @@ def test_autocorrelation_of_a_wave_is_a_wave():
 def test_furrows_have_a_skewness_that_their_normal_twin_has_not(rng):
     furrows = -np.exp(-((gaussian_filter(rng.standard_normal((300, 300)), 4.0) / 0.02) ** 2))
     smooth = gaussian_filter(rng.standard_normal((300, 300)), 4.0)
-    found = [synthesis.skewness_of_curvature(gaussian_filter(h, 1.0).astype(np.float32))
-             for h in (furrows, smooth)]  # fmt: skip
+    found = [
+        synthesis.skewness_of_curvature(gaussian_filter(h, 1.0).astype(np.float32))
+        for h in (furrows, smooth)
+    ]
     assert abs(found[0]) > 5 * abs(found[1])
     assert found[0] < 0

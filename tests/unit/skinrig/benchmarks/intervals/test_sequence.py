@@ -50,9 +50,12 @@ def test_intervals_half_as_wide_are_found_out(rng):
 
 def told(known, best, inner, outer):
     return {
-        "known": known, "time_constant_s": best, "interval_68_s": inner, "interval_s": outer,
+        "known": known,
+        "time_constant_s": best,
+        "interval_68_s": inner,
+        "interval_s": outer,
         "stderr_time_constant_s": None,
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize(
@@ -82,8 +85,13 @@ def test_each_interval_counts_as_it_stands(inner, outer, held_68, held_95):
     ],
 )
 def test_bounds_are_intervals_that_are_open_to_one_side(known, inner, outer, held):
-    one = of_fits("x", [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
-                  CONSTANT_S, subject="a", band="any")  # fmt: skip
+    one = of_fits(
+        "x",
+        [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
+        CONSTANT_S,
+        subject="a",
+        band="any",
+    )
     assert (one.share(68), one.share(95)) == held
     assert np.isnan(one.width)
 
@@ -106,10 +114,14 @@ def test_each_person_reacts_in_a_time_of_their_own():
 )
 def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
     fit = {
-        "known": "estimated", "time_constant_s": 35.0, "stderr_time_constant_s": 2.0,
-        "interval_s": [30.0, 40.0], "delay_s": 0.25, "stderr_delay_s": 0.14,
+        "known": "estimated",
+        "time_constant_s": 35.0,
+        "stderr_time_constant_s": 2.0,
+        "interval_s": [30.0, 40.0],
+        "delay_s": 0.25,
+        "stderr_delay_s": 0.14,
         "delay_interval_s": [0.01, 0.51],
-    }  # fmt: skip
+    }
     one = of_fits("x", [fit], true_s, subject="a", band="any", delay=True)
     assert (one.share(68), one.share(95)) == (held_68, held_95)
     assert one.width == pytest.approx(100 * 0.14 / true_s)

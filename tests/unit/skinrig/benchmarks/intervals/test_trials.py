@@ -28,21 +28,28 @@ def medium(rng, *, stated=1.0, told=True):
         value, half = TRUE * np.exp(error), stated * 0.05
         fits.append(
             {
-                "channel": channel, "method": "photon_table", "valid": True,
-                "coefficients_identified": told, "sigma_tr_per_mm": value,
+                "channel": channel,
+                "method": "photon_table",
+                "valid": True,
+                "coefficients_identified": told,
+                "sigma_tr_per_mm": value,
                 "sigma_tr_stderr": value * half,
                 "interval_per_mm": [value * np.exp(-half), value * np.exp(half)],
-                "sigma_a_per_mm": TRUE * (1 + error), "sigma_s_prime_per_mm": TRUE * (1 + error),
+                "sigma_a_per_mm": TRUE * (1 + error),
+                "sigma_s_prime_per_mm": TRUE * (1 + error),
                 "sigma_a_stderr": TRUE * (1 + error) * half,
                 "sigma_s_prime_stderr": TRUE * (1 + error) * half,
             }
-        )  # fmt: skip
+        )
     document = {"measurements": [{**PLACE, "fits": fits}]}
     values = [TRUE] * 3
     truth = {
-        **PLACE, "kind": "homogeneous", "sigma_tr_per_mm": values, "sigma_a_per_mm": values,
+        **PLACE,
+        "kind": "homogeneous",
+        "sigma_tr_per_mm": values,
+        "sigma_a_per_mm": values,
         "sigma_s_prime_per_mm": values,
-    }  # fmt: skip
+    }
     return (
         appearance(files={SUBSURFACE_FILE: json.dumps(document).encode()}),
         appearance(parameters={"profiles": [truth]}),
@@ -77,12 +84,15 @@ def test_coefficients_that_are_not_told_apart_are_not_judged():
 def directed(rng, *, axis_deg, stated):
     rows = [
         {
-            "channel": channel, "valid": True, "ratio": 1.2 + 0.01 * rng.standard_normal(),
-            "ratio_stderr": 0.01 * stated, "axis_stderr_deg": 2.0 * stated,
+            "channel": channel,
+            "valid": True,
+            "ratio": 1.2 + 0.01 * rng.standard_normal(),
+            "ratio_stderr": 0.01 * stated,
+            "axis_stderr_deg": 2.0 * stated,
             "axis_deg": (axis_deg + 2.0 * rng.standard_normal()) % 180.0,
         }
         for channel in CHANNELS
-    ]  # fmt: skip
+    ]
     angle = np.arange(8) * 45.0
     # 1 / sigma_tr on an ellipse whose axes are as 1.2 to 1
     turn = np.radians(angle - axis_deg)
@@ -118,9 +128,11 @@ def test_widths_of_a_change_are_told_over_what_changes(rng):
     rest = np.full((20, 20), 0.04)
     change = np.where(np.arange(20) < 12, 0.0, 0.01) * np.ones((20, 1))
     found = SkinMap(
-        (change + 0.002 * rng.standard_normal(change.shape)).astype(np.float32), "1",
-        np.full(change.shape, 0.002, np.float32), np.ones(change.shape, bool),
-    )  # fmt: skip
+        (change + 0.002 * rng.standard_normal(change.shape)).astype(np.float32),
+        "1",
+        np.full(change.shape, 0.002, np.float32),
+        np.ones(change.shape, bool),
+    )
     about = {"subject": "II 0", "band": "light"}
     everywhere = np.ones(change.shape, bool)
     alone = of_map("change", found, change, everywhere, **about)

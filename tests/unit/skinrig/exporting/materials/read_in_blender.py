@@ -36,10 +36,13 @@ def pixels(picture):
 
 def told(item):
     return {
-        name: value.to_dict() if hasattr(value, "to_dict") else
-        value.to_list() if hasattr(value, "to_list") else value
+        name: value.to_dict()
+        if hasattr(value, "to_dict")
+        else value.to_list()
+        if hasattr(value, "to_list")
+        else value
         for name, value in item.items()
-    }  # fmt: skip
+    }
 
 
 def world(placed, positions):
@@ -61,9 +64,14 @@ def baked_normals(placed, material, side):
     placed.select_set(True)
     bpy.context.view_layer.objects.active = placed
     bpy.ops.object.bake(
-        type="NORMAL", normal_space="OBJECT", normal_r="POS_X", normal_g="POS_Y",
-        normal_b="POS_Z", margin=0, use_clear=True,
-    )  # fmt: skip
+        type="NORMAL",
+        normal_space="OBJECT",
+        normal_r="POS_X",
+        normal_g="POS_Y",
+        normal_b="POS_Z",
+        margin=0,
+        use_clear=True,
+    )
     values = pixels(picture)
     normals = (2.0 * values[..., :3] - 1.0) @ np.array(placed.matrix_world)[:3, :3].T
     return normals, values[..., 3] > 0.5
@@ -103,9 +111,12 @@ def main(path, out, side):
         "properties": told(material),
     }
     for name, socket in (
-        ("base_color", "Base Color"), ("roughness", "Roughness"), ("normal", "Normal"),
-        ("specular", "Specular IOR Level"), ("radius", "Subsurface Radius"),
-    ):  # fmt: skip
+        ("base_color", "Base Color"),
+        ("roughness", "Roughness"),
+        ("normal", "Normal"),
+        ("specular", "Specular IOR Level"),
+        ("radius", "Subsurface Radius"),
+    ):
         node = linked(surface.inputs[socket])
         picture = node and upstream(node, "ShaderNodeTexImage")
         if picture is None:

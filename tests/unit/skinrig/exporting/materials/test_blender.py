@@ -44,8 +44,11 @@ def read(path, out, bake=SIDE):
         pytest.skip("no bpy: install it, or let BLENDER_PYTHON name a Python that has it")
     done = subprocess.run(
         [python_of_blender(), READER, path, out, str(bake)],
-        capture_output=True, text=True, timeout=250, env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=250,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     with np.load(out) as arrays:
         found = {name: arrays[name] for name in arrays.files}
@@ -103,8 +106,10 @@ def test_blender_has_the_blend_shapes_as_shape_keys(in_blender, material, format
 def test_blender_reads_base_color_as_srgb_and_all_else_as_data(in_blender, material, format_):
     found, facts = in_blender(format_)
     assert [facts[f"{n}_space"] for n in ("base_color", "roughness", "normal")] == [
-        "sRGB", "Non-Color", "Non-Color",
-    ]  # fmt: skip
+        "sRGB",
+        "Non-Color",
+        "Non-Color",
+    ]
     color = found["base_color"][..., :3]
     if format_ == "glb":  # 8 bits stay coded in Blender's memory
         np.testing.assert_allclose(color, srgb_curve(material.base_color), atol=0.51 / 255)

@@ -146,8 +146,11 @@ def validated(path):
     )
     done = subprocess.run(
         ["node", "-e", script, str(validator()), str(path)],
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     return json.loads(done.stdout)
 
 

@@ -46,8 +46,9 @@ def test_the_radius_in_scene_units_gives_sigma_tr_back(written, material):
     assert 0.0 <= share.min() < share.max() <= 1.0
     color = read(folder / "textures/base_color.exr")
     depth = translucency_mm(radius * share / MM[unit], color, material.deficit)
-    np.testing.assert_allclose(depth[material.valid], material.translucency_mm[material.valid],
-                               rtol=2e-5)  # fmt: skip
+    np.testing.assert_allclose(
+        depth[material.valid], material.translucency_mm[material.valid], rtol=2e-5
+    )
     told = json.loads((folder / "material.json").read_text())
     assert (told["scene_unit"], told["mm_per_scene_unit"]) == (unit, pytest.approx(1 / MM[unit]))
 
@@ -60,8 +61,9 @@ def test_the_mesh_beside_it_has_the_scene_unit(written, material):
     np.testing.assert_allclose(
         read_back.bounds,
         [material.mesh.vertices_mm.min(0) * MM[unit], material.mesh.vertices_mm.max(0) * MM[unit]],
-        rtol=1e-5, atol=1e-6,
-    )  # fmt: skip
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 def test_materialx_itself_finds_the_documents_valid(simulated_face, tmp_path):
@@ -134,9 +136,12 @@ def test_color_is_marked_as_linear_srgb_and_data_as_nothing(simulated_face, tmp_
     graph = ElementTree.fromstring((tmp_path / "skin.mtlx").read_text()).find("nodegraph")
     spaces = {node.get("name"): node[0].get("colorspace") for node in graph.findall("image")}
     assert spaces == {
-        "base_color": "lin_rec709", "subsurface_radius_scale": None, "specular_roughness": None,
-        "specular_weight": None, "normal_codes": None,
-    }  # fmt: skip
+        "base_color": "lin_rec709",
+        "subsurface_radius_scale": None,
+        "specular_roughness": None,
+        "specular_weight": None,
+        "normal_codes": None,
+    }
 
 
 def test_base_color_is_what_the_model_reflects_below_the_surface(simulated_face, material):

@@ -64,9 +64,10 @@ def test_a_smooth_surface_is_flat_in_its_own_frame(patch):
 
 def test_a_slope_towards_growing_u_and_v_is_red_and_green():
     flat = build_mesh(
-        [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]],
+        [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]],
+        [[0, 1, 2], [0, 2, 3]],
         [[0, 0], [1, 0], [1, 1], [0, 1]],
-    )  # fmt: skip
+    )
     axes, covered = FramedMesh.of(flat).texel_frames(8)
     for tilted, channel in (((0.6, 0.0, 0.8), 0), ((0.0, 0.6, 0.8), 1)):
         found = to_tangent(np.full((8, 8, 3), tilted), axes, covered)

@@ -158,7 +158,11 @@ def test_meshes_of_one_tile_and_faults_of_meshes_are_as_before(shapes_file, tmp_
     found = udim.read(shapes_file)
     assert found.tiles == (1001,)
     assert isinstance(found.first(), Mesh)
-    np.savez(tmp_path / "bad.npz", vertices_mm=np.zeros((3, 3)), faces=np.array([[0, 1, 9]]),
-             uv=np.full((3, 2), 1.5))  # fmt: skip
+    np.savez(
+        tmp_path / "bad.npz",
+        vertices_mm=np.zeros((3, 3)),
+        faces=np.array([[0, 1, 9]]),
+        uv=np.full((3, 2), 1.5),
+    )
     with pytest.raises(MeshError, match="faces: got indices"):
         udim.read(tmp_path / "bad.npz")

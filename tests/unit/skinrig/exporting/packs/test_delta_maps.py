@@ -64,15 +64,24 @@ def moving(rng):
     color_maps, color_files = color_parts(rng)
     _, wrinkle_maps, wrinkle_files = wrinkle_parts(rng)
     parts = {
-        "facial_color": {"maps": sorted(color_maps), "files": list(color_files),
-                         "source": "simulated"},
-        "wrinkles": {"maps": sorted(wrinkle_maps), "files": list(wrinkle_files),
-                     "source": "simulated", "expressions": ["smile", "anger"]},
-    }  # fmt: skip
+        "facial_color": {
+            "maps": sorted(color_maps),
+            "files": list(color_files),
+            "source": "simulated",
+        },
+        "wrinkles": {
+            "maps": sorted(wrinkle_maps),
+            "files": list(wrinkle_files),
+            "source": "simulated",
+            "expressions": ["smile", "anger"],
+        },
+    }
     return SkinAppearance(
-        {**color_maps, **wrinkle_maps}, "simulated", {"kind": "dynamic", "parts": parts},
+        {**color_maps, **wrinkle_maps},
+        "simulated",
+        {"kind": "dynamic", "parts": parts},
         files={**color_files, **wrinkle_files},
-    )  # fmt: skip
+    )
 
 
 def test_base_color_plus_its_delta_is_the_color_of_the_expression(moving, tmp_path):
@@ -135,9 +144,11 @@ def test_a_folder_without_wrinkles_or_color_says_what_is_missing(moving, tmp_pat
     parts = dict(moving.parameters["parts"])
     del parts["wrinkles"]
     alone = SkinAppearance(
-        dict(moving.maps), "simulated", {"kind": "dynamic", "parts": parts},
+        dict(moving.maps),
+        "simulated",
+        {"kind": "dynamic", "parts": parts},
         files=dict(moving.files),
-    )  # fmt: skip
+    )
     left_out = dict(delta_maps.write(alone, tmp_path, Delivery()))
     assert "skinrig fit wrinkles" in left_out["normal, wm1 to wm3, masks, cavity"]
     with pytest.raises(ExportError, match="nothing was fitted to"):
@@ -188,8 +199,10 @@ def test_sizes_are_those_of_engines(moving, tmp_path, monkeypatch):
     parts = dict(moving.parameters["parts"])
     del parts["wrinkles"]
     color = SkinAppearance(
-        dict(moving.maps), "simulated", {"kind": "dynamic", "parts": parts},
+        dict(moving.maps),
+        "simulated",
+        {"kind": "dynamic", "parts": parts},
         files=dict(moving.files),
-    )  # fmt: skip
+    )
     delta_maps.write(color, tmp_path, Delivery(only=("fear",)))
     assert read(tmp_path / "exr/cm1_delta.exr").shape == (512, 512, 3)

@@ -135,13 +135,18 @@ def relief(rng):
     valid[:3, :3] = False
     entry = {"map": "microrelief_cheek", "table": "kernel_table_cheek.json", "pixel_um": 6.0}
     parts = {
-        "microstructure": {"maps": ["microrelief_cheek"], "files": [], "source": "simulated",
-                           "sites": {"cheek": entry}},
-    }  # fmt: skip
+        "microstructure": {
+            "maps": ["microrelief_cheek"],
+            "files": [],
+            "source": "simulated",
+            "sites": {"cheek": entry},
+        }
+    }
     return SkinAppearance(
-        {"microrelief_cheek": SkinMap(40.0 * height, "um", valid=valid)}, "simulated",
+        {"microrelief_cheek": SkinMap(40.0 * height, "um", valid=valid)},
+        "simulated",
         {"kind": "dynamic", "parts": parts},
-    )  # fmt: skip
+    )
 
 
 def test_a_pack_of_relief_alone_holds_micro_normals_with_their_size_on_skin(relief, tmp_path):
@@ -152,8 +157,11 @@ def test_a_pack_of_relief_alone_holds_micro_normals_with_their_size_on_skin(reli
     normals = read(tmp_path / "exr/micro_normal_cheek.exr")
     assert normals.shape == (42, 84, 3)
     assert "-Y (DirectX)" in told["files"]["exr/micro_normal_cheek.exr"]["what"]
-    assert set(left_out) >= {"base color, cm1 to cm3", "normal, wm1 to wm3, masks, cavity",
-                             "scatter"}  # fmt: skip
+    assert set(left_out) >= {
+        "base color, cm1 to cm3",
+        "normal, wm1 to wm3, masks, cavity",
+        "scatter",
+    }
 
 
 def test_the_green_of_micro_normals_follows_the_order(relief, tmp_path):
@@ -183,5 +191,7 @@ def test_scatter_is_the_models_translucency_at_the_size_of_packs(patch, tmp_path
 
 def test_sizes_of_packs():
     assert (detail_maps.SCATTER_SIZE, delta_maps.NORMAL_SIZE, color_deltas.COLOR_SIZE) == (
-        512, 1024, 512,
-    )  # fmt: skip
+        512,
+        1024,
+        512,
+    )

@@ -27,19 +27,32 @@ MHL = "{urn:ASC:MHL:v2.0}"
 def session(tmp_path):
     """Two darks and a pair of images; one frame is a second attempt."""
     with Session.create(
-        tmp_path / "s", plan=flash_plan(RIG, darks=2), rig=RIG, devices={},
-        subject=Subject("P042", ("research",), DAY), source="measured",
-    ) as made:  # fmt: skip
+        tmp_path / "s",
+        plan=flash_plan(RIG, darks=2),
+        rig=RIG,
+        devices={},
+        subject=Subject("P042", ("research",), DAY),
+        source="measured",
+    ) as made:
         for number, (step, camera) in enumerate(made.todo()):
             for attempt in (1, 2) if step.id == "S001" else (1,):
                 blob = raw.encode_dng(
-                    np.full((10, 16), 600 + number, np.uint16), pattern="RGGB", black=512,
-                    white=16383, step_id=step.id, session_id=made.id,
-                )  # fmt: skip
+                    np.full((10, 16), 600 + number, np.uint16),
+                    pattern="RGGB",
+                    black=512,
+                    white=16383,
+                    step_id=step.id,
+                    session_id=made.id,
+                )
                 made.commit(
-                    step.id, camera, blob, settings=step.settings, t_host_s=100.0 + number,
-                    actual={"light": "flash", "iso": 100}, attempt=attempt,
-                )  # fmt: skip
+                    step.id,
+                    camera,
+                    blob,
+                    settings=step.settings,
+                    t_host_s=100.0 + number,
+                    actual={"light": "flash", "iso": 100},
+                    attempt=attempt,
+                )
         made.attach("notes.txt", b"a note", about={})
         made.close()
     return tmp_path / "s"
@@ -105,8 +118,11 @@ def test_a_c4_id_is_the_published_one():
 def ascmhl(*argv):
     return subprocess.run(
         [sys.executable, "-c", "from ascmhl.cli.ascmhl import mhltool_cli as m; m()", *argv],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
 
 
 def test_the_reference_tool_verifies_an_export_and_names_what_was_changed(session, tmp_path):
@@ -139,8 +155,9 @@ def test_a_sealed_folder_names_no_host_and_is_not_sealed_twice(session, tmp_path
     assert str(tmp_path) not in text
     assert f"<hostname>{platform.node()}<" not in text
     with pytest.raises(SessionError, match="a history"):
-        write_first_generation(tmp_path / "out", now=Session.open(session).manifest.created_at,
-                               version="0")  # fmt: skip
+        write_first_generation(
+            tmp_path / "out", now=Session.open(session).manifest.created_at, version="0"
+        )
 
 
 # event model ----------------------------------------------------------------------------------
@@ -173,9 +190,11 @@ def test_a_run_router_follows_every_document_to_its_run(exported):
     for name, document in exported[1]:
         gather(name, document)
     assert seen == [
-        ("dark-cam", "D000", 1), ("dark-cam", "D001", 2),
-        ("subject-cam", "S000", 1), ("subject-cam", "S001", 2),
-    ]  # fmt: skip
+        ("dark-cam", "D000", 1),
+        ("dark-cam", "D001", 2),
+        ("subject-cam", "S000", 1),
+        ("subject-cam", "S001", 2),
+    ]
 
 
 def test_every_event_leads_to_a_frame_of_the_export(exported):
@@ -198,9 +217,13 @@ def test_every_event_leads_to_a_frame_of_the_export(exported):
 
 def test_a_run_that_lacks_frames_says_so(session, tmp_path):
     unfinished = Session.create(
-        tmp_path / "t", plan=flash_plan(RIG), rig=RIG, devices={},
-        subject=Subject("x", ("any",)), source="simulated",
-    )  # fmt: skip
+        tmp_path / "t",
+        plan=flash_plan(RIG),
+        rig=RIG,
+        devices={},
+        subject=Subject("x", ("any",)),
+        source="simulated",
+    )
     unfinished.release()
     export(tmp_path / "t", tmp_path / "out", to="event-model", use="teaching")
     name, stop = json.loads((tmp_path / "out/documents.jsonl").read_text().splitlines()[-1])

@@ -41,9 +41,12 @@ def session(lights, rng, tmp_path):
         rows.append(f"p{k}.tif " + " ".join(f"{x:.9f}" for x in light))
     (folder / "a.lp").write_text("6\n" + "\n".join(rows) + "\n")
     made = import_light_list(
-        folder, out=tmp_path / "session", encoding="linear",
-        subject=Subject("P042", ("research",), date(2030, 1, 1)), now=lambda: NOW,
-    )  # fmt: skip
+        folder,
+        out=tmp_path / "session",
+        encoding="linear",
+        subject=Subject("P042", ("research",), date(2030, 1, 1)),
+        now=lambda: NOW,
+    )
     return Session.open(made.path)
 
 
@@ -80,8 +83,9 @@ def test_positions_are_there_for_near_lights(session, lights, tmp_path):
     export(session, tmp_path / "out")
     rows = np.loadtxt(tmp_path / "out" / "positions_mm.txt")
     assert rows.shape == (6, 3)
-    np.testing.assert_allclose(rows / np.linalg.norm(rows, axis=1, keepdims=True), lights,
-                               atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True), lights, atol=1e-6
+    )
     near = find(tmp_path / "out", lights=tmp_path / "out" / "positions_mm.txt")
     assert not near.are_unit
     assert json.loads((tmp_path / "out" / "lights.json").read_text())["source"] == "measured"

@@ -29,8 +29,9 @@ def flash(rng):
             "diffuse": SkinMap(rng.uniform(0.2, 0.8, (*shape, 3)), "1"),
             "specular": SkinMap(rng.uniform(0.0, 0.3, (*shape, 3)), "1", valid=valid),
         },
-        "simulated", {"color_table": {"camera": CAMERA, "illuminant": LIGHT}},
-    )  # fmt: skip
+        "simulated",
+        {"color_table": {"camera": CAMERA, "illuminant": LIGHT}},
+    )
 
 
 def channels(path):
@@ -61,9 +62,11 @@ def test_reflectance_is_the_two_layer_models_at_each_wavelength(flash, tmp_path)
     picked = [400.0, 540.0, 700.0]
     for row, column in ((1, 2), (2, 3)):
         direct = two_layer_reflectance(
-            picked, float(flash.maps["melanin"].values[row, column]),
-            float(flash.maps["hemoglobin"].values[row, column]), anisotropy=ANISOTROPY_SKIN,
-        )  # fmt: skip
+            picked,
+            float(flash.maps["melanin"].values[row, column]),
+            float(flash.maps["hemoglobin"].values[row, column]),
+            anisotropy=ANISOTROPY_SKIN,
+        )
         stored = [found[n][row, column] for w in picked for n, nm in named.items() if nm == w]
         np.testing.assert_allclose(stored, direct, rtol=2e-3)
     assert not any(layer[0, 0] for layer in found.values())  # where melanin is not known
@@ -102,8 +105,9 @@ def test_stokes_components_give_the_parallel_and_the_crossed_picture(flash, tmp_
 def test_the_document_says_what_is_measured_and_what_is_not(flash, tmp_path):
     left_out = spectral.write(
         SkinAppearance({n: flash.maps[n] for n in ("melanin", "hemoglobin")}, "simulated"),
-        tmp_path, Delivery(),
-    )  # fmt: skip
+        tmp_path,
+        Delivery(),
+    )
     assert [what for what, _ in left_out] == ["stokes.exr"]
     told = json.loads((tmp_path / "spectral.json").read_text())
     assert told["files"]["reflectance.exr"]["origin"] == "modelled"

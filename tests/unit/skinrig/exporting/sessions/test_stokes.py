@@ -34,17 +34,26 @@ def made(tmp_path, patterns=("full", "x"), only=("parallel", "crossed")):
     view = RIG.views[0]
     shape = (view.height_px, view.width_px)
     with Session.create(
-        tmp_path / "s", plan=plan, rig=RIG, devices={}, source="measured",
+        tmp_path / "s",
+        plan=plan,
+        rig=RIG,
+        devices={},
+        source="measured",
         subject=Subject("P042", ("research",), DAY),
-    ) as session:  # fmt: skip
+    ) as session:
         for step, camera in session.todo():
             lit = step.kind == "gradient" and step.index["polarizer"] in only
             shown = light(step, shape) if lit else np.zeros(shape)
             codes = np.rint(BLACK + (WHITE - BLACK) * shown + 5.0).astype(np.uint16)  # 5 of dark
             blob = raw.encode_dng(
-                codes, pattern="MONO", black=BLACK, white=WHITE, noise_profile=(1e-4, 1e-6),
-                step_id=step.id, session_id=session.id,
-            )  # fmt: skip
+                codes,
+                pattern="MONO",
+                black=BLACK,
+                white=WHITE,
+                noise_profile=(1e-4, 1e-6),
+                step_id=step.id,
+                session_id=session.id,
+            )
             session.commit(
                 step.id, camera, blob, settings=step.settings, t_host_s=1.0, actual={}, attempt=1
             )
@@ -88,9 +97,13 @@ def test_channels_are_named_as_the_published_layout_has_them(tmp_path):
 
 def test_the_document_says_along_which_axis_and_what_was_not_measured(tmp_path):
     done = export_stokes(
-        made(tmp_path, patterns=("full", "dark")), tmp_path / "out", use="research", today=DAY,
-        only=("a000_n0",), with_errors=True,
-    )  # fmt: skip
+        made(tmp_path, patterns=("full", "dark")),
+        tmp_path / "out",
+        use="research",
+        today=DAY,
+        only=("a000_n0",),
+        with_errors=True,
+    )
     told = json.loads((tmp_path / "out/stokes.json").read_text())
     assert told["reference_axis_deg"] == RIG.views[0].analyser_axis_deg == 90.0
     assert "S1 is -1 of" in told["image_frame"]
@@ -123,15 +136,23 @@ def test_a_session_of_another_rig_is_sent_where_it_belongs(tmp_path):
 
     rig = load_rig("flash").resized(16)
     with Session.create(
-        tmp_path / "f", plan=flash_plan(rig, darks=1), rig=rig, devices={},
-        subject=Subject("P042", ("research",), DAY), source="measured",
-    ) as session:  # fmt: skip
+        tmp_path / "f",
+        plan=flash_plan(rig, darks=1),
+        rig=rig,
+        devices={},
+        subject=Subject("P042", ("research",), DAY),
+        source="measured",
+    ) as session:
         view = rig.views[0]
         for step, camera in session.todo():
             blob = raw.encode_dng(
-                np.full((view.height_px, view.width_px), 600, np.uint16), pattern="RGGB",
-                black=512, white=16383, step_id=step.id, session_id=session.id,
-            )  # fmt: skip
+                np.full((view.height_px, view.width_px), 600, np.uint16),
+                pattern="RGGB",
+                black=512,
+                white=16383,
+                step_id=step.id,
+                session_id=session.id,
+            )
             session.commit(
                 step.id, camera, blob, settings=step.settings, t_host_s=1.0, actual={}, attempt=1
             )

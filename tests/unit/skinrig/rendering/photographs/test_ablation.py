@@ -26,10 +26,14 @@ def model(lobes, weights, rng):
     normals[..., :] = (0.6, 0.0, 0.8)
     y, x = np.mgrid[:SIDE, :SIDE] * 1.0
     return SkinReflectance(
-        r_d=rng.uniform(0.2, 0.6, (SIDE, SIDE, 3)), weights=weights, lobes=lobes,
-        translucency_mm=np.ones((SIDE, SIDE, 3)), normals=normals,
-        position_mm=np.stack([x, -y, 0 * x], -1), valid=np.ones((SIDE, SIDE), bool),
-    )  # fmt: skip
+        r_d=rng.uniform(0.2, 0.6, (SIDE, SIDE, 3)),
+        weights=weights,
+        lobes=lobes,
+        translucency_mm=np.ones((SIDE, SIDE, 3)),
+        normals=normals,
+        position_mm=np.stack([x, -y, 0 * x], -1),
+        valid=np.ones((SIDE, SIDE), bool),
+    )
 
 
 def test_skin_that_shines_by_one_lobe_is_as_it_was_with_one_lobe(lobes, rng):
@@ -53,9 +57,10 @@ def test_one_lobe_keeps_how_much_is_reflected_and_gives_up_how_sharply(lobes, rn
 def test_parts_that_are_taken_out_are_the_mesh_s_normal_and_the_mean_albedo(lobes, rng):
     whole = model(lobes, np.ones((SIDE, SIDE, 2)), rng)
     mesh = build_mesh(
-        [[0, -8, 0], [8, -8, 0], [8, 0, 0], [0, 0, 0]], [[0, 1, 2], [0, 2, 3]],
+        [[0, -8, 0], [8, -8, 0], [8, 0, 0], [0, 0, 0]],
+        [[0, 1, 2], [0, 2, 3]],
         [[0, 0], [1, 0], [1, 1], [0, 1]],
-    )  # fmt: skip
+    )
     less = without_parts(whole, mesh)
     np.testing.assert_allclose(less["scanned normals"].normals[4, 4], (0, 0, 1), atol=1e-6)
     np.testing.assert_allclose(

@@ -34,8 +34,10 @@ def test_each_pixel_falls_into_the_band_of_its_true_melanin(rng):
     truth = np.repeat([[0.01], [0.3]], 30, axis=1)
     rows = compare(appearance(truth * 1.1), appearance(truth), rng=rng)
     assert [(row.band_name, row.pixels) for row in rows] == [
-        ("all", 60), ("melanin 0–0.02", 30), ("melanin 0.2–0.51", 30),
-    ]  # fmt: skip
+        ("all", 60),
+        ("melanin 0–0.02", 30),
+        ("melanin 0.2–0.51", 30),
+    ]
 
 
 def test_maps_of_different_size_are_refused(rng):

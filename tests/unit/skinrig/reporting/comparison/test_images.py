@@ -98,11 +98,24 @@ def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, t
 
 
 def test_a_check_of_photographs_that_failed_only_once_is_told_as_changed(light, tmp_path):
-    row = {"pairs": 2, "median": 0.03, "p68": 0.05, "p95": 0.1, "bias": 0.0, "total_error": 0.04,
-           "ssim": 0.9, "noise": 0.01}  # fmt: skip
+    row = {
+        "pairs": 2,
+        "median": 0.03,
+        "p68": 0.05,
+        "p95": 0.1,
+        "bias": 0.0,
+        "total_error": 0.04,
+        "ssim": 0.9,
+        "noise": 0.01,
+    }
     for name, median in (("a", 0.03), ("b", 0.08)):
-        told = {"full model": {**row, "median": median}, "limit": 0.05, "by_kind": {},
-                "ablation": {}, "by_band": {}}  # fmt: skip
+        told = {
+            "full model": {**row, "median": median},
+            "limit": 0.05,
+            "by_kind": {},
+            "ablation": {},
+            "by_band": {},
+        }
         folder(tmp_path / name, light, **told)
     html = report.make([tmp_path / "a", tmp_path / "b"]).html
     assert "1 of 1 checks of both changed their verdict, 1 for the worse" in html

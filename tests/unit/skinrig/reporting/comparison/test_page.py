@@ -129,10 +129,11 @@ def write_maps(folder, rng, *, shift=0.0, **parameters):
         folder,
         SkinAppearance(
             {"melanin": SkinMap(noisy, UNITS["melanin"], np.full(melanin.shape, 0.001))},
-            "simulated", parameters={"truth": "truth", **parameters},
+            "simulated",
+            parameters={"truth": "truth", **parameters},
             inputs={"session": f"sha256:{folder.name}"},
         ),
-    )  # fmt: skip
+    )
     return folder
 
 

@@ -12,8 +12,16 @@ from skinrig.reporting.sections import images as pictures
 
 
 def a_row(median):
-    return {"pairs": 2, "median": median, "p68": 0.05, "p95": 0.2, "bias": -0.01,
-            "total_error": 0.04, "ssim": 0.98, "noise": 0.01}  # fmt: skip
+    return {
+        "pairs": 2,
+        "median": median,
+        "p68": 0.05,
+        "p95": 0.2,
+        "bias": -0.01,
+        "total_error": 0.04,
+        "ssim": 0.98,
+        "noise": 0.01,
+    }
 
 
 def a_folder(path, **document):
@@ -26,10 +34,15 @@ def a_folder(path, **document):
 def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
     folder = a_folder(
         tmp_path / "pictures",
-        **{"full model": a_row(0.06), "by_kind": {"light": a_row(0.06)}, "limit": 0.05,
-           "ablation": {"no surface": a_row(0.11)}, "assumed": ["lights as drawn"],
-           "by_band": {"light": {"pixels": 10, "median": 0.06}}},
-    )  # fmt: skip
+        **{
+            "full model": a_row(0.06),
+            "by_kind": {"light": a_row(0.06)},
+            "limit": 0.05,
+            "ablation": {"no surface": a_row(0.11)},
+            "assumed": ["lights as drawn"],
+            "by_band": {"light": {"pixels": 10, "median": 0.06}},
+        },
+    )
     checks: list[page.Check] = []
     body = pictures.section(folder, checks)
     assert [check.passed for check in checks] == [False]

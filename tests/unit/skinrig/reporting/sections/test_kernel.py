@@ -10,11 +10,21 @@ from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.reporting.sections import kernel
 
 FIT = {
-    "name": "a000_m1", "angle_deg": 0.0, "stretch_s": 0.9, "alpha": -0.17, "alpha_stderr": 0.12,
-    "alpha_95": 0.69, "sigma_um": 41.5, "sigma_stderr_um": 19.5, "sigma_95_um": 38.2,
-    "distance": 0.06, "distance_before": 0.3, "noise_floor": 0.1, "near_best_count": 439,
+    "name": "a000_m1",
+    "angle_deg": 0.0,
+    "stretch_s": 0.9,
+    "alpha": -0.17,
+    "alpha_stderr": 0.12,
+    "alpha_95": 0.69,
+    "sigma_um": 41.5,
+    "sigma_stderr_um": 19.5,
+    "sigma_95_um": 38.2,
+    "distance": 0.06,
+    "distance_before": 0.3,
+    "noise_floor": 0.1,
+    "near_best_count": 439,
     "valid": True,
-}  # fmt: skip
+}
 
 
 def table_of(fit):
@@ -29,9 +39,13 @@ def table_of(fit):
 
 def test_kernels_stand_with_their_standard_errors_and_half_widths():
     assert table_of(FIT)[2:8] == [
-        ("alpha", "-0.17"), ("standard error", "0.12"), ("95 % half width", "0.69"),
-        ("sigma, um", "41.5"), ("standard error, um", "19.5"), ("95 % half width, um", "38.2"),
-    ]  # fmt: skip
+        ("alpha", "-0.17"),
+        ("standard error", "0.12"),
+        ("95 % half width", "0.69"),
+        ("sigma, um", "41.5"),
+        ("standard error, um", "19.5"),
+        ("95 % half width, um", "38.2"),
+    ]
 
 
 @pytest.mark.parametrize("missing", ["alpha_95", "sigma_95_um"])

@@ -33,18 +33,23 @@ def moving(folder, truths):
         "truth": truths,
     }
     dynamic.add(
-        folder, dynamic.FACIAL_COLOR,
+        folder,
+        dynamic.FACIAL_COLOR,
         dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, parameters, {}, "simulated"),
-    )  # fmt: skip
+    )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
     dynamic.add(
-        folder, dynamic.WRINKLES,
+        folder,
+        dynamic.WRINKLES,
         dynamic.Part(
-            maps, {WRINKLE_FILE: document}, {"expressions": ["surprise"], "explained": 0.9}, {},
+            maps,
+            {WRINKLE_FILE: document},
+            {"expressions": ["surprise"], "explained": 0.9},
+            {},
             "simulated",
         ),
-    )  # fmt: skip
+    )
     return neutral
 
 
@@ -81,7 +86,9 @@ def test_without_truth_the_face_is_shown_with_its_own_errors(tmp_path):
 def test_a_sequence_shows_its_places_and_what_is_only_bounded(tmp_path):
     places = {"cheek": 0.03, "chin": 0.02}
     told = {
-        "schema": "skinrig.perfusion-curves/1", "state": "smile", "shot_period_s": 5.5,
+        "schema": "skinrig.perfusion-curves/1",
+        "state": "smile",
+        "shot_period_s": 5.5,
         "cycle_s": 10.0,
         "phases": {"captures": 22, "distinct": 20, "interval_s": 0.5},
         "frames": [{"time_s": 5.5 * k, "phase_s": 5.5 * k % 10} for k in range(22)],
@@ -93,18 +100,22 @@ def test_a_sequence_shows_its_places_and_what_is_only_bounded(tmp_path):
             name: {"start": level, "end": level, "text": "below 0.157 s"}
             for name, level in places.items()
         },
-        "transition": {"cheek": {"seen": False, "decided": True, "power": 0.8},
-                       "chin": {"seen": False, "decided": False}},
+        "transition": {
+            "cheek": {"seen": False, "decided": True, "power": 0.8},
+            "chin": {"seen": False, "decided": False},
+        },
         "reproducibility": {"cheek": {"sd": 1e-4}},
         "fit_of_all": {"text": "below 0.137 s"},
-    }  # fmt: skip
+    }
     store.write(
         tmp_path / "curves",
         SkinAppearance(
-            {}, "simulated", parameters={"kind": "appearance"},
+            {},
+            "simulated",
+            parameters={"kind": "appearance"},
             files={"perfusion_curves.json": json.dumps(told).encode()},
         ),
-    )  # fmt: skip
+    )
     page = report.build([tmp_path])
     assert "22 images meet 20 phases" in page
     assert "below 0.137 s" in page

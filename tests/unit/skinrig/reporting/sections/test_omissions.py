@@ -8,10 +8,15 @@ from skinrig.reporting.sections import omissions
 
 EFFECTS = [
     {"name": "shadows", "verdict": "built", "reason": "a face", "over_noise": 55.0, "switch": ""},
-    {"name": "bounces", "verdict": "negligible", "reason": "<flat>", "over_noise": 0.0,
-     "switch": "interreflections"},
+    {
+        "name": "bounces",
+        "verdict": "negligible",
+        "reason": "<flat>",
+        "over_noise": 0.0,
+        "switch": "interreflections",
+    },
     {"name": "lens", "verdict": "unmodeled", "reason": "1 px", "over_noise": None, "switch": ""},
-]  # fmt: skip
+]
 
 
 @pytest.fixture

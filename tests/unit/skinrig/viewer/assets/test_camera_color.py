@@ -25,9 +25,11 @@ def _source(folder, **more):
     values = np.full((4, 4, 3), 0.4, np.float32)
     appearance = SkinAppearance(maps={"r_d": SkinMap(values, "1")}, source="simulated", **more)
     mesh = ViewerMesh(
-        np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32),
-        np.zeros((3, 2), np.float32), np.array([[0, 1, 2]], np.int32),
-    )  # fmt: skip
+        np.eye(3, dtype=np.float32),
+        np.eye(3, dtype=np.float32),
+        np.zeros((3, 2), np.float32),
+        np.array([[0, 1, 2]], np.int32),
+    )
     return SceneSource(
         "dome", mesh, 64, appearances={"dome": appearance}, paths={"dome": folder / "appearance"}
     )
@@ -38,9 +40,14 @@ def _calibration(folder):
         MATRIX, np.array([1.5]), np.zeros((3, 3)), "linear", "D55", np.array([1.0])
     )
     made = color.to_calibration(
-        fit, Quantity(WHITE, np.zeros(3)), serial="SD-1", rig="dome", source="simulated",
-        created=date(2026, 1, 1), inputs={},
-    )  # fmt: skip
+        fit,
+        Quantity(WHITE, np.zeros(3)),
+        serial="SD-1",
+        rig="dome",
+        source="simulated",
+        created=date(2026, 1, 1),
+        inputs={},
+    )
     store.save(made, folder)
     return fit
 

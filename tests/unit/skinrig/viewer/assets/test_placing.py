@@ -47,8 +47,9 @@ def test_texels_find_their_pixels_through_exact_landmarks(dome, rng):
 def test_pixels_are_off_by_no_more_than_noisy_landmarks(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng, noise_px=1.0, count=40)
-    found = place(position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid,
-                  landmarks_px=flat)  # fmt: skip
+    found = place(
+        position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
+    )
     middle = (slice(12, 36), slice(12, 36))
     off = np.linalg.norm((found.pixel - _pixel(position))[middle], axis=-1)
     assert np.sqrt(np.mean(off**2)) < 2.0
@@ -57,8 +58,9 @@ def test_pixels_are_off_by_no_more_than_noisy_landmarks(dome, rng):
 def test_a_map_comes_back_as_it_was_where_the_camera_saw_it(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng)
-    found = place(position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid,
-                  landmarks_px=flat)  # fmt: skip
+    found = place(
+        position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
+    )
     column, row = np.meshgrid(np.arange(256.0), np.arange(256.0))
     picture = 0.02 + 1e-4 * column + 5e-5 * row
     values, known = found.sampled(picture, np.ones((256, 256), bool))
@@ -73,8 +75,9 @@ def test_skin_that_turns_away_from_the_camera_is_not_taken(dome, rng):
     solid, flat = _landmarks(position, rng)
     turned = normal.copy()
     turned[:10] = (1.0, 0.0, 0.0)
-    found = place(position, turned, np.ones((SIZE, SIZE), bool), landmarks_mm=solid,
-                  landmarks_px=flat)  # fmt: skip
+    found = place(
+        position, turned, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
+    )
     assert not found.seen[:10, SIZE // 2 :].any()
     assert found.seen[20:28, 20:28].all()
 

@@ -104,11 +104,19 @@ def test_the_server_gives_the_page_and_its_tiles(served, pyramid):
 @pytest.mark.parametrize(
     "path",
     [
-        "/tiles/0/9/0", "/tiles/0/../../etc/passwd", "/../etc/passwd", "/%2e%2e/etc/passwd",
-        "/tiles/0/0", "/tiles/0/0/0/", "/tiles/0/-1/0", "/tiles/0/0/0?x=1",
-        "/tiles/0/1/1.npy", "/index.html", "http://127.0.0.1/",
+        "/tiles/0/9/0",
+        "/tiles/0/../../etc/passwd",
+        "/../etc/passwd",
+        "/%2e%2e/etc/passwd",
+        "/tiles/0/0",
+        "/tiles/0/0/0/",
+        "/tiles/0/-1/0",
+        "/tiles/0/0/0?x=1",
+        "/tiles/0/1/1.npy",
+        "/index.html",
+        "http://127.0.0.1/",
     ],
-)  # fmt: skip
+)
 def test_no_other_path_is_answered(served, path):
     before = list(served.requests)
     assert ask(served, path)[0] == 404
