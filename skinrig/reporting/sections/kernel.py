@@ -94,8 +94,8 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
                 )
                 for fit in fits
             ],
-            caption="Kernels fitted to histograms of normals; distances before and after the kernel. "
-            "Kernel errors are not Gaussian: 95 % half widths are not 1.96 standard errors",
+            caption="Kernels fitted to histograms of normals; distances before and after each. "
+            "Kernel errors are not Gaussian: 95 % half widths differ from 1.96 standard errors",
         )
     )
     plots = ""
