@@ -1,0 +1,177 @@
+"""The graph of all imports: no circle, no crowded folder, and contracts that a breach breaks."""
+
+import ast
+import graphlib
+import json
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+MAX_MODULES = 15
+MAX_MODULES_OF = {"skinrig/commands": 17}
+LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
+
+
+@pytest.fixture
+def product_copy(tmp_path):
+    """The packages' sources and the contracts, to be broken."""
+    for package in PACKAGES:
+        leave = shutil.ignore_patterns("__pycache__", "data", "js", "glsl")
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=leave)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def import_graph(root):
+    """Modules with what each imports: at its top, inside functions and for types alone."""
+    script = (
+        "import grimp, json, sys\n"
+        f"graph = grimp.build_graph(*{PACKAGES!r}, cache_dir=None)\n"
+        "found = {m: sorted(graph.find_modules_directly_imported_by(m)) for m in graph.modules}\n"
+        "json.dump(found, sys.stdout)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+def circle_in(graph):
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_imports_form_no_circle():
+    graph = import_graph(ROOT)
+    assert len(graph) > 500
+    assert circle_in(graph) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from rigsim.scenes.dome import scene\n",
+        "def later():\n    from rigsim.scenes.dome import scene\n",
+        "if TYPE_CHECKING:\n    from rigsim.scenes.dome import scene\n",
+    ],
+    ids=["at the top", "in a function", "for types"],
+)
+def test_a_circle_would_be_found(text, product_copy):
+    with (product_copy / "rigsim" / "geometry" / "mesh.py").open("a") as file:
+        file.write("\n" + text)
+    assert {"rigsim.geometry.mesh", "rigsim.scenes.dome.scene"} <= set(
+        circle_in(import_graph(product_copy))
+    )
+
+
+def crowded(root):
+    paths = (p.relative_to(root) for package in PACKAGES for p in (root / package).rglob("*.py"))
+    modules = Counter(path.parent.as_posix() for path in paths if path.name != "__init__.py")
+    return {n: count for n, count in modules.items() if count > MAX_MODULES_OF.get(n, MAX_MODULES)}
+
+
+def test_no_folder_is_crowded():
+    assert crowded(ROOT) == {}
+
+
+def test_a_crowded_folder_would_be_found(tmp_path):
+    folder = tmp_path / "model" / "dipole"
+    folder.mkdir(parents=True)
+    for number in range(MAX_MODULES + 1):
+        (folder / f"m{number}.py").touch()
+    assert crowded(tmp_path) == {"model/dipole": MAX_MODULES + 1}
+
+
+def relative_imports(root):
+    return [
+        f"{path.relative_to(root)}:{node.lineno}"
+        for package in PACKAGES
+        for path in sorted((root / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.level
+    ]
+
+
+def test_every_import_is_absolute():
+    assert relative_imports(ROOT) == []
+
+
+def test_a_relative_import_would_be_found(tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "skin.py").write_text("from . import store\n")
+    assert relative_imports(tmp_path) == ["model/skin.py:1"]
+
+
+BREACHES = {
+    "the packages stand on each other in one direction": ("model/skin.py", "import capture.rig"),
+    "layers inside capture": ("capture/plan/dome.py", "import capture.session"),
+    "layers inside reconstruction": (
+        "reconstruction/chromophores/lines.py",
+        "import reconstruction.registration.strain",
+    ),
+    "estimators import the model and nothing else of ours": (
+        "reconstruction/surface/errors.py",
+        "import capture.rig",
+    ),
+    "layers inside model": ("model/fresnel.py", "import model.brdf.tables"),
+    "the model stays light": ("model/traits/space.py", "import sklearn"),
+    "layers inside rigsim": ("rigsim/world/faults.py", "import rigsim.targets.flat"),
+    "no inverse crime": ("rigsim/light/led_light.py", "import model.fresnel"),
+    "the renderer is imported in one place": ("rigsim/render/rays.py", "import mitsuba"),
+    "drivers alone open serial ports": ("capture/plan/dome.py", "import serial"),
+}
+
+
+def lint(root):
+    """Return the contracts that are broken."""
+    run = subprocess.run([LINT_IMPORTS, "--no-cache"], cwd=root, capture_output=True, text=True)
+    contracts = [line for line in run.stdout.splitlines() if " KEPT" in line or " BROKEN" in line]
+    assert contracts, run.stdout + run.stderr
+    broken = [line for line in contracts if " BROKEN" in line]
+    assert bool(broken) == bool(run.returncode), contracts
+    return broken
+
+
+@pytest.mark.parametrize("contract", BREACHES)
+def test_a_breach_breaks_its_contract(contract, product_copy):
+    name, text = BREACHES[contract]
+    with (product_copy / name).open("a") as file:
+        file.write(f"\n{text}\n")
+    assert any(line.startswith(contract) for line in lint(product_copy))
+
+
+@pytest.mark.parametrize(
+    ("contract", "package"),
+    [
+        ("layers inside capture", "capture"),
+        ("layers inside reconstruction", "reconstruction"),
+        ("layers inside model", "model"),
+        ("layers inside rigsim", "rigsim"),
+    ],
+)
+def test_a_module_in_no_layer_breaks_the_contract_of_its_package(contract, package, product_copy):
+    (product_copy / package / "helpers.py").write_text('"""In no layer."""\n')
+    assert [line.startswith(contract) for line in lint(product_copy)] == [True]
+
+
+def test_a_new_folder_of_the_model_is_forbidden_to_the_simulator(product_copy):
+    """Deny by default: the contract lists what is allowed, not what is forbidden."""
+    (product_copy / "model" / "new_equation").mkdir()
+    (product_copy / "model" / "new_equation" / "__init__.py").write_text('"""New."""\n')
+    with (product_copy / "rigsim" / "light" / "led_light.py").open("a") as file:
+        file.write("\nimport model.new_equation\n")
+    assert any(line.startswith("no inverse crime") for line in lint(product_copy))
+
+
+def test_each_contract_has_a_breach():
+    named = (ROOT / "pyproject.toml").read_text("utf-8").split("[[tool.importlinter.contracts]]")
+    names = [text.split('name = "')[1].split('"')[0] for text in named[1:]]
+    assert [sum(name.startswith(contract) for contract in BREACHES) for name in names] == [1] * 10
