@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import csv
 import importlib.util
 import os
 import sys
@@ -26,12 +27,6 @@ hypothesis.settings.register_profile("alike", derandomize=True, deadline=None, d
 hypothesis.settings.load_profile("alike")
 providers._get_local_constants = providers.Constants
 
-# What one process writes another reads whether or not it has reached the disk: only a cut of power
-# tells, which tests/faults/test_power_cut.py models operation by operation. Each frame waits three
-# times for the disk, in which its core has nothing to do; an invalid descriptor is still refused.
-# That the calls come, tests/unit/capture/session/test_disk.py sees.
-os.fsync = os.fdatasync = lambda descriptor: os.fstat(descriptor) and None
-
 ROOT = Path(__file__).parents[1]
 
 _REAL_TIME = importlib.util.spec_from_file_location(
@@ -41,41 +36,18 @@ real_time = importlib.util.module_from_spec(_REAL_TIME)
 _REAL_TIME.loader.exec_module(real_time)
 pytest_runtest_protocol = real_time.pytest_runtest_protocol
 
-LONGEST_FIRST = (
-    "tests/recovery/test_dome_rig.py",
-    "tests/system/test_demo.py",
-    "tests/browser/test_controls_hands.py",
-    "tests/browser/test_accessibility.py",
-    "tests/browser/test_viewer_pages.py",
-    "tests/system/test_tour.py",
-    "tests/recovery/test_kernels_of_patches.py",
-    "tests/benchmarks/test_benchmarks.py",
-    "tests/radiometry/test_dome_session.py",
-    "tests/radiometry/test_flash_lateral_reference.py",
-    "tests/recovery/test_gradient_stages.py",
-    "tests/faults/test_damage.py",
-    "tests/recovery/test_held_out_photographs.py",
-    "tests/recovery/test_flash_rig.py",
-    "tests/recovery/test_dome_stages.py",
-    "tests/recovery/test_subsurface_inversion.py",
-    "tests/recovery/test_facial_color_fit.py",
-    "tests/protocol/test_fuzz.py",
-    "tests/faults/test_caliper_stateful.py",
-    "tests/faults/test_dome_stateful.py",
-    "tests/faults/test_wire_stateful.py",
-    "tests/recovery/test_head_motion.py",
-    "tests/faults/test_power_cut.py",
-    "tests/unit/skinrig/exporting/test_consent_on_its_way.py",
-    "tests/unit/rigsim/tissue/test_skin_table.py",
-    "tests/unit/reconstruction/kernel_fit/test_fit.py",
-)
-"""Files that take 20 s and more, the longest first; the rest go by how many tests they have. One
-process runs a file from end to end, so one of these taken up last would leave the others without
-work."""
+MIN_RECORDED_S = 2.0
+"""Quicker files are not worth a line."""
+DURATIONS = ROOT / "tests" / "durations.csv"
+"""Seconds of each test file, recorded by `pytest --record-durations`. One process runs a file from
+end to end, so a long file taken up last would leave the others without work."""
 
 
 def pytest_addoption(parser):
     parser.addoption("--device-port", default=None, help="serial URL of a real box")
+    parser.addoption(
+        "--record-durations", action="store_true", help=f"write {DURATIONS.name} from this run"
+    )
 
 
 @cache
@@ -105,20 +77,64 @@ def pytest_ignore_collect(collection_path, config):
     return None if any(map(says_long, (collection_path, *beside, *above))) else True
 
 
+def recorded_durations_s():
+    """Seconds by file; a file that no run has recorded yet counts as quick."""
+    with DURATIONS.open(newline="", encoding="utf-8") as file:
+        return {ROOT / row["file"]: float(row["seconds"]) for row in csv.DictReader(file)}
+
+
 @pytest.hookimpl(trylast=True)  # what is not asked for has been left out
 def pytest_collection_modifyitems(items):
-    missing = [name for name in LONGEST_FIRST if not (ROOT / name).is_file()]
-    if missing:
-        raise pytest.UsageError(f"tests/conftest.py: LONGEST_FIRST: no file {', '.join(missing)}")
-    rank = {ROOT / name: number for number, name in enumerate(LONGEST_FIRST)}
+    seconds = recorded_durations_s()
     tests = Counter(item.path for item in items)
-    place = {path: number for number, path in enumerate(tests)}  # a file's tests stay together
+    number = {path: count for count, path in enumerate(tests)}  # a file's tests stay together
 
     def order(item):
         path = item.path
-        return rank.get(path, len(rank)), -tests[path], place[path]
+        return -seconds.get(path, 0.0), -tests[path], number[path]
 
     items.sort(key=order)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter, config):
+    reports = [
+        report
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if isinstance(report, pytest.TestReport)
+    ]
+    wanting = sum("test data not found" in str(report.longrepr) for report in reports)
+    if wanting:
+        terminalreporter.write_line(
+            f"{wanting} tests skipped for want of test data (SKINRIG_TEST_DATA)"
+        )
+    if config.getoption("record_durations"):
+        seconds = {path: spent for path, spent in recorded_durations_s().items() if path.is_file()}
+        seconds |= dict.fromkeys({ROOT / report.fspath for report in reports}, 0.0)
+        for report in reports:
+            seconds[ROOT / report.fspath] += report.duration
+        with DURATIONS.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(("file", "seconds"))
+            for path, spent in sorted(seconds.items()):
+                if spent >= MIN_RECORDED_S:
+                    table.writerow((path.relative_to(ROOT).as_posix(), f"{spent:.0f}"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_the_disk():
+    """Let synchronizing a file return at once; an invalid descriptor is still refused.
+
+    What one process writes another reads whether or not it has reached the disk: only a cut of
+    power matters, and tests of faults wait for the disk (their conftest.py). Gives the calls that
+    do wait, by name.
+    """
+    waiting = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
+    with pytest.MonkeyPatch.context() as patch:
+        for name in waiting:
+            patch.setattr(os, name, lambda descriptor: os.fstat(descriptor) and None)
+        yield waiting
 
 
 @pytest.fixture
@@ -160,15 +176,3 @@ def device_port(request):
     if url is None:
         pytest.skip("no --device-port was given")
     return url
-
-
-def pytest_terminal_summary(terminalreporter):
-    skipped = [
-        report
-        for report in terminalreporter.stats.get("skipped", [])
-        if "test data not found" in str(report.longrepr)
-    ]
-    if skipped:
-        terminalreporter.write_line(
-            f"{len(skipped)} tests skipped for want of test data (SKINRIG_TEST_DATA)"
-        )

@@ -1,6 +1,7 @@
 """A ledger of pops: what the host believes against what the flash box did; hosts to be struck."""
 
 import itertools
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -20,6 +21,14 @@ from capture.devices.port import (
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Controller
 from rigsim.world.serve import serve
+
+
+@pytest.fixture(autouse=True)
+def waiting_for_the_disk(no_waiting_for_the_disk, monkeypatch):
+    """Wait for the disk as the product does: these tests are about what reaches it."""
+    for name, call in no_waiting_for_the_disk.items():
+        monkeypatch.setattr(os, name, call)
+
 
 # pops of a low power: the tube recovers in 12 ms, so that a second pop would not be refused
 POWER = 0.008

@@ -329,27 +329,6 @@ def test_the_limits_of_the_domes_light_are_those_of_its_rig_file():
             assert float(re.search(r"[\d.]+", value).group()) == getattr(limits, name), name
 
 
-def test_the_decision_on_long_modules_names_those_that_there_are():
-    page = ROOT / "docs" / "decisions" / "0004-modules-longer-than-300-lines.md"
-    decision = page.read_text("utf-8").split("## Decision\n")[1].split("\n## ")[0]
-    package, named_there = "", set()
-    for name in SPAN.findall(decision):
-        if "/" in name:
-            continue
-        package = package if name.startswith(".") else name.rpartition(".")[0]
-        named_there.add(package + name if name.startswith(".") else name)
-    lines = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts): len(
-            path.read_text("utf-8").splitlines()
-        )
-        for where in PACKAGES
-        for path in (ROOT / where).rglob("*.py")
-    }
-    assert sorted(named_there - set(lines)) == []
-    # above 300 a module is looked at, above 400 it is listed or cut
-    assert {name for name, count in lines.items() if count > 400} - named_there == set()
-
-
 def source_texts():
     """Every text in the source, with whatever is filled in left as a gap."""
     texts = []
