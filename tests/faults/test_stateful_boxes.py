@@ -1,0 +1,56 @@
+"""Random hosts of every box on a noisy line: what must hold whatever they do.
+
+`fixtures/hosts` says of each box what that is. A box with one rule left out must be caught: these
+cases test the test.
+"""
+
+from collections import deque
+
+import pytest
+from fixtures.hosts import caliper, dome, flash, probe
+from fixtures.noisy_host import explore
+from hypothesis import Phase
+
+from rigsim.world import World
+
+HOSTS = {
+    "flash": (flash, flash.NoisyFlash, 30),
+    "dome": (dome, dome.NoisyDome, 20),
+    "caliper": (caliper, caliper.NoisyCaliper, 15),
+    "probe": (probe, probe.NoisyProbe, 15),
+}
+"""Module, state machine, and steps of an example."""
+LEFT_OUT = [
+    pytest.param(box, rule, caught, marks=marks, id=f"{box}-{rule.__name__}")
+    for box, (module, _, _) in HOSTS.items()
+    for rule, caught, marks in module.LEFT_OUT
+]
+
+
+@pytest.mark.parametrize("box", HOSTS)
+def test_a_box_keeps_its_rules_on_a_noisy_line(box):
+    _, host, steps = HOSTS[box]
+    explore(host, 40 if box == "flash" else 25, steps=steps)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("box", HOSTS)
+def test_a_box_keeps_its_rules_on_a_noisy_line_for_long(box):
+    _, host, steps = HOSTS[box]
+    explore(host, 600 if box == "flash" else 500, steps=steps)
+
+
+@pytest.mark.parametrize(("box", "leave_out", "caught_by"), LEFT_OUT)
+def test_a_box_with_one_rule_left_out_is_caught(monkeypatch, box, leave_out, caught_by):
+    leave_out(monkeypatch)
+    _, host, steps = HOSTS[box]
+    with pytest.raises(AssertionError) as caught:
+        explore(host, 600, steps=steps, phases=[Phase.generate])
+    assert {entry.name for entry in caught.traceback} & set(caught_by)
+
+
+def test_the_cache_of_answers_is_a_queue_of_eight():
+    controller = World(flash.RIG).box("flash")
+    assert isinstance(controller._replies, deque)
+    assert controller._replies.maxlen == 8
