@@ -10,13 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import serial
+from fixtures.framed_bench import FramedBench
 from serial import rfc2217
 
-from capture.devices import wire
 from capture.devices.camera import open_camera
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port
-from capture.devices.wire import Code, Reply, Request
 from capture.rig import load_rig
 from rigsim.world import World
 from rigsim.world.faults import Faults
@@ -154,59 +153,6 @@ def _bench(world, addresses, transport):
 
 def _clock(world):
     return world.clock if world.virtual else None
-
-
-class FramedBench:
-    """A box at one second past power-up, spoken to in frames with the right numbers."""
-
-    def __init__(self, world, name):
-        self.world = world
-        self.box = world.box(name)
-        self.unit = self.box.device
-        self.now = 1.0
-        self.seq = 100
-        self.said = []
-
-    def raw(self, data):
-        answer = self.box.feed(data, self.now)
-        self.hear(answer)
-        return answer
-
-    def hear(self, data):
-        for line in data.splitlines():
-            if line[:1] == b"!":
-                event = wire.decode(line)
-                self.said.append((event.name, event.payload))
-
-    def reply(self, text):
-        self.seq += 1
-        data = self.raw(wire.encode(Request(self.seq, self.box.boot, text)))
-        frames = [wire.decode(line) for line in data.splitlines()]
-        (reply,) = [frame for frame in frames if isinstance(frame, Reply)]
-        return reply
-
-    def ask(self, text):
-        reply = self.reply(text)
-        assert reply.code == Code.OK, (text, reply)
-        return reply.payload
-
-    def code(self, text):
-        return self.reply(text).code
-
-    def events(self, name):
-        return [payload for said, payload in self.said if said == name]
-
-    def wait(self, seconds, *, ping_s=0.2):
-        """Let time pass; the host is alive."""
-        until = self.now + seconds
-        while self.now < until - 1e-12:
-            self.now = min(self.now + ping_s, until)
-            self.ask("SYST:PING?")
-
-    def silence(self, seconds):
-        """Let time pass; the host is not."""
-        self.now += seconds
-        self.hear(self.box.advance(self.now))
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from fixtures.framed_bench import ANY, SHARED_COMMANDS
 
 from capture.devices import wire
 from capture.devices.wire import Code, Request
@@ -25,7 +26,6 @@ SKIN = TapeMechanics(
     hardening_n_per_mm=2.0,
 )
 
-ANY = object()
 READY = ("CAL:FORC:LIM 5", "SYST:ARM")
 # header -> text, what must come before, expected payload
 MANUAL = {
@@ -41,24 +41,6 @@ MANUAL = {
     "CAL:FORC?": ("CAL:FORC?", (), ANY),
     "CAL:FORC:LIM": ("CAL:FORC:LIM 1.5", (), ""),
     "CAL:FORC:LIM?": ("CAL:FORC:LIM?", (), "NONE"),
-}
-SHARED = {
-    "*IDN?",
-    "*RST",
-    "*CLS",
-    "*OPC?",
-    "SYST:ERR?",
-    "SYST:HELLO?",
-    "SYST:CAP?",
-    "SYST:CAP:PART?",
-    "SYST:WDOG",
-    "SYST:WDOG?",
-    "SYST:ARM",
-    "SYST:ARM?",
-    "SYST:PING?",
-    "SAFE",
-    "ABOR",
-    "STAT?",
 }
 
 
@@ -107,7 +89,7 @@ def move(bench, step):
 
 
 def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED == set(bench.box.commands)
+    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
     assert all(command.manual for command in bench.box.commands.values())
 
 

@@ -5,9 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from fixtures.framed_bench import ANY, SHARED_COMMANDS, FramedBench
 
 from capture.devices import wire
-from capture.devices.wire import Code, Event, Reply, Request
+from capture.devices.wire import Code, Event, Request
 from capture.plan.dome import as_table, dome_plan
 from capture.plan.eye_light import eye_light
 from capture.plan.flicker import flicker_of_rows
@@ -21,7 +22,6 @@ from rigsim.world.faults import Faults
 DOME = load_rig("dome")
 RIG = DOME.subset(views=["C00", "C05", "C15"]).resized(16)
 
-ANY = object()
 # header -> (text, needs arming, what must come before, expected payload)
 MANUAL = {
     "SEQ:CLE": ("SEQ:CLE", (), ""),
@@ -42,76 +42,15 @@ MANUAL = {
     "DOSE?": ("DOSE? 3", (), "0.000000"),
     "DOSE:NEW": ("DOSE:NEW P042", (), ""),
 }
-SHARED = {
-    "*IDN?",
-    "*RST",
-    "*CLS",
-    "*OPC?",
-    "SYST:ERR?",
-    "SYST:HELLO?",
-    "SYST:CAP?",
-    "SYST:CAP:PART?",
-    "SYST:WDOG",
-    "SYST:WDOG?",
-    "SYST:ARM",
-    "SYST:ARM?",
-    "SYST:PING?",
-    "SAFE",
-    "ABOR",
-    "STAT?",
-}
 
 
-class Bench:
-    """A box at one second past power-up, spoken to in frames with the right numbers."""
+class Bench(FramedBench):
+    """A dome's box that notes which cameras it releases, and when."""
 
     def __init__(self, rig=RIG, **faults):
-        self.world = World(rig, seed=3, faults=Faults(**faults))
-        self.box = self.world.box("dome")
-        self.unit = self.box.device
+        super().__init__(World(rig, seed=3, faults=Faults(**faults)), "dome")
         self.edges = []
         self.unit._on_trigger = lambda now, mask: self.edges.append((now, mask))
-        self.now = 1.0
-        self.seq = 100
-        self.said = []
-
-    def raw(self, data):
-        answer = self.box.feed(data, self.now)
-        self.hear(answer)
-        return answer
-
-    def hear(self, data):
-        for line in data.splitlines():
-            if line[:1] == b"!":
-                event = wire.decode(line)
-                self.said.append((event.name, event.payload))
-
-    def reply(self, text):
-        self.seq += 1
-        data = self.raw(wire.encode(Request(self.seq, self.box.boot, text)))
-        frames = [wire.decode(line) for line in data.splitlines()]
-        (reply,) = [frame for frame in frames if isinstance(frame, Reply)]
-        return reply
-
-    def ask(self, text):
-        reply = self.reply(text)
-        assert reply.code == Code.OK, (text, reply)
-        return reply.payload
-
-    def code(self, text):
-        return self.reply(text).code
-
-    def wait(self, seconds, *, ping_s=0.2):
-        """Let time pass; the host is alive."""
-        until = self.now + seconds
-        while self.now < until - 1e-12:
-            self.now = min(self.now + ping_s, until)
-            self.ask("SYST:PING?")
-
-    def silence(self, seconds):
-        """Let time pass; the host is not."""
-        self.now += seconds
-        self.hear(self.box.advance(self.now))
 
     def load(self, rows):
         self.ask("SEQ:CLE")
@@ -145,7 +84,7 @@ def behind(count):
 
 
 def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED == set(bench.box.commands)
+    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
     assert all(command.manual for command in bench.box.commands.values())
 
 

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from fixtures.framed_bench import ANY
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
@@ -16,7 +17,7 @@ from rigsim.world.faults import Faults
 RIG = load_rig("flash").resized(16)
 
 # header -> (text, needs arming, expected payload or a test of it)
-ANY = object()
+
 MANUAL = {
     "*IDN?": ("*IDN?", False, "RIGSIM,FLASH2,FL-0001,1.0"),
     "*RST": ("*RST", False, ""),

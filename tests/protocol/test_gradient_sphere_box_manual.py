@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from fixtures.framed_bench import ANY, SHARED_COMMANDS
 
 from capture.devices import wire
 from capture.devices.gradient_sphere import PatternRow as HostRow
@@ -21,7 +22,6 @@ WAYS = np.array([light.position_mm for light in RIG.lights])
 WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 TURN_S = RIG.polarizer_move_s
 
-ANY = object()
 ROW = "SEQ:DEF 0,X:0:500:30000:1"
 # header -> text, what must come before, expected payload
 MANUAL = {
@@ -47,24 +47,6 @@ MANUAL = {
     "SAFE:EYES?": ("SAFE:EYES?", (), "OPEN"),
     "DOSE?": ("DOSE? 3", (), "0.000000"),
     "DOSE:NEW": ("DOSE:NEW P042", (), ""),
-}
-SHARED = {
-    "*IDN?",
-    "*RST",
-    "*CLS",
-    "*OPC?",
-    "SYST:ERR?",
-    "SYST:HELLO?",
-    "SYST:CAP?",
-    "SYST:CAP:PART?",
-    "SYST:WDOG",
-    "SYST:WDOG?",
-    "SYST:ARM",
-    "SYST:ARM?",
-    "SYST:PING?",
-    "SAFE",
-    "ABOR",
-    "STAT?",
 }
 
 
@@ -105,7 +87,7 @@ def run(bench, rows, token="r1"):
 
 
 def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED == set(bench.box.commands)
+    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
     assert all(command.manual for command in bench.box.commands.values())
 
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from fixtures.framed_bench import ANY, SHARED_COMMANDS
 
 from capture.devices import wire
 from capture.devices.wire import Code, Request
@@ -17,7 +18,6 @@ RIG = load_rig("probe")
 PROBE = RIG.probe
 LAG_S = 1e-3  # from the command to blades that have cleared the fibre
 
-ANY = object()
 HEAD = ("SYST:ARM", "HEAD:SITE cheek,22.5")
 # header -> text, what must come before, expected payload
 MANUAL = {
@@ -40,24 +40,6 @@ MANUAL = {
     "CAM:TEMP?": ("CAM:TEMP?", (), ANY),
     "DOSE?": ("DOSE?", (), "0.000000"),
     "DOSE:NEW": ("DOSE:NEW S1", (), ""),
-}
-SHARED = {
-    "*IDN?",
-    "*RST",
-    "*CLS",
-    "*OPC?",
-    "SYST:ERR?",
-    "SYST:HELLO?",
-    "SYST:CAP?",
-    "SYST:CAP:PART?",
-    "SYST:WDOG",
-    "SYST:WDOG?",
-    "SYST:ARM",
-    "SYST:ARM?",
-    "SYST:PING?",
-    "SAFE",
-    "ABOR",
-    "STAT?",
 }
 HARMLESS = ("PUMP VENT", "SHUT CLOSE", "LED 0", "HEAD:FREE")
 ACTS = ("HEAD:SITE cheek,0", "PUMP ON,5000,60", "LED 500", "SHUT OPEN,100")
@@ -118,7 +100,7 @@ def nothing_on(bench):
 
 
 def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED == set(bench.box.commands)
+    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
     assert all(command.manual for command in bench.box.commands.values())
 
 
