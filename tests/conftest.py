@@ -1,7 +1,6 @@
 """Fixtures shared by all tests."""
 
 import csv
-import importlib.util
 import os
 import sys
 from collections import Counter
@@ -17,23 +16,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import numpy as np
 import pytest
-from hypothesis.internal.conjecture import providers
+import real_time
 
 # Tests draw the same examples in each run, as slowly as a busy machine likes; nothing is kept
-# from one run for the next. Derandomized or not, Hypothesis would also draw the numbers that stand
-# in the source of all modules imported by then, and which those are is chance: other tests of the
-# same process.
+# from one run for the next. Later releases of Hypothesis than the pinned one also draw numbers from
+# the source of whatever modules a process has imported, which changes with its other tests.
 hypothesis.settings.register_profile("alike", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("alike")
-providers._get_local_constants = providers.Constants
+
 
 ROOT = Path(__file__).parents[1]
 
-_REAL_TIME = importlib.util.spec_from_file_location(
-    "real_time", Path(__file__).with_name("real_time.py")
-)
-real_time = importlib.util.module_from_spec(_REAL_TIME)
-_REAL_TIME.loader.exec_module(real_time)
 pytest_runtest_protocol = real_time.pytest_runtest_protocol
 
 MIN_RECORDED_S = 2.0
