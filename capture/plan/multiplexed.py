@@ -26,13 +26,13 @@ from capture.rig import Rig
 Seconds = int | float | str | Decimal | Fraction
 """A time; numbers count as the decimals that they are printed as."""
 
-RELEASE_S = 0.04
+RELEASE_DELAY_S = 0.04
 """Time from an image at hand to the release of the next one, s: arming camera and box."""
-REPEATED = Fraction(1, 10)
+REPEATED_PHASE_FRACTION = Fraction(1, 10)
 """Part of the phases that are met again by default, to see whether they repeat."""
-FEWEST_PHASES = 8
+MIN_PHASES = 8
 """With fewer, four in each half of the cycle, nothing can be said of what lies between."""
-_FINEST = 10**6
+_MAX_PERIOD_DENOMINATOR = 10**6
 """Largest denominator of a period in s; finer ones are rounded to it."""
 
 
@@ -65,7 +65,7 @@ class PhaseGrid:
     @property
     def aliased(self) -> bool:
         """Whether so few phases are met that what lies between the states cannot be seen."""
-        return self.distinct < FEWEST_PHASES
+        return self.distinct < MIN_PHASES
 
 
 def exact(value: Seconds) -> Fraction:
@@ -86,7 +86,7 @@ def exact(value: Seconds) -> Fraction:
     except (ValueError, ZeroDivisionError) as exc:
         fault = Fault("seconds", shown(value), "a finite number")
         raise PlanError("cannot plan", faults=[fault]) from exc
-    return number.limit_denominator(_FINEST)
+    return number.limit_denominator(_MAX_PERIOD_DENOMINATOR)
 
 
 def phase_grid(prompt_period_s: Seconds, shot_period_s: Seconds) -> PhaseGrid:
@@ -179,7 +179,7 @@ def image_s(rig: Rig, exposure_s: float) -> Fraction:
     5.498
     """
     slowest = max(exact(view.shutter_lag_s) + exact(view.readout_s) for view in rig.views)
-    return slowest + exact(exposure_s) + exact(RELEASE_S)
+    return slowest + exact(exposure_s) + exact(RELEASE_DELAY_S)
 
 
 def multiplexed_plan(
@@ -258,7 +258,7 @@ def multiplexed_plan(
     _check_flash(rig, grid.shot_period_s, power)
     if cycles is not None:
         captures = math.ceil(cycles * grid.cycle_s / grid.shot_period_s)
-    count = captures or grid.distinct + math.ceil(grid.distinct * REPEATED)
+    count = captures or grid.distinct + math.ceil(grid.distinct * REPEATED_PHASE_FRACTION)
     begun = _darks(rig, darks, exposure_s=exposure_s, iso=iso)
     common: dict[str, Value] = {
         "polarizer": "crossed",
@@ -397,7 +397,7 @@ class Phases:
     @property
     def aliased(self) -> bool:
         """Whether shot and prompt periods meet too few phases, however long the sequence is."""
-        return self.possible < FEWEST_PHASES
+        return self.possible < MIN_PHASES
 
     def __str__(self) -> str:
         again = self.captures - self.distinct

@@ -8,7 +8,14 @@ from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
-from capture.session.contents import FRAMES, JOURNAL, MANIFEST, ORPHANS, Contents, list_files
+from capture.session.contents import (
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    MANIFEST_FILE,
+    ORPHANS_FOLDER,
+    Contents,
+    list_files,
+)
 from capture.session.disk import Disk
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
@@ -59,12 +66,14 @@ def require_free(path: Path) -> None:
         raise SessionError("cannot start here", where=str(path), faults=faults)
     if not path.exists():
         return
-    debris = {FRAMES, ORPHANS, JOURNAL, f"{MANIFEST}.part"}
+    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part"}
     found = {entry.name for entry in os.scandir(path)}
     filled = any(
-        any((path / folder).iterdir()) for folder in (FRAMES, ORPHANS) if (path / folder).is_dir()
+        any((path / folder).iterdir())
+        for folder in (FRAMES_FOLDER, ORPHANS_FOLDER)
+        if (path / folder).is_dir()
     )
-    written = (path / JOURNAL).exists() and (path / JOURNAL).stat().st_size > 0
+    written = (path / JOURNAL_FILE).exists() and (path / JOURNAL_FILE).stat().st_size > 0
     if found - debris or filled or written:
         got = ", ".join(sorted(found)[:5])
         faults = [Fault("folder", f"a folder with {got}", "a new or empty folder")]
@@ -87,14 +96,14 @@ def set_orphans_aside(disk: Disk, path: Path, contents: Contents) -> None:
     orphans = [file for file in present if file not in lines]
     if not orphans:
         return
-    taken = set(os.listdir(path / ORPHANS))
+    taken = set(os.listdir(path / ORPHANS_FOLDER))
     for file in orphans:
         name, number = Path(file).name, 1
         while f"{name}.{number}" in taken:
             number += 1
         taken.add(f"{name}.{number}")
         _log.warning("%s: no line in the journal, set aside", path / file)
-        disk.rename(path / file, path / ORPHANS / f"{name}.{number}")
-    disk.fsync_dir(path / ORPHANS)
+        disk.rename(path / file, path / ORPHANS_FOLDER / f"{name}.{number}")
+    disk.fsync_dir(path / ORPHANS_FOLDER)
     for folder in sorted({Path(file).parent for file in orphans}):
         disk.fsync_dir(path / folder)

@@ -17,11 +17,11 @@ from capture.documents import Checks, Fault, shown
 from capture.plan import Plan, Value
 from capture.rig import Rig
 from capture.session.contents import (
-    ATTACHMENTS,
-    FRAMES,
-    JOURNAL,
-    MANIFEST,
-    ORPHANS,
+    ATTACHMENTS_FOLDER,
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    MANIFEST_FILE,
+    ORPHANS_FOLDER,
     Contents,
     undamaged_contents,
 )
@@ -147,18 +147,18 @@ class Session(SessionView):
         data, _ = manifest.encode()
         require_free(place)
         with DiskErrors(place):
-            for folder in (place, place / FRAMES, place / ORPHANS):
+            for folder in (place, place / FRAMES_FOLDER, place / ORPHANS_FOLDER):
                 if not folder.is_dir():
                     disk.make_dir(folder)
-            if not (place / JOURNAL).exists():
-                write_new(disk, place / JOURNAL, b"")
+            if not (place / JOURNAL_FILE).exists():
+                write_new(disk, place / JOURNAL_FILE, b"")
             # a session exists from the moment its manifest has its name, so that comes last
-            part = place / f"{MANIFEST}.part"
+            part = place / f"{MANIFEST_FILE}.part"
             if part.exists():
                 disk.remove(part)
             write_new(disk, part, data)
             disk.fsync_dir(place)
-            disk.rename(part, place / MANIFEST)
+            disk.rename(part, place / MANIFEST_FILE)
             disk.fsync_dir(place)
             disk.fsync_dir(place.resolve().parent)
         return cls.resume(place, disk=disk)
@@ -197,7 +197,7 @@ class Session(SessionView):
         place = Path(path)
         undamaged_contents(place)
         with DiskErrors(place):
-            descriptor = disk.open_append(place / JOURNAL)
+            descriptor = disk.open_append(place / JOURNAL_FILE)
         try:
             if not disk.lock(descriptor):
                 what = "another process is writing this session"
@@ -208,7 +208,7 @@ class Session(SessionView):
                 raise SessionError("the session is closed", where=str(place), advice=advice)
             with DiskErrors(place):
                 if contents.walk.torn:
-                    _log.warning("%s: cut %d torn bytes", place / JOURNAL, contents.walk.torn)
+                    _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
                     disk.fdatasync(descriptor)
                 set_orphans_aside(disk, place, contents)
@@ -378,7 +378,7 @@ class Session(SessionView):
             with DiskErrors(self.path):
                 if isinstance(line, AttachmentLine) and not self._attached:
                     if not target.parent.is_dir():
-                        self._disk.make_dir(self.path / ATTACHMENTS)
+                        self._disk.make_dir(self.path / ATTACHMENTS_FOLDER)
                     self._disk.fsync_dir(self.path)
                 write_new(self._disk, part, blob)
                 self._disk.rename(part, target)

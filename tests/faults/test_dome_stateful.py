@@ -20,7 +20,12 @@ from hypothesis.stateful import run_state_machine_as_test as run_machine
 from capture.devices.port import BoxRebooted, CommandRefused, Port, PortTimeout
 from capture.devices.wire import Code
 from capture.plan.eye_light import eye_light
-from capture.plan.flicker import FLASH_SHARE, SAMPLE_S, count_flashes, fused
+from capture.plan.flicker import (
+    EYE_SAMPLE_S,
+    MIN_FLASH_CHANGE,
+    average_over_flicker_fusion,
+    count_flashes,
+)
 from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.dome import DomeUnit
@@ -181,14 +186,14 @@ class NoisyDome(RuleBasedStateMachine):
             return
         recent = [p for p in pulses if p.t_off_s > pulses[-1].t_off_s - 4.0]
         start = min(p.t_on_s for p in recent) - 0.2
-        edges = np.arange(start, pulses[-1].t_off_s + 0.2, SAMPLE_S)
+        edges = np.arange(start, pulses[-1].t_off_s + 0.2, EYE_SAMPLE_S)
         signal = np.zeros(edges.size)
         for p in recent:
             signal[(edges >= p.t_on_s) & (edges < p.t_off_s)] += WEIGHTS[p.led] * p.level
-        seen = fused(signal)
+        seen = average_over_flicker_fusion(signal)
         if seen.max() > 0.0:
             # the box judges a change by the brightest of the last second, this by all of them
-            flashes = count_flashes(seen, least=2.0 * FLASH_SHARE * WEIGHTS.max())
+            flashes = count_flashes(seen, least=2.0 * MIN_FLASH_CHANGE * WEIGHTS.max())
             assert flashes < RIG.leds.max_flashes_per_s + 0.5
 
 

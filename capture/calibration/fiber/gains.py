@@ -13,8 +13,8 @@ import numpy as np
 from capture.arrays import BoolArray, Float64Array, FloatArray
 from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk, no_crosstalk
 from capture.calibration.fiber.phantom import ExpectedReflectance
-from capture.calibration.fiber.readings import FibreReadings
-from capture.calibration.fiber.spots import FibreSpots
+from capture.calibration.fiber.readings import FiberReadings
+from capture.calibration.fiber.spots import FiberSpots
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
@@ -27,21 +27,21 @@ from capture.calibration.store import load
 from capture.calibration.validity import require
 from capture.rig import Rig
 
-__all__ = ["FibreCalibration", "FibreError", "FibreReflectance", "calibrate_fibres"]
+__all__ = ["FiberCalibration", "FiberError", "FiberReflectance", "calibrate_fibers"]
 
 
-DEAD_SHARE: Final = 0.05
+DEAD_FIBER_GAIN: Final = 0.05
 """Of the usual gain: a fibre that surely gives less is dead."""
-LEAST_SIGMAS: Final = 3.0
+MIN_GAIN_SIGMAS: Final = 3.0
 """Of a gain over its standard error."""
 
 
-class FibreError(CalibrationError):
+class FiberError(CalibrationError):
     """Readings that a fibre probe cannot be calibrated from, or that are not this probe's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FibreReflectance:
+class FiberReflectance:
     """Reflectance in each fibre, with what its errors have in common kept apart.
 
     Attributes
@@ -86,12 +86,12 @@ class FibreReflectance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FibreCalibration:
+class FiberCalibration:
     """Gains, cross-talk and stray light of a fibre probe.
 
     Attributes
     ----------
-    spots : FibreSpots
+    spots : FiberSpots
         Where the fibres end in the image, and their names.
     radius_mm : ndarray of float64, shape (F,)
         Distance of each fibre from the source.
@@ -110,7 +110,7 @@ class FibreCalibration:
         Fibres that give no light.
     """
 
-    spots: FibreSpots
+    spots: FiberSpots
     radius_mm: Float64Array
     gain: Float64Array
     gain_stderr: Float64Array
@@ -144,23 +144,23 @@ class FibreCalibration:
         """Of the fibres."""
         return self.spots.names
 
-    def reflectance(self, readings: FibreReadings, *, level: float = 1.0) -> FibreReflectance:
+    def reflectance(self, readings: FiberReadings, *, level: float = 1.0) -> FiberReflectance:
         """Return the reflectance in each fibre.
 
         Parameters
         ----------
-        readings : FibreReadings
+        readings : FiberReadings
             Of this probe, by the same apertures.
         level : float
             Of the source, 0 < level <= 1.
 
         Returns
         -------
-        FibreReflectance
+        FiberReflectance
 
         Raises
         ------
-        FibreError
+        FiberError
             Where the readings are of other fibres or colors.
 
         Notes
@@ -169,13 +169,13 @@ class FibreCalibration:
         light is guessed from theirs, with an error as large as the guess.
         """
         if readings.names != self.names or readings.signal.shape != self.gain.shape:
-            raise FibreError(
+            raise FiberError(
                 f"readings: got {len(readings.names)} fibres from {readings.names[:1]} in"
                 f" {readings.signal.shape[-1]} colors, expected those of the calibration,"
                 f" {len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}"
             )
         if not 0 < level <= 1:
-            raise FibreError(f"level: got {level}, expected 0 < level <= 1")
+            raise FiberError(f"level: got {level}, expected 0 < level <= 1")
         signal, variance, told = _guessed(readings)
         light, spread = self.crosstalk.unmix(signal / level, variance / level**2)
         valid = np.asarray(readings.valid & self.valid & told, np.bool_)
@@ -189,7 +189,7 @@ class FibreCalibration:
         # weighed as if each fibre's own, and once more as what moves all far fibres together
         mixed = self.crosstalk.shared_changes(light, self.light, ratio) / gain
         common = np.concatenate([value * self.common, stray[None], mixed])
-        return FibreReflectance(
+        return FiberReflectance(
             self.names,
             self.radius_mm,
             value,
@@ -200,7 +200,7 @@ class FibreCalibration:
             self._reasons(readings),
         )
 
-    def _reasons(self, readings: FibreReadings) -> dict[str, str]:
+    def _reasons(self, readings: FiberReadings) -> dict[str, str]:
         reasons = {}
         for i, name in enumerate(self.names):
             if self.dead[i]:
@@ -277,7 +277,7 @@ class FibreCalibration:
         )
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FibreCalibration:
+    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FiberCalibration:
         """Return the calibrated probe of a rig, in the rig's order.
 
         Raises
@@ -306,7 +306,7 @@ class FibreCalibration:
 
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
         return cls(
-            FibreSpots(
+            FiberSpots(
                 names,
                 value("spot_px"),
                 stderr("spot_px"),
@@ -340,7 +340,7 @@ class FibreCalibration:
     @classmethod
     def load(
         cls, folder: str | Path, rig: Rig, *, view: str = "cam", on: date | None = None
-    ) -> FibreCalibration:
+    ) -> FiberCalibration:
         """Return the calibrated probe of a rig from a CALIBRATION/ folder.
 
         Parameters
@@ -366,25 +366,25 @@ class FibreCalibration:
         return cls.from_calibration(found, rig, serial)
 
 
-def calibrate_fibres(
-    phantom: FibreReadings,
-    masks: Mapping[int, FibreReadings],
+def calibrate_fibers(
+    phantom: FiberReadings,
+    masks: Mapping[int, FiberReadings],
     *,
-    spots: FibreSpots,
+    spots: FiberSpots,
     radius_mm: FloatArray | tuple[float, ...],
     expected: ExpectedReflectance,
     level: float = 1.0,
-) -> FibreCalibration:
+) -> FiberCalibration:
     """Calibrate a probe from its readings of a phantom of known optics.
 
     Parameters
     ----------
-    phantom : FibreReadings
+    phantom : FiberReadings
         All fibres uncovered.
-    masks : mapping of int to FibreReadings
+    masks : mapping of int to FiberReadings
         One fibre uncovered, by its number, on the same phantom; empty: cross-talk and stray light
         are taken to be none.
-    spots : FibreSpots
+    spots : FiberSpots
         The apertures of all readings.
     radius_mm : array_like, shape (F,)
         Distance of each fibre from the source.
@@ -395,41 +395,41 @@ def calibrate_fibres(
 
     Returns
     -------
-    FibreCalibration
+    FiberCalibration
 
     Raises
     ------
-    FibreError
+    FiberError
         Where the shapes do not fit, or no fibre gives light.
     """
     count, colors = phantom.signal.shape
     if expected.per_mm2.shape != (count, colors) or len(spots.names) != count:
-        raise FibreError(
+        raise FiberError(
             f"expected reflectance: got shape {expected.per_mm2.shape} and {len(spots.names)}"
             f" spots, expected those of the readings, {(count, colors)}"
         )
     if not 0 < level <= 1:
-        raise FibreError(f"level: got {level}, expected 0 < level <= 1")
+        raise FiberError(f"level: got {level}, expected 0 < level <= 1")
     mixed = measure_crosstalk(masks, phantom) if masks else no_crosstalk(count, colors)
     signal, variance, told = _guessed(phantom)
     light, spread = mixed.unmix(signal, variance)
     doubt = mixed.matrix_variance(light, light, np.zeros_like(light))
     error = np.sqrt(spread + doubt + mixed.offset_common**2)
     gain = light / expected.per_mm2
-    bright = np.asarray(phantom.valid & told & (light > LEAST_SIGMAS * error), np.bool_)
+    bright = np.asarray(phantom.valid & told & (light > MIN_GAIN_SIGMAS * error), np.bool_)
     usual = np.array([np.median(g[b]) if b.any() else 0.0 for g, b in zip(gain.T, bright.T)])  # noqa: B905
     if phantom.saturated.all():
-        raise FibreError(
+        raise FiberError(
             "phantom: all fibres are saturated in every exposure; take shorter ones, or a lower"
             " level of the source"
         )
     if not (usual > 0).any():
-        raise FibreError(
+        raise FiberError(
             "phantom: no fibre gives light; check the source, its shutter, the head's contact with"
             " the phantom, and the exposures"
         )
-    most = (light + LEAST_SIGMAS * error) / expected.per_mm2
-    dim = np.asarray(phantom.valid & (most < DEAD_SHARE * usual), np.bool_)
+    most = (light + MIN_GAIN_SIGMAS * error) / expected.per_mm2
+    dim = np.asarray(phantom.valid & (most < DEAD_FIBER_GAIN * usual), np.bool_)
     dead = np.asarray(dim.any(axis=1) & ~bright.any(axis=1), np.bool_)
     valid = np.asarray(bright & spots.found.reshape(-1, 1), np.bool_)
     relative = np.hypot(
@@ -445,7 +445,7 @@ def calibrate_fibres(
         mixed.cover_leak,
         mixed.cover_leak_stderr,
     )
-    return FibreCalibration(
+    return FiberCalibration(
         spots,
         np.asarray(radius_mm, np.float64),
         np.where(valid, gain / level, 0.0),
@@ -458,7 +458,7 @@ def calibrate_fibres(
     )
 
 
-def _guessed(readings: FibreReadings) -> tuple[Float64Array, Float64Array, BoolArray]:
+def _guessed(readings: FiberReadings) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return signal and variance, those of fibres that are not valid guessed from the next ones.
 
     And in which colors that can be done, shape (C,): where all are saturated nothing is known of

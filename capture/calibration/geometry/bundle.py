@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import LEAST_CORNERS, Board, Sighting
+from capture.calibration.geometry.board import MIN_BOARD_CORNERS, Board, Sighting
 from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
 
 __all__ = [
-    "BoardPlace",
+    "BoardPose",
     "Bundle",
     "BundleError",
     "LensPrior",
@@ -37,12 +37,12 @@ __all__ = [
 Gauge: TypeAlias = Literal["board", "cameras"]
 Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
 
-CAMERA, LENS, PLACE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
-HUBER = 2.5  # robust sigmas beyond which a corner counts less
-MAX_STEPS = 100
-STOP = 1e-10  # relative decrease of the cost
-LEAST_SIGMA_PX = 1e-9
-LEAST_SHARED = 2  # places that a camera must share with others
+N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
+HUBER_SIGMAS = 2.5  # robust sigmas beyond which a corner counts less
+MAX_BUNDLE_STEPS = 100
+COST_TOL = 1e-10  # relative decrease of the cost
+MIN_SIGMA_PX = 1e-9
+MIN_SHARED_POSES = 2  # places that a camera must share with others
 
 
 class Target(Protocol):
@@ -98,7 +98,7 @@ class LensPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BoardPlace:
+class BoardPose:
     """Where a board stood: ``x_rig = rotation x_board + translation_mm``."""
 
     rotation: Float64Array
@@ -109,7 +109,7 @@ class BoardPlace:
         return points_mm @ self.rotation.T + self.translation_mm
 
     @classmethod
-    def in_jig(cls, board: Board) -> BoardPlace:
+    def in_jig(cls, board: Board) -> BoardPose:
         """Return the jig's place: the board's middle in the rig's origin, its front towards +z."""
         width, height = board.size_mm
         rotation = np.diag([1.0, -1.0, -1.0])
@@ -124,7 +124,7 @@ class Bundle:
     ----------
     cameras : dict of str to CameraPose
         By view name, with standard errors.
-    places : dict of int to BoardPlace
+    places : dict of int to BoardPose
         By pose number.
     rms_px : dict of str to float
         Root mean square distance of a camera's corners to where the fit puts them.
@@ -139,7 +139,7 @@ class Bundle:
     """
 
     cameras: dict[str, CameraPose]
-    places: dict[int, BoardPlace]
+    places: dict[int, BoardPose]
     rms_px: dict[str, float]
     sigma_px: float
     corners: dict[str, int]
@@ -165,7 +165,7 @@ def adjust(
     start : mapping of str to CameraPose
         Nominal or earlier cameras, by view name; those without sightings are named in an error.
     gauge : {"board", "cameras"}
-        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPlace.in_jig`), or the
+        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
         nominal cameras' centres, which the result is moved onto as a rigid body.
     prior : LensPrior, optional
         What is known of the lenses.
@@ -190,7 +190,7 @@ def adjust(
         for pose in sorted({pose for _, pose in sightings})
     }
     if gauge == "board":
-        to_jig = _between(places[0], BoardPlace.in_jig(board))
+        to_jig = _between(places[0], BoardPose.in_jig(board))
         places = {pose: _moved_place(place, *to_jig) for pose, place in places.items()}
         cameras = {name: _moved_camera(camera, *to_jig) for name, camera in start.items()}
     else:
@@ -209,7 +209,7 @@ def adjust(
 
 def place_board(
     sightings: Sightings, board: Target, cameras: Mapping[str, CameraPose], pose: int
-) -> BoardPlace:
+) -> BoardPose:
     """Return where the board stood, from all its images, with the cameras as given.
 
     Each image alone gives a guess; the one that suits all images best is refined on all of them.
@@ -220,7 +220,7 @@ def place_board(
         If no image of that pose fits.
     """
     seen = {name: s for (name, number), s in sightings.items() if number == pose}
-    best: tuple[float, BoardPlace] | None = None
+    best: tuple[float, BoardPose] | None = None
     for name, sighting in seen.items():
         camera = cameras[name]
         points = board.points_mm[sighting.ids]
@@ -229,7 +229,7 @@ def place_board(
         )
         for turn, shift in zip(turns, shifts, strict=True) if solved else ():
             local = Rotation.from_rotvec(np.ravel(turn)).as_matrix()
-            place = BoardPlace(
+            place = BoardPose(
                 camera.rotation.T @ local,
                 camera.rotation.T @ (np.ravel(shift) - camera.translation_mm),
             )
@@ -253,7 +253,7 @@ def place_board(
 
 
 def gaps_px(
-    camera: CameraPose, place: BoardPlace, board: Target, sighting: Sighting
+    camera: CameraPose, place: BoardPose, board: Target, sighting: Sighting
 ) -> Float64Array:
     """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
     found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
@@ -269,10 +269,10 @@ def _check_shared(sightings: Sightings, cameras: Mapping[str, CameraPose], gauge
     count = {p: sum(p in seen for seen in poses.values()) for seen in poses.values() for p in seen}
     for name, seen in poses.items():
         shared = sum(count[p] > 1 for p in seen) if len(cameras) > 1 else len(seen)
-        if shared < LEAST_SHARED:
+        if shared < MIN_SHARED_POSES:
             raise BundleError(
                 f"camera {name}: shares {shared} board poses with other cameras (it saw"
-                f" {len(seen)}), expected at least {LEAST_SHARED}; show the board where it and"
+                f" {len(seen)}), expected at least {MIN_SHARED_POSES}; show the board where it and"
                 " another camera see it, tilted between them"
             )
     if gauge == "board" and not count.get(0, 0):
@@ -305,38 +305,40 @@ class _Problem:
         *,
         cameras_fixed: bool = False,
     ) -> None:
-        self.images = {k: s for k, s in sorted(sightings.items()) if len(s.ids) >= LEAST_CORNERS}
+        self.images = {
+            k: s for k, s in sorted(sightings.items()) if len(s.ids) >= MIN_BOARD_CORNERS
+        }
         self.board = board
         self.names = sorted({name for name, _ in self.images})
         self.poses = sorted({pose for _, pose in self.images})
         self.start = start
         self.gauge = gauge
         self.sigmas = {name: prior.sigmas(start[name]) for name in self.names}
-        free = np.zeros(len(self.names) * CAMERA + len(self.poses) * PLACE, bool)
+        free = np.zeros(len(self.names) * N_CAMERA + len(self.poses) * N_POSE, bool)
         if not cameras_fixed:
             for i, name in enumerate(self.names):
-                free[i * CAMERA : i * CAMERA + LENS] = self.sigmas[name] > 0
-                free[i * CAMERA + LENS : (i + 1) * CAMERA] = True
-        free[len(self.names) * CAMERA :] = True
+                free[i * N_CAMERA : i * N_CAMERA + N_LENS] = self.sigmas[name] > 0
+                free[i * N_CAMERA + N_LENS : (i + 1) * N_CAMERA] = True
+        free[len(self.names) * N_CAMERA :] = True
         if gauge == "board":
-            at = len(self.names) * CAMERA + self.poses.index(0) * PLACE
-            free[at : at + PLACE] = False
+            at = len(self.names) * N_CAMERA + self.poses.index(0) * N_POSE
+            free[at : at + N_POSE] = False
         self.free = np.nonzero(free)[0]
         self.cameras_fixed = cameras_fixed
 
     def solve(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPlace]
-    ) -> tuple[dict[str, CameraPose], dict[int, BoardPlace]]:
+        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose]
+    ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         """Run Levenberg's method with Huber's weights; the scale is taken anew at each step."""
         cameras, places = dict(cameras), dict(places)
         damping = 1e-3
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_BUNDLE_STEPS):
             residuals = self._residuals(cameras, places)
             sigma = self._sigma(residuals)
             cost = self._cost(residuals, cameras, sigma)
             H, g = self._equations(cameras, places, residuals, sigma)
             while True:
-                step = np.zeros(len(self.names) * CAMERA + len(self.poses) * PLACE)
+                step = np.zeros(len(self.names) * N_CAMERA + len(self.poses) * N_POSE)
                 damped = H + damping * np.diag(np.diag(H))
                 step[self.free] = cho_solve(cho_factor(damped), -g)
                 trial = self._stepped(cameras, places, step)
@@ -349,30 +351,30 @@ class _Problem:
                 break
             cameras, places = trial
             damping = max(damping / 10.0, 1e-12)
-            if cost - new < STOP * max(cost, 1e-300):
+            if cost - new < COST_TOL * max(cost, 1e-300):
                 break
         else:
             raise BundleError(
-                f"bundle adjustment: still moving after {MAX_STEPS} steps; show more poses of the"
-                " board, tilted more"
+                f"bundle adjustment: still moving after {MAX_BUNDLE_STEPS} steps; show more"
+                " poses of the board, tilted more"
             )
         return cameras, places
 
-    def judged(self, cameras: dict[str, CameraPose], places: dict[int, BoardPlace]) -> Bundle:
+    def judged(self, cameras: dict[str, CameraPose], places: dict[int, BoardPose]) -> Bundle:
         """Return the solution with standard errors in the gauge."""
         residuals = self._residuals(cameras, places)
         sigma = self._sigma(residuals)
         weights = {key: _huber(r, sigma) for key, r in residuals.items()}
         square = sum(float((weights[k][:, None] * r**2).sum()) for k, r in residuals.items())
         count = 2.0 * sum(float(w.sum()) for w in weights.values())
-        unknown = len(self.free) - (PLACE if self.gauge == "cameras" else 0)
+        unknown = len(self.free) - (N_POSE if self.gauge == "cameras" else 0)
         noise = float(np.sqrt(square / max(count - unknown, 1.0)))
-        H, _ = self._equations(cameras, places, residuals, max(noise, LEAST_SIGMA_PX))
-        covariance = np.zeros((len(self.names) * CAMERA + len(self.poses) * PLACE,) * 2)
+        H, _ = self._equations(cameras, places, residuals, max(noise, MIN_SIGMA_PX))
+        covariance = np.zeros((len(self.names) * N_CAMERA + len(self.poses) * N_POSE,) * 2)
         covariance[np.ix_(self.free, self.free)] = self._inverse(H, cameras)
         found, centers = {}, {}
         for i, name in enumerate(self.names):
-            block = covariance[i * CAMERA : (i + 1) * CAMERA, i * CAMERA : (i + 1) * CAMERA]
+            block = covariance[i * N_CAMERA : (i + 1) * N_CAMERA, i * N_CAMERA : (i + 1) * N_CAMERA]
             camera = cameras[name]
             errors = np.sqrt(np.clip(np.diag(block), 0.0, None))
             matrix = np.zeros((3, 3))
@@ -385,7 +387,7 @@ class _Problem:
                 translation_stderr_mm=errors[12:15],
             )
             to_center = np.hstack(_center_derivative(camera))
-            centers[name] = to_center @ block[LENS:, LENS:] @ to_center.T
+            centers[name] = to_center @ block[N_LENS:, N_LENS:] @ to_center.T
         rms, corners = {}, {}
         for name in self.names:
             mine = np.concatenate([r for (n, _), r in residuals.items() if n == name])
@@ -402,18 +404,18 @@ class _Problem:
         """Return the covariance; with free frame, that of the frame fixed by the centres."""
         if self.gauge == "board" or self.cameras_fixed:
             return np.asarray(np.linalg.inv(H))
-        total = len(self.names) * CAMERA + len(self.poses) * PLACE
-        B = np.zeros((PLACE, total))  # sum of shifts, sum of moments of the centres
+        total = len(self.names) * N_CAMERA + len(self.poses) * N_POSE
+        B = np.zeros((N_POSE, total))  # sum of shifts, sum of moments of the centres
         middle = np.mean([cameras[name].center_mm for name in self.names], axis=0)
         for i, name in enumerate(self.names):
             to_center = np.hstack(_center_derivative(cameras[name]))
             arm = _cross_matrix(cameras[name].center_mm - middle)
-            B[:3, i * CAMERA + LENS : (i + 1) * CAMERA] = to_center
-            B[3:, i * CAMERA + LENS : (i + 1) * CAMERA] = arm @ to_center
+            B[:3, i * N_CAMERA + N_LENS : (i + 1) * N_CAMERA] = to_center
+            B[3:, i * N_CAMERA + N_LENS : (i + 1) * N_CAMERA] = arm @ to_center
         B = B[:, self.free]
         n = len(self.free)
         scale = np.sqrt(np.diag(H))
-        bordered = np.zeros((n + PLACE, n + PLACE))
+        bordered = np.zeros((n + N_POSE, n + N_POSE))
         bordered[:n, :n] = H / np.outer(scale, scale)
         B = B / scale
         B /= np.linalg.norm(B, axis=1, keepdims=True)
@@ -422,7 +424,7 @@ class _Problem:
         return np.asarray(inverse / np.outer(scale, scale))
 
     def _residuals(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPlace]
+        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose]
     ) -> dict[tuple[str, int], Float64Array]:
         out = {}
         for (name, pose), s in self.images.items():
@@ -434,7 +436,7 @@ class _Problem:
     def _sigma(residuals: Mapping[tuple[str, int], Float64Array]) -> float:
         """Return the noise by the median of the absolute residuals."""
         every = np.abs(np.concatenate(list(residuals.values()))).ravel()
-        return max(1.4826 * float(np.median(every)), LEAST_SIGMA_PX)
+        return max(1.4826 * float(np.median(every)), MIN_SIGMA_PX)
 
     def _cost(
         self,
@@ -445,7 +447,9 @@ class _Problem:
         total = 0.0
         for r in residuals.values():
             z = np.linalg.norm(r, axis=1) / sigma
-            total += float(np.where(z <= HUBER, z**2, 2 * HUBER * z - HUBER**2).sum())
+            total += float(
+                np.where(z <= HUBER_SIGMAS, z**2, 2 * HUBER_SIGMAS * z - HUBER_SIGMAS**2).sum()
+            )
         for name in () if self.cameras_fixed else self.names:
             total += float((self._lens_pull(name, cameras[name]) ** 2).sum())
         return total
@@ -454,18 +458,18 @@ class _Problem:
         """Return how far a lens is from its prior, in standard deviations; 0 where fixed."""
         sigmas = self.sigmas[name]
         gap = _lens(camera) - _lens(self.start[name])
-        return np.divide(gap, sigmas, out=np.zeros(LENS), where=sigmas > 0)
+        return np.divide(gap, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
 
     def _equations(
         self,
         cameras: Mapping[str, CameraPose],
-        places: Mapping[int, BoardPlace],
+        places: Mapping[int, BoardPose],
         residuals: Mapping[tuple[str, int], Float64Array],
         sigma: float,
     ) -> tuple[Float64Array, Float64Array]:
         """Return the normal matrix and the gradient of half the cost, free numbers only."""
-        first = len(self.names) * CAMERA
-        total = first + len(self.poses) * PLACE
+        first = len(self.names) * N_CAMERA
+        total = first + len(self.poses) * N_POSE
         H, g = np.zeros((total, total)), np.zeros(total)
         for (name, pose), sighting in self.images.items():
             of_camera, of_place = _derivatives(
@@ -473,9 +477,9 @@ class _Problem:
             )
             r = residuals[name, pose]
             w = np.repeat(_huber(r, sigma), 2) / sigma**2
-            i, j = self.names.index(name) * CAMERA, first + self.poses.index(pose) * PLACE
-            A, B, rows = of_camera.reshape(-1, CAMERA), of_place.reshape(-1, PLACE), r.ravel()
-            at, to = slice(i, i + CAMERA), slice(j, j + PLACE)
+            i, j = self.names.index(name) * N_CAMERA, first + self.poses.index(pose) * N_POSE
+            A, B, rows = of_camera.reshape(-1, N_CAMERA), of_place.reshape(-1, N_POSE), r.ravel()
+            at, to = slice(i, i + N_CAMERA), slice(j, j + N_POSE)
             H[to, to] += (B * w[:, None]).T @ B
             g[to] += B.T @ (w * rows)
             if not self.cameras_fixed:
@@ -483,23 +487,20 @@ class _Problem:
                 H[at, to] += (A * w[:, None]).T @ B
                 g[at] += A.T @ (w * rows)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
-            lens = np.arange(i * CAMERA, i * CAMERA + LENS)
+            lens = np.arange(i * N_CAMERA, i * N_CAMERA + N_LENS)
             sigmas = self.sigmas[name]
-            inverse = np.divide(1.0, sigmas, out=np.zeros(LENS), where=sigmas > 0)
+            inverse = np.divide(1.0, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
             H[lens, lens] += inverse**2
             g[lens] += inverse * self._lens_pull(name, cameras[name])
         H[first:, :first] = H[:first, first:].T
         return H[np.ix_(self.free, self.free)], g[self.free]
 
     def _stepped(
-        self,
-        cameras: Mapping[str, CameraPose],
-        places: Mapping[int, BoardPlace],
-        step: Float64Array,
-    ) -> tuple[dict[str, CameraPose], dict[int, BoardPlace]]:
+        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose], step: Float64Array
+    ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         new_cameras, new_places = dict(cameras), dict(places)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
-            d = step[i * CAMERA : (i + 1) * CAMERA]
+            d = step[i * N_CAMERA : (i + 1) * N_CAMERA]
             camera = cameras[name]
             matrix = camera.matrix.copy()
             matrix[0, 0] += d[0]
@@ -513,17 +514,17 @@ class _Problem:
                 rotation=_turned(camera.rotation, d[9:12]),
                 translation_mm=camera.translation_mm + d[12:15],
             )
-        first = len(self.names) * CAMERA
+        first = len(self.names) * N_CAMERA
         for j, pose in enumerate(self.poses):
-            d = step[first + j * PLACE : first + (j + 1) * PLACE]
-            new_places[pose] = BoardPlace(
+            d = step[first + j * N_POSE : first + (j + 1) * N_POSE]
+            new_places[pose] = BoardPose(
                 _turned(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
             )
         return new_cameras, new_places
 
 
 def _derivatives(
-    camera: CameraPose, place: BoardPlace, points_mm: Float64Array
+    camera: CameraPose, place: BoardPose, points_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d place, shape (n, 2, 6)."""
     on_board = points_mm @ place.rotation.T
@@ -547,7 +548,7 @@ def _derivatives(
     P[:, 0, 0] = P[:, 1, 1] = 1 / z
     P[:, 0, 2], P[:, 1, 2] = -a / z, -b / z
     to_pixel = (focal[:, None] * D) @ P
-    of_camera = np.zeros((len(a), 2, CAMERA))
+    of_camera = np.zeros((len(a), 2, N_CAMERA))
     bent = distort(np.stack([a, b], axis=-1), camera.distortion)
     of_camera[:, 0, 0], of_camera[:, 1, 1] = bent.T
     of_camera[:, 0, 2] = of_camera[:, 1, 3] = 1.0
@@ -592,17 +593,17 @@ def _lens(camera: CameraPose) -> Float64Array:
 
 def _huber(residual: Float64Array, sigma: float) -> Float64Array:
     z = np.linalg.norm(residual, axis=1) / sigma
-    return np.asarray(np.where(z > HUBER, HUBER / np.maximum(z, HUBER), 1.0))
+    return np.asarray(np.where(z > HUBER_SIGMAS, HUBER_SIGMAS / np.maximum(z, HUBER_SIGMAS), 1.0))
 
 
-def _between(a: BoardPlace, b: BoardPlace) -> tuple[Float64Array, Float64Array]:
+def _between(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Array]:
     """Return the rigid motion that takes place a to place b."""
     rotation = b.rotation @ a.rotation.T
     return rotation, b.translation_mm - rotation @ a.translation_mm
 
 
-def _moved_place(place: BoardPlace, rotation: Float64Array, shift: Float64Array) -> BoardPlace:
-    return BoardPlace(rotation @ place.rotation, rotation @ place.translation_mm + shift)
+def _moved_place(place: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
+    return BoardPose(rotation @ place.rotation, rotation @ place.translation_mm + shift)
 
 
 def _moved_camera(camera: CameraPose, rotation: Float64Array, shift: Float64Array) -> CameraPose:

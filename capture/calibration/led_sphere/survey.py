@@ -10,7 +10,7 @@ import numpy as np
 
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.spot_photometry import (
-    RING,
+    RING_RADII,
     RateImage,
     Shot,
     measure_flux,
@@ -27,7 +27,7 @@ from capture.calibration.led_sphere.glass_ball import (
     find_spots,
     light_directions,
     locate_ball,
-    mirrored,
+    mirror_lights,
 )
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.led_sphere.polarization import FilmFit, fit_films, leakage
@@ -37,19 +37,21 @@ from capture.rig import Rig, View
 __all__ = ["GlassBall", "SphereSurvey", "survey_sphere"]
 
 
-MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
+SPOT_MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
 WAVELENGTH_MM = 5.5e-4
-FLOOR_PX = 0.03  # of a spot's middle, whatever its light: the pixels' own responses, the polish
-MIDDLE_PX = 0.1  # about how well middles are known, those of dim spots among them
-EXPOSURE_SHARE = 1e-3  # how well an exposure's light repeats
-RESPONSE_SHARE = 1e-3  # how well pixels' responses are known over a spot
-DEAD_SHARE = 0.05  # of the mean: a light dimmer than this is dead
-LEAST_CERTAIN = 0.3  # relative error above which an intensity is not called measured
-OFF_ANALYSER_DEG = 2.0
-OFF_AXIS_DEG = 3.0
-OFF_PLACE_SIGMAS = 5.0
-OFF_PLACE_DEG = 0.5
-STRAY_SHARE = 0.2  # of a usual spot's peak: fainter ones are reflections of spots, or their rings
+# of a spot's middle, whatever its light: the pixels' own responses, the polish
+MIN_CENTER_STDERR_PX = 0.03
+TYPICAL_CENTER_STDERR_PX = 0.1  # about how well middles are known, those of dim spots among them
+EXPOSURE_REPEATABILITY = 1e-3  # how well an exposure's light repeats
+PIXEL_RESPONSE_STDERR = 1e-3  # how well pixels' responses are known over a spot
+MAX_DEAD_INTENSITY = 0.05  # of the mean: a light dimmer than this is dead
+MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity is not called measured
+MAX_ANALYZER_OFFSET_DEG = 2.0
+MAX_POLARIZER_TURN_DEG = 3.0
+MAX_LIGHT_OFFSET_SIGMAS = 5.0
+MAX_LIGHT_OFFSET_DEG = 0.5
+# of a usual spot's peak: fainter ones are reflections of spots, or their rings
+STRAY_PEAK_RATIO = 0.2
 STRAY_MM = 0.4
 SKIN_ETA = 1.4
 
@@ -154,7 +156,7 @@ def survey_sphere(
     pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     distance = np.linalg.norm(place, axis=1)
-    about = mirrored(camera, np.array(what.center_mm), what.radius_mm, place)
+    about = mirror_lights(camera, np.array(what.center_mm), what.radius_mm, place)
     spot_mm = _spot_radius(about, camera, what, rig, view)
     aperture_px = np.maximum(spot_mm / pixel_mm, 2.5)
     total = _both_states(shots)
@@ -164,11 +166,15 @@ def survey_sphere(
     middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
     measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
     fit = _again(fit, spots, middle, measured, camera, place, what)
-    errors = np.hypot(np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, FLOOR_PX))
+    errors = np.hypot(
+        np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, MIN_CENTER_STDERR_PX)
+    )
     found = light_directions(camera, fit.ball, middle, errors, distance)
     direction = np.where(measured[:, None], found.direction, place / distance[:, None])
     stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
-    shown = mirrored(camera, fit.ball.center_mm, fit.ball.radius_mm, direction * distance[:, None])
+    shown = mirror_lights(
+        camera, fit.ball.center_mm, fit.ball.radius_mm, direction * distance[:, None]
+    )
     at = np.where(measured[:, None], middle, shown.pixels)
 
     glass = _reflection(rig, camera, view, what.eta, shown.to_light, shown.to_camera, direction)
@@ -180,13 +186,13 @@ def survey_sphere(
     films = _with_geometry(films, glass, what, np.linalg.norm(stderr, axis=1) / np.sqrt(2))
     intensity, intensity_stderr = _intensities(rig, camera, fit.ball, films, shown, direction)
     fluxed = _two_readings(readings, good)
-    lit = fluxed & measured & (intensity > DEAD_SHARE)
+    lit = fluxed & measured & (intensity > MAX_DEAD_INTENSITY)
     if not lit.any():
         raise BallError("ball: no light's spot could be measured; check exposures and focus")
     scale = float(intensity[lit].mean())
     intensity, intensity_stderr = intensity / scale, intensity_stderr / scale
-    certain = intensity_stderr < LEAST_CERTAIN * np.maximum(intensity, DEAD_SHARE)
-    dead = fluxed & (intensity + 2 * intensity_stderr < DEAD_SHARE)
+    certain = intensity_stderr < MAX_INTENSITY_STDERR * np.maximum(intensity, MAX_DEAD_INTENSITY)
+    dead = fluxed & (intensity + 2 * intensity_stderr < MAX_DEAD_INTENSITY)
     valid = dead | (fluxed & measured & certain)
     lights = SphereLightTable(
         tuple(light.name for light in rig.lights),
@@ -238,7 +244,7 @@ def _locate(
         radius_mm=what.radius_mm,
         radius_stderr_mm=what.radius_stderr_mm,
         depth_stderr_mm=what.depth_stderr_mm,
-        margin_mm=RING[1] * MARGIN_MM,
+        margin_mm=RING_RADII[1] * SPOT_MARGIN_MM,
         noise_px=noise_px,
         lit=lit,
     )
@@ -268,7 +274,7 @@ def _spot_radius(
     lamp_px = lamps * np.linalg.norm(shown.px_per_mm, ord=2, axis=(1, 2))
     pixel_mm = rig.view(view).distance_mm / float(camera.matrix[0, 0])
     wide = lamp_px * pixel_mm + cone * np.maximum(*defocus)
-    return np.asarray(0.5 * wide + MARGIN_MM)
+    return np.asarray(0.5 * wide + SPOT_MARGIN_MM)
 
 
 def _again(
@@ -283,7 +289,7 @@ def _again(
     """Return the ball by the spots' middles instead of their brightest pixels."""
     if not measured.any():
         raise BallError("ball: no spot lies whole within the image; centre the ball")
-    sharp = _locate(middle[measured], camera, place, what, measured, MIDDLE_PX)
+    sharp = _locate(middle[measured], camera, place, what, measured, TYPICAL_CENTER_STDERR_PX)
     return BallFit(sharp.ball, fit.spot, fit.in_field, fit.stray, sharp.light_scatter_mm)
 
 
@@ -338,7 +344,7 @@ def _fluxes(
         flux = measure_flux(shot, at, aperture_px=aperture_px)
         scale = 1.0 / (within * shot.amount_s)
         rate = flux.value * scale
-        variance = flux.variance * scale**2 + (EXPOSURE_SHARE * rate) ** 2
+        variance = flux.variance * scale**2 + (EXPOSURE_REPEATABILITY * rate) ** 2
         rows.append((rate, variance, flux.whole & ~flux.saturated))
         saturated &= flux.saturated
     rates, variances, good = (np.array(part) for part in zip(*rows, strict=True))
@@ -423,11 +429,13 @@ def _intensities(
     shares = []
     root = np.linalg.cholesky(ball.covariance_mm2 + 1e-18 * np.eye(4))
     for column in root.T:
-        other = mirrored(camera, ball.center_mm + column[:3], ball.radius_mm + column[3], place)
+        other = mirror_lights(
+            camera, ball.center_mm + column[:3], ball.radius_mm + column[3], place
+        )
         shares.append(np.log(other.magnification_px2 / shown.magnification_px2))
     known = np.array(shares)
     known -= known.mean(axis=1, keepdims=True)
-    common2 = np.sum(known**2, axis=0) + RESPONSE_SHARE**2
+    common2 = np.sum(known**2, axis=0) + PIXEL_RESPONSE_STDERR**2
     return value, np.sqrt((films.strength_stderr * per_strength) ** 2 + common2 * value**2)
 
 
@@ -509,18 +517,20 @@ def _findings(
     nominal = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.linalg.norm(lights.directions - nominal, axis=1)
     usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(place, axis=1)
-    far = lights.seen & (off > np.maximum(OFF_PLACE_SIGMAS * usual, np.radians(OFF_PLACE_DEG)))
+    far = lights.seen & (
+        off > np.maximum(MAX_LIGHT_OFFSET_SIGMAS * usual, np.radians(MAX_LIGHT_OFFSET_DEG))
+    )
     for k in np.flatnonzero(far):
         told.append(f"light {names[k]} stands {np.degrees(off[k]):.2f} degrees from its place")
     zero, error = np.degrees([films.zero_rad, films.zero_stderr_rad])
-    if abs(zero) > OFF_ANALYSER_DEG:
+    if abs(zero) > MAX_ANALYZER_OFFSET_DEG:
         told.append(
             f"the analyser stands {zero:+.2f} ± {error:.2f} degrees off its reading: crossed leaks"
             f" {100 * np.median(table.leakage):.1f} % of reflections; turn it back"
         )
     turn = np.degrees(table.axis_error_rad)
     turned = table.valid & (
-        np.abs(turn) > OFF_AXIS_DEG + 3 * np.degrees(table.axis_error_stderr_rad)
+        np.abs(turn) > MAX_POLARIZER_TURN_DEG + 3 * np.degrees(table.axis_error_stderr_rad)
     )
     for k in np.flatnonzero(turned):
         told.append(f"the polarizer of light {names[k]} is turned by {turn[k]:+.1f} degrees")
@@ -536,7 +546,7 @@ def _findings(
         bright = [
             k
             for k in fit.stray
-            if peak[k] > STRAY_SHARE * usual_peak
+            if peak[k] > STRAY_PEAK_RATIO * usual_peak
             and np.linalg.norm(own - spots[k], axis=1).min() > STRAY_MM / pixel_mm
         ]
         if bright:

@@ -21,7 +21,7 @@ from capture.calibration.record import CalibrationError
 
 __all__ = [
     "SphereError",
-    "SpherePlace",
+    "SpherePosition",
     "contour",
     "find_outline",
     "locate_sphere",
@@ -31,21 +31,22 @@ __all__ = [
 ]
 
 
-ANGLES = 180  # places on the outline where an edge is sought
-REACH = 0.12  # how far from the outline, of its radius, in the first search
-LEAST_REACH_PX = 3.0
+N_OUTLINE_ANGLES = 180  # places on the outline where an edge is sought
+EDGE_SEARCH_RADII = 0.12  # how far from the outline, of its radius, in the first search
+MIN_EDGE_SEARCH_PX = 3.0
 EDGE_STEP_PX = 0.25
 FINE_STEP_PX = 0.125
-FINE_REACH_PX = 1.5
+FINE_SEARCH_PX = 1.5
 FINE_WINDOW_PX = 9.0
 PIXEL_BLUR_PX = 0.5  # a pixel's square and the interpolation between pixels, as a Gaussian
-LEAST_EDGES = 30
-HUBER = 2.5
-GLARE = 1.15  # root of the brightest over the usual background along a line across the edge
-VOTES_STEP_PX = 2.0  # cells of the search for the sphere
-RADIUS_SIGMAS = 5.0
-STOP_RAD = 1e-12
-RADIUS_LIMIT = 0.002  # relative difference of the radius below which nothing is said
+MIN_OUTLINE_EDGES = 30
+HUBER_SIGMAS = 2.5
+# root of the brightest over the usual background along a line across the edge
+MAX_GLARE_RATIO = 1.15
+VOTE_CELL_PX = 2.0  # cells of the search for the sphere
+MAX_RADIUS_SIGMAS = 5.0
+REFLECTION_TOL_RAD = 1e-12
+MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius below which nothing is said
 
 
 class SphereError(CalibrationError):
@@ -53,7 +54,7 @@ class SphereError(CalibrationError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SpherePlace:
+class SpherePosition:
     """Where a sphere is.
 
     Attributes
@@ -107,16 +108,16 @@ def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> Float6
     direction = camera.rays(middle)
     range_mm = radius_mm / np.sin(np.arctan(radius_px / focal))
     center = camera.center_mm + range_mm * direction
-    reach = max(REACH * radius_px, LEAST_REACH_PX)
+    reach = max(EDGE_SEARCH_RADII * radius_px, MIN_EDGE_SEARCH_PX)
     for _ in range(3):
         edges = _edges(gray, camera, center, radius_mm, reach)
-        if len(edges) < LEAST_EDGES:
+        if len(edges) < MIN_OUTLINE_EDGES:
             return None
         center, sigma, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
-        reach = max(LEAST_REACH_PX, min(reach / 2, 8.0 * sigma))
+        reach = max(MIN_EDGE_SEARCH_PX, min(reach / 2, 8.0 * sigma))
     for _ in range(2):
         edges = _fine_edges(np.asarray(image, np.float64), camera, center, radius_mm)
-        if len(edges) < LEAST_EDGES:
+        if len(edges) < MIN_OUTLINE_EDGES:
             return None
         center, _, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
     return edges
@@ -128,7 +129,7 @@ def locate_sphere(
     radius_mm: float,
     *,
     check_radius: bool = True,
-) -> SpherePlace:
+) -> SpherePosition:
     """Locate one sphere from its outlines in one or several cameras.
 
     Parameters
@@ -143,7 +144,7 @@ def locate_sphere(
 
     Returns
     -------
-    SpherePlace
+    SpherePosition
 
     Raises
     ------
@@ -163,7 +164,9 @@ def locate_sphere(
         free_radius = float(free[3])
         free_stderr = float(free_sigma * np.sqrt(np.linalg.inv(free_H)[3, 3]))
         gap = abs(free_radius - radius_mm)
-        if check_radius and gap > max(RADIUS_SIGMAS * free_stderr, RADIUS_LIMIT * radius_mm):
+        if check_radius and gap > max(
+            MAX_RADIUS_SIGMAS * free_stderr, MAX_RADIUS_MISFIT * radius_mm
+        ):
             raise SphereError(
                 f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras say"
                 f" {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or calibrate the"
@@ -172,7 +175,7 @@ def locate_sphere(
     residual = np.concatenate(
         [_outline_px(cameras[n], edges, center, radius_mm) for n, edges in outlines.items()]
     )
-    return SpherePlace(
+    return SpherePosition(
         center[:3],
         radius_mm,
         np.asarray(sigma**2 * np.linalg.inv(H)),
@@ -277,7 +280,7 @@ def reflection_points(
         slope += (square - r * (light_n + r)) / (light_n**2 + light_t**2)
         newton = angle - miss / slope
         new = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-        done = np.abs(new - angle).max(initial=0.0) < STOP_RAD
+        done = np.abs(new - angle).max(initial=0.0) < REFLECTION_TOL_RAD
         angle = new
         if done:
             break
@@ -315,18 +318,18 @@ def _vote(gray: Float64Array, radii_px: list[float]) -> tuple[Float64Array, floa
     if not rows.size:
         return None
     ux, uy = gx[rows, columns] / size[rows, columns], gy[rows, columns] / size[rows, columns]
-    shape = tuple(int(n / VOTES_STEP_PX) + 1 for n in gray.shape)
+    shape = tuple(int(n / VOTE_CELL_PX) + 1 for n in gray.shape)
     best: tuple[float, Float64Array, float] | None = None
     for radius in radii_px:
-        x = ((columns - radius * ux) / VOTES_STEP_PX).astype(int)
-        y = ((rows - radius * uy) / VOTES_STEP_PX).astype(int)
+        x = ((columns - radius * ux) / VOTE_CELL_PX).astype(int)
+        y = ((rows - radius * uy) / VOTE_CELL_PX).astype(int)
         good = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
         votes = np.bincount(y[good] * shape[1] + x[good], minlength=shape[0] * shape[1])
         field = gaussian_filter(votes.reshape(shape).astype(float), max(0.03 * radius, 1.0))
         peak = int(np.argmax(field))
         if best is None or field.flat[peak] > best[0]:
             row, column = divmod(peak, shape[1])
-            middle = (np.array([column, row]) + 0.5) * VOTES_STEP_PX
+            middle = (np.array([column, row]) + 0.5) * VOTE_CELL_PX
             best = float(field.flat[peak]), middle, radius
     return (best[1], best[2]) if best is not None else None
 
@@ -355,7 +358,7 @@ def _edges(
     # edges much weaker than most are none, and lights near the rim or behind it make false ones
     strong = peak > 0.3 * np.median(peak[fine]) if fine.any() else fine
     background = np.median(lines[:, steps > 0])
-    dark = lines.max(axis=1) < GLARE * background
+    dark = lines.max(axis=1) < MAX_GLARE_RATIO * background
     return np.asarray(found[fine & inside & strong & dark])
 
 
@@ -376,7 +379,7 @@ def _fine_edges(
     steps = np.arange(-half, half + FINE_STEP_PX / 2, FINE_STEP_PX)
     places = outline[:, None] + steps[None, :, None] * outward[:, None]
     lines = map_coordinates(image, [places[..., 1], places[..., 0]], order=1, mode="nearest")
-    shifts = np.arange(-FINE_REACH_PX, FINE_REACH_PX + FINE_STEP_PX / 2, FINE_STEP_PX)
+    shifts = np.arange(-FINE_SEARCH_PX, FINE_SEARCH_PX + FINE_STEP_PX / 2, FINE_STEP_PX)
     power = np.stack(
         [np.sum((lines @ _edge_basis(steps, at)) ** 2, axis=1) for at in shifts], axis=1
     )
@@ -391,7 +394,7 @@ def _fine_edges(
     found = outline + offset[:, None] * outward
     outside, within = lines[:, steps > 1.5].mean(axis=1), lines[:, steps < -1.5].mean(axis=1)
     background = np.median(outside)
-    dark = lines.max(axis=1) < GLARE**2 * background
+    dark = lines.max(axis=1) < MAX_GLARE_RATIO**2 * background
     fine &= dark & (within < outside) & _in_image(found, image.shape, half)
     return np.asarray(found[fine])
 
@@ -418,7 +421,7 @@ def _outline(
     camera: CameraPose, center: Float64Array, radius_mm: float
 ) -> tuple[Float64Array, Float64Array]:
     """Return points of the expected outline, and unit vectors out of it."""
-    outline = contour(camera, center[:3], radius_mm, ANGLES)
+    outline = contour(camera, center[:3], radius_mm, N_OUTLINE_ANGLES)
     outward = outline - outline.mean(axis=0)
     return outline, outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
@@ -473,7 +476,7 @@ def _fit(
     for _ in range(30):
         r = residuals(sphere)
         sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
-        w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+        w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
         J = np.empty((len(r), len(sphere)))
         for k in range(len(sphere)):
             step = np.zeros(len(sphere))
@@ -485,6 +488,6 @@ def _fit(
         if np.linalg.norm(change) < 1e-7:
             break
     r = residuals(sphere)
-    w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+    w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
     noise = float(np.sqrt((w * r**2).sum() / max(w.sum() - len(sphere), 1.0)))
     return sphere, noise, H

@@ -22,12 +22,12 @@ def bent(camera, distortion=LENS):
 
 def boards_in_view(rng, count):
     """Places of the board around the origin; the first in the jig."""
-    places = {0: bundle.BoardPlace.in_jig(BOARD)}
+    places = {0: bundle.BoardPose.in_jig(BOARD)}
     for pose in range(1, count):
         turn = cv2.Rodrigues(rng.uniform(-0.7, 0.7, 3))[0]
         rotation = turn @ places[0].rotation
         middle = np.array([*np.array(BOARD.size_mm) / 2, 0.0])
-        places[pose] = bundle.BoardPlace(rotation, rng.uniform(-15, 15, 3) - rotation @ middle)
+        places[pose] = bundle.BoardPose(rotation, rng.uniform(-15, 15, 3) - rotation @ middle)
     return places
 
 

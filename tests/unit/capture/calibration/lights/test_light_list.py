@@ -8,7 +8,7 @@ from capture.calibration.geometry.intrinsics import CameraPose, nominal_cameras
 from capture.calibration.lights import light_fit, mirror_lights, mirror_sphere
 from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 from capture.calibration.lights.light_list import CameraResponse, LightTable
-from capture.calibration.lights.mirror_sphere import SphereError, SpherePlace
+from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.rig import load_rig
 
@@ -125,7 +125,7 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
     true = {name: place + rng.normal(0, 2.5, 3) for name, place in lights.items()}
     spheres, seen = {}, []
     for number, center in enumerate([[-85.0, 45, 30], [85.0, -45, -30], [0.0, 0, 20]]):
-        spheres[number] = SpherePlace(
+        spheres[number] = SpherePosition(
             np.array(center) + rng.normal(0, 0.01, 3),
             RADIUS_MM,
             1e-4 * np.eye(3),
