@@ -103,7 +103,7 @@ def _renderer() -> Finding:
 
 
 def _serial_ports() -> list[Finding]:
-    from capture.devices.port import serial_ports
+    from capture.devices.port_url import serial_ports
 
     ports = serial_ports()
     return [

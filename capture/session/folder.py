@@ -54,6 +54,36 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.close(descriptor)
 
 
+def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
+    """Make the folder of a session with an empty journal and its manifest.
+
+    Raises
+    ------
+    SessionError
+        Unless the folder is new, empty, or the debris of an interrupted creation.
+    """
+    require_free(path)
+    with DiskErrors(path):
+        for folder in (path, path / FRAMES_FOLDER, path / ORPHANS_FOLDER):
+            if not folder.is_dir():
+                disk.make_dir(folder)
+        if not (path / JOURNAL_FILE).exists():
+            write_new(disk, path / JOURNAL_FILE, b"")
+        write_manifest(disk, path, manifest)
+
+
+def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
+    """Write the manifest under its name, last: from that moment on the session exists."""
+    part = path / f"{MANIFEST_FILE}.part"
+    if part.exists():
+        disk.remove(part)
+    write_new(disk, part, manifest)
+    disk.fsync_dir(path)
+    disk.rename(part, path / MANIFEST_FILE)
+    disk.fsync_dir(path)
+    disk.fsync_dir(path.resolve().parent)
+
+
 def require_free(path: Path) -> None:
     """Raise unless the folder is new, empty, or the debris of an interrupted creation."""
     advice = "Choose a new folder, or resume the session that is there."

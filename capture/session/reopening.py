@@ -17,7 +17,7 @@ from capture.session.contents import (
 )
 from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionError
-from capture.session.folder import DiskErrors, require_free, write_new
+from capture.session.folder import DiskErrors, require_free, write_manifest, write_new
 from capture.session.frames import check_file
 from capture.session.journal import CloseLine
 from capture.session.store import Session
@@ -85,12 +85,5 @@ def reopen_copy(
         if (target / JOURNAL_FILE).exists():  # debris of an interrupted creation, empty
             disk.remove(target / JOURNAL_FILE)
         write_new(disk, target / JOURNAL_FILE, journal)
-        part = target / f"{MANIFEST_FILE}.part"
-        if part.exists():
-            disk.remove(part)
-        write_new(disk, part, manifest)
-        disk.fsync_dir(target)
-        disk.rename(part, target / MANIFEST_FILE)
-        disk.fsync_dir(target)
-        disk.fsync_dir(target.resolve().parent)
+        write_manifest(disk, target, manifest)
     return Session.resume(target, disk=disk), reason

@@ -13,9 +13,10 @@ import numpy as np
 
 from capture.calibration import sensor, store
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
-from capture.calibration.fiber.gains import FiberCalibration, calibrate_fibers
+from capture.calibration.fiber.gains import calibrate_fibers
 from capture.calibration.fiber.merge import MergedSeries, merge_series
 from capture.calibration.fiber.phantom import PhantomCertificate
+from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.calibration.fiber.readings import FiberReadings, sum_spots
 from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session

@@ -173,7 +173,7 @@ def _fitted(
     look: Sight, read: Sequence[Float64Array], places: Sequence[int], exposures: int, *, noise: bool
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
-    from capture.calibration.fiber.gains import FiberReflectance
+    from capture.calibration.fiber.probe_calibration import FiberReflectance
     from reconstruction.pipeline.probe.images import Measurement
     from reconstruction.pipeline.probe.stages import Profile, fit_profiles
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.calibration.fiber.gains import FiberCalibration
+from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.session import Session
 from rigsim.as_built.probe import build_probe
 from skinrig.cli import main

@@ -10,13 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capture.calibration.geometry.board import Board
-from capture.calibration.geometry.bundle import (
-    BoardPose,
-    BundleError,
-    Sightings,
-    gaps_px,
-    place_board,
-)
+from capture.calibration.geometry.board_pose import BoardPose, gaps_px
+from capture.calibration.geometry.bundle import place_board
+from capture.calibration.geometry.bundle_equations import BundleError, Sightings
 from capture.calibration.geometry.intrinsics import CameraPose
 
 __all__ = ["MovedCamera", "find_moved"]

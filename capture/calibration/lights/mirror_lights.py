@@ -18,14 +18,8 @@ from threadpoolctl import threadpool_limits
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.lights.mirror_sphere import (
-    SphereError,
-    SpherePosition,
-    contour,
-    reflect,
-    reflection_pixels,
-    reflection_points,
-)
+from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition, contour
+from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 
 __all__ = ["Highlights", "LightPositions", "SphereWindow", "find_highlights", "locate_lights"]
 

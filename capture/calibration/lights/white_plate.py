@@ -12,7 +12,7 @@ from scipy.ndimage import binary_erosion
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.geometry.board import Sighting, find_markers
-from capture.calibration.geometry.bundle import BoardPose
+from capture.calibration.geometry.board_pose import BoardPose
 
 __all__ = ["PlateSamples", "PlateWindow", "WhitePlate"]
 

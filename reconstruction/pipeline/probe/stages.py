@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from capture.calibration.fiber.darks import CameraNoise
-from capture.calibration.fiber.gains import FiberCalibration, FiberReflectance
+from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberReflectance
 from capture.calibration.fiber.readings import sum_spots
 from capture.calibration.sensor import SensorCalibration
 from capture.rig import Probe

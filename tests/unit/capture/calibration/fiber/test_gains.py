@@ -9,12 +9,13 @@ from scipy.stats import chi2
 
 from capture.calibration import store
 from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk
-from capture.calibration.fiber.gains import FiberCalibration, FiberError, calibrate_fibers
+from capture.calibration.fiber.gains import calibrate_fibers
 from capture.calibration.fiber.phantom import (
     CertificateError,
     ExpectedReflectance,
     read_certificate,
 )
+from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberError
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
 from capture.calibration.record import CalibrationMismatch

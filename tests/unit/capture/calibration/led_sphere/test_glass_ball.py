@@ -12,8 +12,8 @@ from capture.calibration.led_sphere.glass_ball import (
     find_spots,
     light_directions,
     locate_ball,
-    mirror_lights,
 )
+from capture.calibration.led_sphere.mirrored_lights import mirror_lights
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")

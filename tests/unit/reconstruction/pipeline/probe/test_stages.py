@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from capture.calibration.fiber.gains import FiberReflectance
+from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
 from model import photon_table
