@@ -21,12 +21,12 @@ from typing import Any, NoReturn, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+STRICT_CONFIG = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 _T = TypeVar("_T")
 
 # SI value of one unit, per quantity; two suffixes of one row can be converted into each other
-_UNITS: tuple[dict[str, float], ...] = (
+_SI_UNITS: tuple[dict[str, float], ...] = (
     {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0},
     {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0},
     {"deg": math.pi / 180.0, "rad": 1.0},
@@ -236,7 +236,7 @@ def near_miss(key: str, known: Iterable[str]) -> str:
 
 
 def _unit_factor(unit: str, wanted: str) -> float | None:
-    for row in _UNITS:
+    for row in _SI_UNITS:
         if unit in row and wanted in row:
             return row[unit] / row[wanted]
     return None

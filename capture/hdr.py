@@ -18,19 +18,19 @@ from capture.documents import Checks, InputError
 
 __all__ = ["BracketError", "Response", "merge", "merge_reference", "recover_response"]
 
-STEPS: Final = 1
+N_WEIGHTING_STEPS: Final = 1
 """Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
-_TILE: Final = 512
-_CHUNK: Final = 128
-_SMALL: Final = 1 << 17  # pixels
+_TILE_PIXELS: Final = 512
+_CHUNK_PIXELS: Final = 128
+_MAX_SERIAL_PIXELS: Final = 1 << 17  # pixels
 """Tiles that a thread takes at a time, so that one on a busy core holds up no other."""
-_FAST: Final = {"nsz", "arcp", "contract", "reassoc"}
+_FAST_MATH: Final = {"nsz", "arcp", "contract", "reassoc"}
 
-_EXACT: Final = 2.0**53
+_MAX_EXACT_INTEGER: Final = 2.0**53
 """Whole numbers below it are exact in float64."""
 
-_LEVELS: Final = 256
-_GROUPS: Final = 8
+_N_LEVELS: Final = 256
+_N_GROUPS: Final = 8
 
 Merged = tuple[Float32Array, Float32Array, BoolArray]
 
@@ -132,25 +132,25 @@ def recover_response(
     order = np.argsort(middle + rng.uniform(0, 1e-3, len(middle)), kind="stable")
     strata = np.array_split(order, pixels)
     curves = []
-    for _ in range(_GROUPS):
+    for _ in range(_N_GROUPS):
         chosen = np.array([rng.choice(part) for part in strata if len(part)])
         # each pixel is a patch of its own, of which the library samples the middle
         side = int(np.ceil(np.sqrt(len(chosen))))
         padded = np.concatenate([chosen, rng.choice(order, side * side - len(chosen))])
         patches = [np.ascontiguousarray(v[padded].reshape(side, side, 3)) for v in values]
         solver = cv2.createCalibrateDebevec(side * side, float(smoothness), False)
-        curve = solver.process(patches, times.astype(np.float32)).reshape(_LEVELS, 3)
-        curves.append(curve / curve[_LEVELS // 2])
+        curve = solver.process(patches, times.astype(np.float32)).reshape(_N_LEVELS, 3)
+        curves.append(curve / curve[_N_LEVELS // 2])
     exposure = np.array(curves, np.float64)
     seen = np.stack(
-        [np.bincount(values[..., c].ravel(), minlength=_LEVELS) for c in range(3)], axis=-1
+        [np.bincount(values[..., c].ravel(), minlength=_N_LEVELS) for c in range(3)], axis=-1
     )
     mean = exposure.mean(axis=0)
     rising = np.gradient(mean, axis=0) > 0
-    inner = np.zeros((_LEVELS, 1), np.bool_)
+    inner = np.zeros((_N_LEVELS, 1), np.bool_)
     inner[3:-3] = True  # the ends are clipped
     valid = (seen >= 20) & rising & inner
-    stderr = exposure.std(axis=0, ddof=1) / np.sqrt(_GROUPS)
+    stderr = exposure.std(axis=0, ddof=1) / np.sqrt(_N_GROUPS)
     return Response(mean, stderr, np.asarray(valid, np.bool_))
 
 
@@ -231,9 +231,9 @@ def merge(
     longest = float(times.max())
     # waking a second thread takes longer than a small frame; the choice holds for this thread only
     threads = get_num_threads()
-    set_num_threads(1 if radiance.size < _SMALL else threads)
+    set_num_threads(1 if radiance.size < _MAX_SERIAL_PIXELS else threads)
     try:
-        with parallel_chunksize(_CHUNK):
+        with parallel_chunksize(_CHUNK_PIXELS):
             _merge_tiles(
                 np.array([row.ctypes.data for row in rows], np.int64),
                 (times / longest).astype(np.float32),
@@ -275,7 +275,7 @@ def merge_reference(
     valid = time > 0
     radiance = signal / np.where(valid, time, 1.0)
     total = np.ones(shape)
-    for _ in range(STEPS):
+    for _ in range(N_WEIGHTING_STEPS):
         weighted, total = np.zeros(shape), np.zeros(shape)
         for frame, t in zip(frames, times, strict=True):
             # one frame's weight for its own DN / t is t^2 / variance
@@ -335,7 +335,9 @@ def _check(
         if not _floating(frame):
             continue
         values = frame.astype(np.float64, copy=False)
-        part = (values == np.rint(values)) & (np.abs(values) < _EXACT)  # NaN is not whole
+        part = (values == np.rint(values)) & (
+            np.abs(values) < _MAX_EXACT_INTEGER
+        )  # NaN is not whole
         if not part.all():
             checks.that(
                 f"frames[{k}]",
@@ -365,22 +367,22 @@ def _as_pointer(typing_context: Any, address: Any) -> Any:
     return types.voidptr(address), build
 
 
-@njit(cache=True, parallel=True, error_model="numpy", fastmath=_FAST)
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=_FAST_MATH)
 def _merge_tiles(  # type: ignore[no-untyped-def]
     addresses, times, starters, per_gain, floor, black, white, per_time, radiance, variance, valid
 ):
     """Merge tile by tile: the frames' tiles stay in cache over the rounds of weighing."""
     size = radiance.shape[0]
-    for tile in prange((size + _TILE - 1) // _TILE):
-        start = tile * _TILE
-        count = min(_TILE, size - start)
+    for tile in prange((size + _TILE_PIXELS - 1) // _TILE_PIXELS):
+        start = tile * _TILE_PIXELS
+        count = min(_TILE_PIXELS, size - start)
         first = np.empty(count, np.float32)  # electrons per DN's worth: radiance over gain
         s = np.zeros(count, np.float32)  # weighted sum of DN
         w = np.zeros(count, np.float32)  # sum of weights times time
         for k in starters:
             frame = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
             _add(frame, times[k], black, white, s, w)
-        for _ in range(STEPS):
+        for _ in range(N_WEIGHTING_STEPS):
             for i in range(count):
                 r = s[i] / w[i] if w[i] > 0.0 else np.float32(0.0)
                 first[i] = max(r, np.float32(0.0)) * per_gain
@@ -401,7 +403,7 @@ def _merge_tiles(  # type: ignore[no-untyped-def]
             variance[start + i] = per_time * per_time / w[i] if good else np.float32(np.nan)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
 def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tile of one frame, weighed as read noise alone would have it."""
     for i in range(len(s)):
@@ -411,7 +413,7 @@ def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
         w[i] += usable * t
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
 def _add_weighed(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tile of one frame, weighed by its time over its variance."""
     for i in range(len(s)):
@@ -421,7 +423,7 @@ def _add_weighed(frame, t, first, floor, black, white, s, w):  # type: ignore[no
         w[i] += weight * t
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
 def _add_pair(one, two, t, u, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tiles of two frames with one division for both: a / x + b / y = (a y + b x) / x y."""
     for i in range(len(s)):

@@ -16,11 +16,11 @@ from typing import Any, ClassVar
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, Fault, near_miss, parse, read_toml
+from capture.documents import STRICT_CONFIG, Checks, Fault, near_miss, parse, read_toml
 from capture.rig_parts import (
     ID_RULE,
     Caliper,
-    Fibre,
+    Fiber,
     LedLimits,
     Light,
     Probe,
@@ -28,14 +28,14 @@ from capture.rig_parts import (
     Vector,
     is_id,
 )
-from capture.view import MAX_SIDE_PX, PATTERNS, View
+from capture.view import CFA_PATTERNS, MAX_SIDE_PX, View
 
 __all__ = [
+    "CFA_PATTERNS",
     "ID_RULE",
     "MAX_SIDE_PX",
-    "PATTERNS",
     "Caliper",
-    "Fibre",
+    "Fiber",
     "LedLimits",
     "Light",
     "Probe",
@@ -56,7 +56,7 @@ class Rig:
     The frame's origin is the subject's centre; +x right, +y up, +z towards the main camera.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     lights: tuple[Light, ...]
@@ -202,7 +202,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return rig_from_json(read_toml(path, error=RigError), where=str(path))
 
 
-MOST_LISTED = 40
+MAX_LISTED_NAMES = 40
 """Names of lights or views that a message lists; of more it tells the first ones and the last."""
 
 
@@ -212,7 +212,7 @@ def _named(rows: tuple[Any, ...], name: str, what: str) -> Any:
             return row
     known = [row.name for row in rows]
     listed = ", ".join(known)
-    if len(known) > MOST_LISTED:
+    if len(known) > MAX_LISTED_NAMES:
         listed = f"{', '.join(known[:2])} … {known[-1]}, {len(known)} in all"
     fault = Fault("name", repr(name), f"one of {listed}", near_miss(name, known))
     raise RigError(what, faults=[fault])

@@ -9,12 +9,12 @@ from typing import ClassVar
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, InputError
+from capture.documents import STRICT_CONFIG, Checks, InputError
 
 Vector = tuple[float, float, float]
 
 ID_RULE = "1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot"
-AXIS = "0 <= degrees < 180"
+AXIS_RULE = "0 <= degrees < 180"
 """What an axis of a film may be."""
 
 
@@ -42,7 +42,7 @@ class Light:
     camera at +z) towards +y, in degrees. A light points at the rig's origin.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     position_mm: Vector
@@ -70,7 +70,7 @@ class Light:
         )
         checks.that("illuminant", self.illuminant, bool(self.illuminant), "a name")
         axis, half = self.polarizer_axis_deg, self.half_intensity_deg
-        checks.that("polarizer_axis_deg", axis, axis is None or 0 <= axis < 180, AXIS)
+        checks.that("polarizer_axis_deg", axis, axis is None or 0 <= axis < 180, AXIS_RULE)
         checks.that("half_intensity_deg", half, half is None or 0 < half < 90, "0 < degrees < 90")
         strengths = {"energy_ws": self.energy_ws, "power_w": self.power_w}
         given = {name: value for name, value in strengths.items() if value is not None}
@@ -101,7 +101,7 @@ class LedLimits:
     The numbers are this project's nominal ones, not a certificate: an assembled dome is measured.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     max_on_s: float = 0.5
     """Longest time an LED stays on for one command or row, s, > 0."""
@@ -149,7 +149,7 @@ class Caliper:
     How much force it may use is no property of the rig: who captures must say it.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     aperture_mm: float
     """Distance of the jaws at step 0, mm, > 0."""
@@ -177,7 +177,7 @@ class Caliper:
         checks.that("first_step", self.first_step, narrow, "<= 0, and the jaws apart")
         checks.that("last_step", self.last_step, self.last_step >= 0, ">= 0")
         for angle in self.angles_deg:
-            checks.that("angles_deg", angle, 0 <= angle < 180, AXIS)
+            checks.that("angles_deg", angle, 0 <= angle < 180, AXIS_RULE)
         differ = len(set(self.angles_deg)) == len(self.angles_deg) > 0
         checks.that("angles_deg", self.angles_deg, differ, "at least one, none twice")
         checks.close()
@@ -195,10 +195,10 @@ class Caliper:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fibre:
+class Fiber:
     """One detection fibre of a contact probe, from the head's face to its end before the camera."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     position_mm: tuple[float, float]
@@ -233,9 +233,9 @@ class Probe:
     +x is along the line of fibres and +z out of the skin.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
-    fibres: tuple[Fibre, ...]
+    fibres: tuple[Fiber, ...]
     """By growing distance from the source."""
     source_core_mm: float
     """Diameter of the source fibre's core, mm, > 0."""

@@ -9,12 +9,12 @@ from typing import ClassVar, Literal
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, Fault
-from capture.rig_parts import AXIS, ID_RULE, RigError, Vector, is_id
+from capture.documents import STRICT_CONFIG, Checks, Fault
+from capture.rig_parts import AXIS_RULE, ID_RULE, RigError, Vector, is_id
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
 
-PATTERNS: tuple[str, ...] = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
+CFA_PATTERNS: tuple[str, ...] = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 MAX_SIDE_PX = 65_535
 MAX_BINNING = 3.0
 
@@ -23,7 +23,7 @@ MAX_BINNING = 3.0
 class View:
     """One camera of the rig: pinhole, sensor and analyser, all nominal."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     camera_model: str
@@ -93,7 +93,7 @@ class View:
             seconds = getattr(self, field)
             checks.that(field, seconds, 0 <= seconds < math.inf, "seconds >= 0")
         checks.that("bit_depth", self.bit_depth, 8 <= self.bit_depth <= 16, "8 to 16")
-        checks.that("cfa", self.cfa, self.cfa in PATTERNS, f"one of {', '.join(PATTERNS)}")
+        checks.that("cfa", self.cfa, self.cfa in CFA_PATTERNS, f"one of {', '.join(CFA_PATTERNS)}")
         checks.that("black_level", self.black_level, self.black_level >= 0, ">= 0")
         top = 2**self.bit_depth - 1 if 8 <= self.bit_depth <= 16 else 65_535
         checks.that(
@@ -103,7 +103,9 @@ class View:
             f"black_level {self.black_level} < white_level <= {top}",
         )
         analyser = self.analyser_axis_deg
-        checks.that("analyser_axis_deg", analyser, analyser is None or 0 <= analyser < 180, AXIS)
+        checks.that(
+            "analyser_axis_deg", analyser, analyser is None or 0 <= analyser < 180, AXIS_RULE
+        )
         checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
         checks.close()
 

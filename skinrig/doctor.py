@@ -103,7 +103,7 @@ def _renderer() -> Finding:
 
 
 def _serial_ports() -> list[Finding]:
-    from capture.devices.port import serial_ports
+    from capture.devices.port_url import serial_ports
 
     ports = serial_ports()
     return [
@@ -118,11 +118,11 @@ def _serial_ports() -> list[Finding]:
 
 def _camera_producers() -> Finding:
     from capture.devices.camera import CameraUrlError
-    from capture.devices.cameras.genicam_producer import SEARCH_PATH, producer_files
+    from capture.devices.cameras.genicam_producer import PRODUCER_PATH_VARIABLE, producer_files
 
     try:
         state = ", ".join(file.name for file in producer_files("genicam", ""))
     except CameraUrlError:
         state = ""
-    mend = f"install the camera maker's software and set {SEARCH_PATH} to its folder"
+    mend = f"install the camera maker's software and set {PRODUCER_PATH_VARIABLE} to its folder"
     return Finding("GenTL producers", state or "none", True, "" if state else mend)

@@ -36,12 +36,12 @@ from capture.session import Session
 
 log = logging.getLogger(__name__)
 
-BUFFER_BYTES = 384 * 2**20
+MAX_BUFFERED_PIXEL_BYTES = 384 * 2**20
 """Most pixels that are held at once."""
-LISTEN_S = 0.2
-CALM_S = 1.1
+ROW_POLL_S = 0.2
+MIN_DARK_GAP_S = 1.1
 """Darkness between single rows, so that no second sees more than one flash of them."""
-LEASE_S = 2.0
+DOME_LEASE_S = 2.0
 
 
 class Dome(Protocol):
@@ -110,7 +110,7 @@ def run_dome(
     run = _Run(rig, box, cameras, session, operator)
     try:
         box.dark()  # whatever was going on before
-        box.set_lease(LEASE_S)
+        box.set_lease(DOME_LEASE_S)
         box.set_cameras((1 << len(rig.views)) - 1)
         if not session.frames():
             box.new_subject(session.id[:32])
@@ -259,7 +259,7 @@ class _Run:
         left: list[Step] = []
         why = ""
         for step in steps:
-            self._box.listen(CALM_S)
+            self._box.listen(MIN_DARK_GAP_S)
             missing, reason = self._sequence([step], attempt)
             left += missing
             why = reason or why
@@ -317,7 +317,7 @@ class _Run:
         """Renew the lease until the sequence is over; return when its rows released the cameras."""
         times: dict[int, float] = {}
         while True:
-            times.update(self._box.listen(LISTEN_S))
+            times.update(self._box.listen(ROW_POLL_S))
             position = self._box.position()
             if position.state != "RUN":
                 if position.state != "DONE":
@@ -342,7 +342,7 @@ class _Run:
     ) -> list[Step]:
         """Commit the rows of which every camera has a frame; return the steps of the others."""
         pixels = sum(2 * view.width_px * view.height_px for view in map(self._rig.view, streams))
-        at_once = max(1, BUFFER_BYTES // pixels)
+        at_once = max(1, MAX_BUFFERED_PIXEL_BYTES // pixels)
         missing: list[Step] = []
         for first in range(0, len(steps), at_once):
             last = min(first + at_once, len(steps))

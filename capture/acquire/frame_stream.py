@@ -22,10 +22,10 @@ from capture.devices.camera import (
     check_frame,
 )
 
-CLOCK_TRIES = 8
-DRIFT = 2e-4
+N_CLOCK_READINGS = 8
+CLOCK_DRIFT_S_PER_S = 2e-4
 """How far a camera's clock may run away, s per s."""
-MATCH_SHARE = 0.25
+MAX_ROW_TIME_DEVIATION = 0.25
 """Most deviation of a frame from its row's time, of the shortest row."""
 
 
@@ -44,7 +44,7 @@ class ClockOffset:
 def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> ClockOffset:
     """Return a camera's clock against the box's: the best of a few comparisons."""
     best = ClockOffset(0.0, float("inf"), 0.0)
-    for _ in range(CLOCK_TRIES):
+    for _ in range(N_CLOCK_READINGS):
         before = camera.clock_s()
         box_s = box_clock_s()
         after = camera.clock_s()
@@ -103,7 +103,7 @@ class FrameStream:
         lag_s: float,
         timeout_s: float,
     ) -> None:
-        if clock.uncertainty_s > MATCH_SHARE * dwell_s:
+        if clock.uncertainty_s > MAX_ROW_TIME_DEVIATION * dwell_s:
             raise CameraError(
                 f"view {name!r}: the clocks of camera and box could be compared to "
                 f"{1e3 * clock.uncertainty_s:.1f} ms only, too coarse for rows of "
@@ -169,6 +169,6 @@ class FrameStream:
     def _row_of(self, frame: Frame) -> int | None:
         box_s = frame.t_start_s - self._clock.offset_s
         place = int(np.argmin(np.abs(self._times - box_s)))
-        allowed_s = self._clock.uncertainty_s + DRIFT * abs(box_s - self._clock.box_s)
-        allowed_s = min(allowed_s + 1e-3, MATCH_SHARE * self._dwell_s + 1e-3)
+        allowed_s = self._clock.uncertainty_s + CLOCK_DRIFT_S_PER_S * abs(box_s - self._clock.box_s)
+        allowed_s = min(allowed_s + 1e-3, MAX_ROW_TIME_DEVIATION * self._dwell_s + 1e-3)
         return self._rows[place] if abs(self._times[place] - box_s) <= allowed_s else None

@@ -16,7 +16,7 @@ from capture.acquire.frame_stream import FrameStream, compare_clocks
 from capture.acquire.frames import FRAME_MARGIN_S, configure, encode, wanted_exposure
 from capture.acquire.outcome import MAX_ATTEMPTS, Operator, attempts_so_far, given_up
 from capture.devices.camera import Camera, Frame, Trigger
-from capture.devices.gradient_sphere import READINGS_DEG, Eyes, Judgment, PatternRow, Position
+from capture.devices.gradient_sphere import ANALYZER_DEG, Eyes, Judgment, PatternRow, Position
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Step, Value
@@ -25,10 +25,10 @@ from capture.session import Session
 
 log = logging.getLogger(__name__)
 
-LISTEN_S = 0.1
-CALM_S = 1.1
+SCAN_POLL_S = 0.1
+SCAN_DARK_GAP_S = 1.1
 """Darkness after which no window of duty, and no second of flashes, holds an earlier scan."""
-CALM_TRIES = 5
+MAX_DARK_GAPS = 5
 
 
 class Sphere(Protocol):
@@ -109,7 +109,7 @@ def reading_deg(step: Step) -> float:
     90.0
     """
     given = step.settings.get("analyser_deg")
-    return READINGS_DEG[str(step.settings["polarizer"])] if given is None else float(given)
+    return ANALYZER_DEG[str(step.settings["polarizer"])] if given is None else float(given)
 
 
 class Scanner:
@@ -221,9 +221,9 @@ class Scanner:
         """Let time pass while all boxes know that the host is there."""
         left_s = seconds
         while left_s > 0.0:
-            self._sphere.listen(min(left_s, LISTEN_S))
+            self._sphere.listen(min(left_s, SCAN_POLL_S))
             self._keep_alive()
-            left_s -= LISTEN_S
+            left_s -= SCAN_POLL_S
 
     # one sequence -----------------------------------------------------------------------------
 
@@ -298,21 +298,21 @@ class Scanner:
 
     def _judged(self, rows: int) -> Judgment:
         """Arm the table, after darkness where the light of a moment ago makes it too much."""
-        for _ in range(CALM_TRIES):
+        for _ in range(MAX_DARK_GAPS):
             try:
                 return self._sphere.arm_scan(rows)
             except CommandRefused as error:
                 if error.code not in (Code.DUTY, Code.FLICKER, Code.THERMAL):
                     raise
-                log.info("%s; waiting %g s", error, CALM_S)
-                self.pause(CALM_S)
+                log.info("%s; waiting %g s", error, SCAN_DARK_GAP_S)
+                self.pause(SCAN_DARK_GAP_S)
         return self._sphere.arm_scan(rows)
 
     def _listen(self, steps: Sequence[Step]) -> dict[int, float]:
         """Renew the leases until the scan is over; return when its rows released the cameras."""
         times: dict[int, float] = {}
         while True:
-            times.update(self._sphere.listen(LISTEN_S))
+            times.update(self._sphere.listen(SCAN_POLL_S))
             self._keep_alive()
             position = self._sphere.position()
             if position.state != "RUN":

@@ -19,7 +19,7 @@ from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session
 
-KINDS = ("gradient_sphere", "dome", "probe", "flash")
+RIG_KINDS = ("gradient_sphere", "dome", "probe", "flash")
 """Boxes by which a rig is known."""
 
 
@@ -98,7 +98,7 @@ def run_plan(
         When ``interrupted`` said so.
     """
     plan.check(rig)
-    kind = next(name for name in KINDS if name in rig.boxes or name == "flash")
+    kind = next(name for name in RIG_KINDS if name in rig.boxes or name == "flash")
     if kind not in boxes:
         raise AcquisitionError(f"box {kind!r}: no port was given; add --port {kind}=URL")
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])

@@ -14,7 +14,7 @@ from capture.arrays import Float32Array, Float64Array
 from capture.documents import InputError
 
 __all__ = [
-    "KINDS",
+    "CALIBRATION_KINDS",
     "Calibration",
     "CalibrationDamaged",
     "CalibrationError",
@@ -30,7 +30,7 @@ __all__ = [
     "require_plain_name",
 ]
 
-KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
+CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
 DEFAULT_VALIDITY_DAYS = 90
 
 Source: TypeAlias = Literal["measured", "simulated"]
@@ -99,7 +99,7 @@ class Calibration:
     Attributes
     ----------
     kind : str
-        One of `KINDS`.
+        One of `CALIBRATION_KINDS`.
     rig : str
         Name of the rig it was made on.
     serials : tuple of str
@@ -134,8 +134,10 @@ class Calibration:
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
-        if self.kind not in KINDS:
-            raise ValueError(f"Calibration.kind: got {self.kind!r}, expected one of {KINDS}")
+        if self.kind not in CALIBRATION_KINDS:
+            raise ValueError(
+                f"Calibration.kind: got {self.kind!r}, expected one of {CALIBRATION_KINDS}"
+            )
         if not self.serials:
             raise ValueError("Calibration.serials: got none, expected at least one device serial")
         if self.source not in ("measured", "simulated"):

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from capture.arrays import Float32Array
 from capture.calibration.record import (
-    KINDS,
+    CALIBRATION_KINDS,
     Calibration,
     CalibrationDamaged,
     CalibrationError,
@@ -37,7 +37,7 @@ from capture.calibration.record import (
 from capture.calibration.validity import Drift, drift, require
 
 __all__ = [
-    "KINDS",
+    "CALIBRATION_KINDS",
     "SCHEMA",
     "Calibration",
     "CalibrationDamaged",
@@ -154,7 +154,7 @@ def load(directory: str | Path, kind: str) -> Calibration:
     directory : str or Path
         The folder.
     kind : str
-        One of `KINDS`.
+        One of `CALIBRATION_KINDS`.
 
     Returns
     -------
@@ -167,8 +167,8 @@ def load(directory: str | Path, kind: str) -> Calibration:
     CalibrationDamaged
         If the file is not of this schema, or it or one of its maps was altered.
     """
-    if kind not in KINDS:
-        raise ValueError(f"kind: got {kind!r}, expected one of {KINDS}")
+    if kind not in CALIBRATION_KINDS:
+        raise ValueError(f"kind: got {kind!r}, expected one of {CALIBRATION_KINDS}")
     folder = Path(directory)
     path = folder / f"{kind}.json"
     try:

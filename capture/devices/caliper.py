@@ -21,7 +21,7 @@ from capture.devices.port import PortTimeout
 __all__ = ["CaliperBox", "CaliperStatus", "Ended", "MoveReport"]
 
 Ended = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
-_ENDS: dict[str, Ended] = {
+_END_WORDS: dict[str, Ended] = {
     "REACHED": "reached",
     "FORCE": "force",
     "STALL": "stall",
@@ -29,9 +29,9 @@ _ENDS: dict[str, Ended] = {
     "NOHOME": "no_home",
     "STOPPED": "stopped",
 }
-_LISTEN_S = 0.1
+_TRAVEL_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
-_MARGIN_S = 2.0
+_TRAVEL_MARGIN_S = 2.0
 """Longer than this over its own time no move may take."""
 
 
@@ -145,7 +145,7 @@ class CaliperBox(Box):
     def set_angle(self, angle_deg: float) -> None:
         """Turn the jaws to one of ``limits["angles_deg"]`` and wait; refused while skin is held."""
         self._port.ask(f"CAL:ANG {_decimal('angle_deg', angle_deg)}")
-        self._wait(360.0 / float(self.limits["turn_deg_per_s"]) + _MARGIN_S)
+        self._wait(360.0 / float(self.limits["turn_deg_per_s"]) + _TRAVEL_MARGIN_S)
 
     def angle_deg(self) -> float:
         """Return the angle that the jaws have or turn to, degrees."""
@@ -194,9 +194,9 @@ class CaliperBox(Box):
         """Let `seconds` pass while the box holds what it holds: the lease is renewed."""
         left_s = seconds
         while left_s > 0.0:
-            self._port.listen(min(left_s, _LISTEN_S))
+            self._port.listen(min(left_s, _TRAVEL_POLL_S))
             self.ping()
-            left_s -= _LISTEN_S
+            left_s -= _TRAVEL_POLL_S
 
     def _finish(self, payload: str) -> MoveReport:
         """Wait for the end of the move that the box has accepted as number `payload`."""
@@ -204,7 +204,7 @@ class CaliperBox(Box):
             raise self._bad("CAL:STEP:ABS", payload, "the number of the move")
         number, limits = int(payload), self.limits
         travel_mm = (limits["step_max"] - limits["step_min"] + 2) * float(limits["step_mm"])
-        self._wait(4.0 * travel_mm / float(limits["speed_mm_per_s"]) + _MARGIN_S)
+        self._wait(4.0 * travel_mm / float(limits["speed_mm_per_s"]) + _TRAVEL_MARGIN_S)
         report = self.last_move()
         if report is None or report.number != number:
             raise self._bad("CAL:LAST?", str(report), f"the end of move {number}")
@@ -217,14 +217,19 @@ class CaliperBox(Box):
                 raise PortTimeout(
                     f"{self._port.url}: the caliper still moves after {timeout_s:.1f} s; stop it"
                 )
-            self._port.listen(_LISTEN_S)
-            waited_s += _LISTEN_S
+            self._port.listen(_TRAVEL_POLL_S)
+            waited_s += _TRAVEL_POLL_S
 
     def _report(self, text: str, payload: str) -> MoveReport:
         try:
             number, ended, step, reading, force, t_us = payload.split(",")
             return MoveReport(
-                int(number), _ENDS[ended], int(step), float(reading), float(force), int(t_us) / 1e6
+                int(number),
+                _END_WORDS[ended],
+                int(step),
+                float(reading),
+                float(force),
+                int(t_us) / 1e6,
             )
         except (ValueError, KeyError) as exc:
             raise self._bad(text, payload, "number,END,step,mm,N,us") from exc

@@ -19,7 +19,7 @@ import numpy as np
 from capture.arrays import UInt16Array
 from capture.devices.port import DeviceError
 
-ENTRY_POINTS = "capture.cameras"
+CAMERA_ENTRY_POINTS = "capture.cameras"
 MAX_EXPOSURE_DEVIATION_EV = 1.0 / 3.0
 
 
@@ -196,7 +196,9 @@ def check_address(url: str) -> None:
 
 def _entry(url: str) -> importlib.metadata.EntryPoint:
     kind, colon, _ = url.partition(":")
-    found = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    found = {
+        entry.name: entry for entry in importlib.metadata.entry_points(group=CAMERA_ENTRY_POINTS)
+    }
     if not colon or kind not in found:
         raise CameraUrlError(
             f"camera address: got {url!r}, expected KIND:REST with KIND one of "

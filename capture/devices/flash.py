@@ -17,11 +17,11 @@ from capture.devices.port import Clock, LinkLost, Port, PortTimeout, WrongDevice
 
 __all__ = ["ChargeState", "FlashBox", "FlashReport", "Status", "find_box"]
 
-KIND = "flash"
+FLASH_KIND = "flash"
 Polarizer = Literal["parallel", "crossed"]
-_STOPS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}
-_SHORTEST_WAIT_S = 0.02
-_LISTEN_S = 0.2
+_POLARIZER_WORDS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}
+_MIN_WAIT_S = 0.02
+_CHARGE_POLL_S = 0.2
 """Longest silence while waiting; shorter than the shortest lease."""
 
 
@@ -82,7 +82,7 @@ class FlashBox(Box):
         When the box is no flash box, or another one.
     """
 
-    kind = KIND
+    kind = FLASH_KIND
 
     def status(self) -> Status:
         """Return the status bits."""
@@ -92,7 +92,7 @@ class FlashBox(Box):
 
     def set_polarizer(self, polarizer: str) -> None:
         """Begin to turn the analyser to "parallel" or "crossed"."""
-        words = {stop: word for word, stop in _STOPS.items()}
+        words = {stop: word for word, stop in _POLARIZER_WORDS.items()}
         if polarizer not in words:
             raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
         self._port.ask(f"FLAS:POL {words[polarizer]}")
@@ -159,7 +159,7 @@ class FlashBox(Box):
                     f"{self._port.url}: the flash is not ready after {timeout_s:g} s (charge "
                     f"{state.charge:.2f}); check its mains and its emergency stop"
                 )
-            pause_s = min(max(state.ready_in_s, _SHORTEST_WAIT_S), _LISTEN_S)
+            pause_s = min(max(state.ready_in_s, _MIN_WAIT_S), _CHARGE_POLL_S)
             self._port.listen(pause_s)
             waited_s += pause_s
 
@@ -205,9 +205,9 @@ class FlashBox(Box):
     # answers ----------------------------------------------------------------------------------
 
     def _stop(self, text: str, payload: str) -> Polarizer:
-        if payload not in _STOPS:
+        if payload not in _POLARIZER_WORDS:
             raise self._bad(text, payload, "PAR or CROS")
-        return _STOPS[payload]
+        return _POLARIZER_WORDS[payload]
 
     def _report(self, text: str, payload: str) -> FlashReport:
         fields = payload.split(",")

@@ -1,7 +1,7 @@
 """The gradient sphere's box: one method a command, units in and out, no policy.
 
 A pattern is a light of all LEDs at once: full, or weighted by a coordinate of the way to each of
-them (`capture.plan.steps.PATTERNS`). A scan is a table of patterns: uploaded, compared by its
+them (`capture.plan.steps.LIGHT_PATTERNS`). A scan is a table of patterns: uploaded, compared by its
 checksum, armed, which makes the box judge it, and triggered; the box then steps by itself, turns
 the analyser where a row asks for another reading (in the dark), releases the cameras once each
 light is steady, and reports each release. The lease runs meanwhile: `listen` renews it.
@@ -16,10 +16,10 @@ from typing import ClassVar, Literal
 
 from capture.devices.led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
 from capture.devices.port import PortTimeout
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 
 __all__ = [
-    "READINGS_DEG",
+    "ANALYZER_DEG",
     "Eyes",
     "GradientSphereBox",
     "Judgment",
@@ -29,9 +29,9 @@ __all__ = [
 ]
 
 Polarizer = Literal["parallel", "crossed"]
-READINGS_DEG: dict[str, float] = {"parallel": 0.0, "crossed": 90.0}
+ANALYZER_DEG: dict[str, float] = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser in each state."""
-_WAIT_S = 0.05
+_ANALYZER_POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +95,9 @@ class GradientSphereBox(LedBox):
 
     def set_polarizer(self, polarizer: str) -> None:
         """Begin to turn the analyser to "parallel" or "crossed"; refused while a light is on."""
-        if polarizer not in READINGS_DEG:
+        if polarizer not in ANALYZER_DEG:
             raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
-        self._port.ask(f"POL {READINGS_DEG[polarizer]:.0f}")
+        self._port.ask(f"POL {ANALYZER_DEG[polarizer]:.0f}")
 
     def set_analyser(self, angle_deg: float) -> None:
         """Begin to turn the analyser to a reading of 0 to 180 degrees."""
@@ -125,8 +125,8 @@ class GradientSphereBox(LedBox):
                 raise PortTimeout(
                     f"{self._port.url}: the analyser still turns after {timeout_s:g} s; check it"
                 )
-            self.listen(_WAIT_S)
-            waited_s += _WAIT_S
+            self.listen(_ANALYZER_POLL_S)
+            waited_s += _ANALYZER_POLL_S
 
     # single patterns --------------------------------------------------------------------------
 
@@ -148,7 +148,7 @@ class GradientSphereBox(LedBox):
     def lit(self) -> str:
         """Return the pattern that is on, "dark" for none."""
         payload = self._port.ask("PATT?").lower()
-        if payload not in PATTERNS:
+        if payload not in LIGHT_PATTERNS:
             raise self._bad("PATT?", payload, "a pattern")
         return payload
 
@@ -201,8 +201,8 @@ class GradientSphereBox(LedBox):
 
 
 def _pattern(name: str) -> str:
-    if name not in PATTERNS:
-        raise ValueError(f"pattern: got {name!r}, expected one of {', '.join(PATTERNS)}")
+    if name not in LIGHT_PATTERNS:
+        raise ValueError(f"pattern: got {name!r}, expected one of {', '.join(LIGHT_PATTERNS)}")
     return name
 
 

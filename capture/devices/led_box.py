@@ -18,11 +18,11 @@ from capture.devices.port import Port
 __all__ = ["LEVEL_STEPS", "Eyes", "Judgment", "LedBox", "LedStatus", "Position"]
 
 Eyes = Literal["open", "closed", "shielded"]
-EYES: tuple[str, ...] = ("open", "closed", "shielded")
+EYE_STATES: tuple[str, ...] = ("open", "closed", "shielded")
 LEVEL_STEPS = 1000
-_LISTEN_S = 0.1
+_PROGRAM_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
-_LINE_BYTES = 200
+_MAX_PROGRAM_LINE_BYTES = 200
 """Rows that are sent in one line: a short line survives a bad cable."""
 
 
@@ -93,7 +93,9 @@ class LedBox(Box):
         first = 0
         while first < len(texts):
             end, size = first, 0
-            while end < len(texts) and (end == first or size + len(texts[end]) <= _LINE_BYTES):
+            while end < len(texts) and (
+                end == first or size + len(texts[end]) <= _MAX_PROGRAM_LINE_BYTES
+            ):
                 size += len(texts[end]) + 1
                 end += 1
             self._port.ask(f"{name}:DEF {first},{joint.join(texts[first:end])}")
@@ -146,7 +148,7 @@ class LedBox(Box):
         found: dict[int, float] = {}
         left_s = seconds
         while left_s > 0.0:
-            for event in self._port.listen(min(left_s, _LISTEN_S)):
+            for event in self._port.listen(min(left_s, _PROGRAM_POLL_S)):
                 if event.name == "SEQ:STEP":
                     row, _, t_us = event.payload.partition(",")
                     if row.isdecimal() and t_us.isdecimal():
@@ -154,7 +156,7 @@ class LedBox(Box):
                 elif event.name == "LED:FAIL" and event.payload.isdecimal():
                     self.failed_leds.add(int(event.payload))
             self.ping()
-            left_s -= _LISTEN_S
+            left_s -= _PROGRAM_POLL_S
         return found
 
     # cameras, eyes, dose ----------------------------------------------------------------------
@@ -177,14 +179,14 @@ class LedBox(Box):
 
     def set_eyes(self, eyes: Eyes) -> None:
         """Pass on what a person says of the subject's eyes."""
-        if eyes not in EYES:
-            raise ValueError(f"eyes: got {eyes!r}, expected one of {', '.join(EYES)}")
+        if eyes not in EYE_STATES:
+            raise ValueError(f"eyes: got {eyes!r}, expected one of {', '.join(EYE_STATES)}")
         self._port.ask(f"SAFE:EYES {eyes.upper()}")
 
     def eyes(self) -> str:
         """Return what was said of the subject's eyes."""
         payload = self._port.ask("SAFE:EYES?").lower()
-        if payload not in EYES:
+        if payload not in EYE_STATES:
             raise self._bad("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
         return payload
 

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import importlib
-import importlib.metadata
 import json
 import logging
 import os
@@ -23,12 +21,23 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import serial
 
 from capture.devices import wire
+from capture.devices.errors import (
+    BadAnswer,
+    BoxRebooted,
+    CommandRefused,
+    DeviceError,
+    LinkLost,
+    PortBusy,
+    PortTimeout,
+    PortUrlError,
+    WrongDevice,
+)
+from capture.devices.port_url import load_url_handler, opening_advice
 from capture.devices.wire import Code, Event, Reply, Request
 
 __all__ = [
@@ -46,12 +55,10 @@ __all__ = [
     "PortTimeout",
     "PortUrlError",
     "WrongDevice",
-    "serial_ports",
 ]
 
 log = logging.getLogger(__name__)
 
-URL_HANDLERS = "capture.urlhandlers"
 READ_SLICE_S = 0.02
 """How long one read waits, in s; longer waits are made of slices."""
 MAX_CAPABILITY_PARTS = 1024
@@ -65,55 +72,6 @@ except ImportError:  # pragma: no cover - Windows has no termios
 
 # what pyserial lets through when the device is gone or the port was closed under a reader
 _LINK_FAILURES = (OSError, _termios_error, TypeError, AttributeError)
-
-
-class DeviceError(Exception):
-    """Root of what drivers raise about a device."""
-
-
-class PortUrlError(DeviceError, ValueError):
-    """The URL names no way to reach a device."""
-
-
-class LinkLost(DeviceError, ConnectionError):
-    """The port cannot be opened, or is gone; whether the last act was done is not known."""
-
-
-class PortBusy(LinkLost):
-    """Another program holds the port."""
-
-
-class PortTimeout(DeviceError, TimeoutError):
-    """No answer in spite of retries; whether the act was done is not known."""
-
-
-class BoxRebooted(DeviceError, ConnectionResetError):
-    """The box started again: it is dark, disarmed and has forgotten its settings."""
-
-
-class WrongDevice(DeviceError, ValueError):
-    """Behind the URL is another device, or one that speaks another version."""
-
-
-class BadAnswer(DeviceError, ValueError):
-    """A well-framed answer whose content is not what the manual says."""
-
-
-class CommandRefused(DeviceError, RuntimeError):
-    """The box refused and did nothing.
-
-    Attributes
-    ----------
-    code
-        Why, see `capture.devices.wire.Code`.
-    text
-        The command.
-    """
-
-    def __init__(self, text: str, code: int, reason: str) -> None:
-        super().__init__(f"{text!r} was refused with {code}: {reason}; nothing was done")
-        self.text = text
-        self.code = code
 
 
 class Clock(Protocol):
@@ -239,12 +197,7 @@ class Port:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def hello(self, *, patience_s: float = 3.0) -> Hello:
@@ -355,7 +308,7 @@ class Port:
             raise RuntimeError(f"{self.url}: used by two threads; a port belongs to its maker")
 
     def _open(self) -> None:
-        _load_handler(self.url)
+        load_url_handler(self.url)
         try:
             self._serial = serial.serial_for_url(
                 self.url,
@@ -373,7 +326,7 @@ class Port:
             number = getattr(exc, "errno", None)
             reason = os.strerror(number) if number and kind is LinkLost else str(exc)
             raise kind(
-                f"cannot open {self.url}: {reason}; {_hint(self.url, kind, number)}"
+                f"cannot open {self.url}: {reason}; {opening_advice(self.url, kind, number)}"
             ) from exc
         self._splitter.clear()
         self._lines.clear()
@@ -472,13 +425,6 @@ class Port:
         return frame
 
 
-def serial_ports() -> list[str]:
-    """Return the names of this machine's serial ports, sorted."""
-    from serial.tools import list_ports
-
-    return sorted(str(port.device) for port in list_ports.comports())
-
-
 def _hello_fields(url: str, payload: str) -> tuple[int, str, str, str]:
     fields = payload.split(",")
     if len(fields) != 4 or not fields[0].isdecimal():
@@ -487,26 +433,3 @@ def _hello_fields(url: str, payload: str) -> tuple[int, str, str, str]:
             "'version,kind,serial,firmware'"
         )
     return int(fields[0]), fields[1], fields[2], fields[3]
-
-
-def _load_handler(url: str) -> None:
-    """Make the entry point that serves the scheme of `url` known to pyserial."""
-    scheme, separator, _ = url.partition("://")
-    if not separator:
-        return
-    for entry_point in importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme.lower()):
-        # pyserial swallows an ImportError of its handlers; here it shows
-        importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
-        if entry_point.value not in serial.protocol_handler_packages:
-            serial.protocol_handler_packages.append(entry_point.value)
-
-
-def _hint(url: str, kind: type[Exception], number: int | None) -> str:
-    """Return what to do about a port that does not open."""
-    if kind is PortBusy:
-        return "another program holds it"
-    if number == errno.EACCES:
-        return "no right to it: on Debian join the group dialout and log in again"
-    if "://" in url:
-        return "does a server listen there?"
-    return "is it plugged in?"

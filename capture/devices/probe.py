@@ -21,7 +21,7 @@ __all__ = ["Opening", "ProbeBox", "ProbeStatus", "SuctionReport", "SuctionState"
 
 Shut = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
 Vented = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
-_SHUTS: dict[str, Shut] = {
+_SHUTTER_WORDS: dict[str, Shut] = {
     "OPEN": "open",
     "TIMED": "timed",
     "ASKED": "asked",
@@ -30,7 +30,7 @@ _SHUTS: dict[str, Shut] = {
     "INTERLOCK": "interlock",
     "DARK": "dark",
 }
-_VENTS: dict[str, Vented] = {
+_VENT_WORDS: dict[str, Vented] = {
     "TIMED": "timed",
     "ASKED": "asked",
     "LOW": "low",
@@ -40,9 +40,9 @@ _VENTS: dict[str, Vented] = {
     "INTERLOCK": "interlock",
     "DARK": "dark",
 }
-_LISTEN_S = 0.1
+_VALVE_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
-_MARGIN_S = 2.0
+_VALVE_MARGIN_S = 2.0
 """Longer than this over its own time no movement may take."""
 
 
@@ -216,7 +216,7 @@ class ProbeBox(Box):
             return None
         try:
             number, ended, mbar, t_us = payload.split(",")
-            return SuctionReport(int(number), _VENTS[ended], float(mbar), int(t_us) / 1e6)
+            return SuctionReport(int(number), _VENT_WORDS[ended], float(mbar), int(t_us) / 1e6)
         except (ValueError, KeyError) as exc:
             raise self._bad("PUMP:LAST?", payload, "number,END,mbar,us") from exc
 
@@ -278,7 +278,7 @@ class ProbeBox(Box):
         try:
             number, ended, open_us, shut_us = payload.split(",")
             shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
-            return Opening(int(number), int(open_us) / 1e6, _SHUTS[ended], shut_s)
+            return Opening(int(number), int(open_us) / 1e6, _SHUTTER_WORDS[ended], shut_s)
         except (ValueError, KeyError) as exc:
             raise self._bad("SHUT:LAST?", payload, "number,END,us,us") from exc
 
@@ -297,7 +297,7 @@ class ProbeBox(Box):
             When the cover does not arrive.
         """
         self._port.ask(f"FIB {'ALL' if fibre is None else fibre}")
-        self._wait(float(self.limits["cover_ms"]) / 1e3 + _MARGIN_S)
+        self._wait(float(self.limits["cover_ms"]) / 1e3 + _VALVE_MARGIN_S)
 
     def uncovered(self) -> int | None:
         """Return the number of the only fibre that is not covered; None: none is covered."""
@@ -329,7 +329,7 @@ class ProbeBox(Box):
 
     # time -------------------------------------------------------------------------------------
 
-    def listen(self, seconds: float, *, every_s: float = _LISTEN_S) -> None:
+    def listen(self, seconds: float, *, every_s: float = _VALVE_POLL_S) -> None:
         """Let `seconds` pass while the box does what it does: the lease is renewed.
 
         Parameters
@@ -352,8 +352,8 @@ class ProbeBox(Box):
                 raise PortTimeout(
                     f"{self._port.url}: the probe still moves after {timeout_s:.1f} s; check it"
                 )
-            self._port.listen(_LISTEN_S)
-            waited_s += _LISTEN_S
+            self._port.listen(_VALVE_POLL_S)
+            waited_s += _VALVE_POLL_S
 
     def _to_number(self, text: str, payload: str) -> float:
         try:

@@ -46,11 +46,11 @@ MAX_SEQ = 2**32 - 1
 UNKNOWN_BOOT = 0
 """Epoch of a host that has not said hello; no box ever draws it."""
 
-_NUMBER = r"(0|[1-9][0-9]{0,9})"
-_HEAD = re.compile(rf"([@=!]){_NUMBER}:([0-9a-f]{{4}}) (.*)", re.DOTALL)
-_CODE = re.compile(r"(0|-?[1-9][0-9]{0,3})(?: (.*))?", re.DOTALL)
-_NAME = re.compile(r"([A-Z][A-Z0-9:]{0,31})(?: (.*))?", re.DOTALL)
-_SEALED = re.compile(rb"\*[0-9A-F]{4}\Z")
+_NUMBER_PATTERN = r"(0|[1-9][0-9]{0,9})"
+_FRAME_PATTERN = re.compile(rf"([@=!]){_NUMBER_PATTERN}:([0-9a-f]{{4}}) (.*)", re.DOTALL)
+_CODE_PATTERN = re.compile(r"(0|-?[1-9][0-9]{0,3})(?: (.*))?", re.DOTALL)
+_NAME_PATTERN = re.compile(r"([A-Z][A-Z0-9:]{0,31})(?: (.*))?", re.DOTALL)
+_CHECKSUM_PATTERN = re.compile(rb"\*[0-9A-F]{4}\Z")
 
 
 class BadFrame(ValueError):
@@ -154,7 +154,7 @@ class Event:
         _check_counter("number", self.number)
         _check_boot(self.boot)
         _check_text("payload", self.payload)
-        if _NAME.fullmatch(self.name) is None:
+        if _NAME_PATTERN.fullmatch(self.name) is None:
             raise ValueError(f"name: got {self.name!r}, expected upper-case words like 'WDOG:TRIP'")
 
 
@@ -183,7 +183,7 @@ def seal(text: str) -> str:
 def unseal(sealed: str) -> str:
     """Return the text that `seal` was given; raise `BadFrame` when it is damaged."""
     data = sealed.encode("ascii", errors="replace")
-    if _SEALED.search(data) is None:
+    if _CHECKSUM_PATTERN.search(data) is None:
         raise BadFrame(f"checksum: got {sealed[-5:]!r} at the end, expected '*' and 4 hex digits")
     body, stated = data[:-5], int(data[-4:], 16)
     if crc16(body) != stated:
@@ -235,14 +235,14 @@ def decode(line: bytes) -> Request | Reply | Event:
     if any(not 0x20 <= byte <= 0x7E for byte in line):
         raise BadFrame("line: got a byte outside printable ASCII")
     body = unseal(line.decode("ascii"))
-    head = _HEAD.fullmatch(body)
+    head = _FRAME_PATTERN.fullmatch(body)
     if head is None:
         raise BadFrame(f"frame: got {body[:24]!r}, expected '@', '=' or '!', seq:boot and a text")
     mark, number, boot, rest = head[1], int(head[2]), int(head[3], 16), head[4]
     try:
         if mark == "@":
             return Request(number, boot, rest)
-        tail = (_CODE if mark == "=" else _NAME).fullmatch(rest)
+        tail = (_CODE_PATTERN if mark == "=" else _NAME_PATTERN).fullmatch(rest)
         if tail is None or tail[2] == "":
             raise BadFrame(f"frame: got {rest[:24]!r} after seq:boot, expected a code or a name")
         if mark == "=":
@@ -256,7 +256,7 @@ def decode(line: bytes) -> Request | Reply | Event:
 
 def looks_framed(line: bytes) -> bool:
     """Tell whether a line is, or was before it was damaged, meant as a frame."""
-    return line[:1] in (b"@", b"=", b"!") or _SEALED.search(line) is not None
+    return line[:1] in (b"@", b"=", b"!") or _CHECKSUM_PATTERN.search(line) is not None
 
 
 def next_seq(seq: int) -> int:

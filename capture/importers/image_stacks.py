@@ -26,10 +26,10 @@ from capture.session import Session, Subject
 
 Encoding = Literal["auto", "sRGB", "linear"]
 
-RIG_NAME = "light-list"
-FAR_MM = 1000.0
-SAMPLE_POINTS = 3000
-CLEARLY = 0.8
+LIGHT_LIST_RIG_NAME = "light-list"
+ASSUMED_LIGHT_DISTANCE_MM = 1000.0
+N_SAMPLE_POINTS = 3000
+LINEAR_MISFIT_RATIO = 0.8
 """Linear values are believed when they leave less than this part of the misfit."""
 
 
@@ -211,7 +211,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             first = photo
             inside = np.ones(shape, bool) if mask is None else light_lists.read_mask(mask, shape)
             places = np.flatnonzero(inside)
-            chosen = places[:: max(1, places.size // SAMPLE_POINTS)]
+            chosen = places[:: max(1, places.size // N_SAMPLE_POINTS)]
         same = (first.encoding, first.frame.pattern, first.frame.cfa.shape, first.frame.white)
         if (photo.encoding, frame.pattern, frame.cfa.shape, frame.white) != same:
             got = f"{photo.encoding} {shape[1]} x {shape[0]} {frame.pattern}"
@@ -235,7 +235,9 @@ def _adds_up_as_codes(samples: Float64Array, found: LightList) -> bool:
     """Return whether the files' values obey the shading better than the light they should code."""
     decoded = np.clip(samples, 0.0, 1.0)
     codes = np.asarray(encode_srgb(decoded))
-    return _misfit(codes, found.directions) < CLEARLY * _misfit(decoded, found.directions)
+    return _misfit(codes, found.directions) < LINEAR_MISFIT_RATIO * _misfit(
+        decoded, found.directions
+    )
 
 
 def _misfit(samples: FloatArray, directions: Float64Array) -> float:
@@ -270,11 +272,11 @@ def _assumed(
 
 
 def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
-    positions = found.vectors if near else FAR_MM * found.directions
+    positions = found.vectors if near else ASSUMED_LIGHT_DISTANCE_MM * found.directions
     height, width = frame.cfa.shape
     black = round(sum(frame.black) / len(frame.black))
     return Rig(
-        name=RIG_NAME,
+        name=LIGHT_LIST_RIG_NAME,
         lights=tuple(
             Light(
                 name=f"L{k:03d}",
@@ -290,7 +292,7 @@ def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
                 name="cam",
                 camera_model=frame.camera_model or "unknown camera",
                 serial="unknown",
-                position_mm=(0.0, 0.0, FAR_MM),
+                position_mm=(0.0, 0.0, ASSUMED_LIGHT_DISTANCE_MM),
                 target_mm=(0.0, 0.0, 0.0),
                 up=(0.0, 1.0, 0.0),
                 focal_mm=frame.focal_mm or 50.0,

@@ -17,9 +17,9 @@ from capture.documents import Fault, InputError
 
 Encoding = Literal["raw", "linear", "sRGB"]
 
-MAX_BYTES = 2**30
-MAX_PICTURE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
-MAX_PICTURE_SIDE = 32_767
+MAX_IMAGE_BYTES = 2**30
+MAX_IMAGE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
+MAX_IMAGE_SIDE_PX = 32_767
 WHITE_DN = 65_535
 FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point pictures
 FLOAT_HEADROOM = 1.02  # nothing in a floating-point picture saturates, so its top stays below white
@@ -28,12 +28,12 @@ FLOAT_HEADROOM = 1.02  # nothing in a floating-point picture saturates, so its t
 ASSUMED_FULL_WELL_E = 20_000.0
 ASSUMED_READ_NOISE_E = 10.0
 
-_JPEG, _PNG, _EXR = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_JPEG_MAGIC, _PNG_MAGIC, _EXR_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
+_TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SUFFIXES = (".tif", ".tiff")
-_NAMES = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".exr": "OpenEXR"}
+_FORMAT_NAMES = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".exr": "OpenEXR"}
 """What a file of that name, which is none and no raw file either, was meant to be."""
-_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
+_IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
 
 
 class PhotoError(InputError):
@@ -75,13 +75,13 @@ def read_photo(path: str | Path) -> Photo:
     file = Path(path)
     where = str(file)
     head = _head(file, where)
-    if head.startswith(_JPEG):
+    if head.startswith(_JPEG_MAGIC):
         return _display(file, where, *_check_jpeg(file.read_bytes(), where))
-    if head.startswith(_PNG):
+    if head.startswith(_PNG_MAGIC):
         return _display(file, where, *_check_png(file.read_bytes(), where))
-    if head.startswith(_EXR):
+    if head.startswith(_EXR_MAGIC):
         return _exr(file, where)
-    if head.startswith(_TIFF) and file.suffix.lower() in _TIFF_SUFFIXES:
+    if head.startswith(_TIFF_MAGICS) and file.suffix.lower() in _TIFF_SUFFIXES:
         return _tiff(file, where)
     return _raw(file, where)
 
@@ -115,7 +115,7 @@ def cells_of(rgb: UInt16Array) -> UInt16Array:
 
 
 def _error(what: str, where: str, path: str, got: str, expected: str) -> PhotoError:
-    return PhotoError(what, where=where, faults=[Fault(path, got, expected)], advice=_ADVICE)
+    return PhotoError(what, where=where, faults=[Fault(path, got, expected)], advice=_IMAGE_ADVICE)
 
 
 def _head(file: Path, where: str) -> bytes:
@@ -125,8 +125,10 @@ def _head(file: Path, where: str) -> bytes:
         size = file.stat().st_size
         if size == 0:
             raise _error("is empty", where, "size", "0 bytes", "a photograph")
-        if size > MAX_BYTES:
-            raise _error("is too large", where, "size", f"{size} bytes", f"at most {MAX_BYTES}")
+        if size > MAX_IMAGE_BYTES:
+            raise _error(
+                "is too large", where, "size", f"{size} bytes", f"at most {MAX_IMAGE_BYTES}"
+            )
         with file.open("rb") as stream:
             return stream.read(16)
     except OSError as exc:
@@ -136,15 +138,15 @@ def _head(file: Path, where: str) -> bytes:
 def _check_size(width: int, height: int, where: str) -> None:
     if (
         min(width, height) < 1
-        or max(width, height) > MAX_PICTURE_SIDE
-        or (width * height > MAX_PICTURE_PIXELS)
+        or max(width, height) > MAX_IMAGE_SIDE_PX
+        or (width * height > MAX_IMAGE_PIXELS)
     ):
         raise _error(
             "is absurd in size",
             where,
             "size",
             f"{width} x {height} pixels",
-            f"sides of 1 to {MAX_PICTURE_SIDE}, at most {MAX_PICTURE_PIXELS} pixels",
+            f"sides of 1 to {MAX_IMAGE_SIDE_PX}, at most {MAX_IMAGE_PIXELS} pixels",
         )
 
 
@@ -163,11 +165,11 @@ def _raw(file: Path, where: str) -> Photo:
     try:
         frame = raw.read(file)
     except raw.RawError as exc:
-        if (kind := _NAMES.get(file.suffix.lower())) is not None:
+        if (kind := _FORMAT_NAMES.get(file.suffix.lower())) is not None:
             begins = repr(file.read_bytes()[:4])
             expected = f"those of a {kind}"
             raise _error(f"is no {kind}", where, "first bytes", begins, expected) from exc
-        raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_ADVICE) from exc
+        raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_IMAGE_ADVICE) from exc
     except NotImplementedError as exc:  # LibRaw's word for a filter array it cannot describe
         raise _error("has an unknown filter array", where, "cell", str(exc), "2 x 2") from exc
     notes = []

@@ -21,12 +21,12 @@ from capture.raw import RawFrame
 
 Kind = Literal["lp", "list", "chrome ball"]
 
-PICTURES = frozenset(
+IMAGE_SUFFIXES = frozenset(
     ".png .jpg .jpeg .tif .tiff .exr .dng .nef .cr2 .cr3 .arw .orf .rw2 .raf .pef .srw .kdc".split()
 )
 BALL_NAMES = ("chrome", "ball", "sphere", "mirror")
 MAX_LIGHTS = 10_000
-UNIT_RANGE = (0.98, 1.02)
+UNIT_LENGTH_RANGE = (0.98, 1.02)
 """Lengths up to which the rows of a list count as directions rounded in the file."""
 
 
@@ -56,7 +56,7 @@ class LightList:
     def are_unit(self) -> bool:
         """Whether the rows are directions rather than positions."""
         length = np.linalg.norm(self.vectors, axis=1)
-        return bool((length > UNIT_RANGE[0]).all() and (length < UNIT_RANGE[1]).all())
+        return bool((length > UNIT_LENGTH_RANGE[0]).all() and (length < UNIT_LENGTH_RANGE[1]).all())
 
 
 def natural(name: str) -> tuple[tuple[int, int | str], ...]:
@@ -123,7 +123,7 @@ def pictures_in(directory: Path) -> tuple[Path, ...]:
                 file
                 for file in directory.iterdir()
                 if file.is_file()
-                and file.suffix.lower() in PICTURES
+                and file.suffix.lower() in IMAGE_SUFFIXES
                 and not file.name.startswith(".")
                 and not is_mask(file)
             ),
@@ -145,7 +145,7 @@ def is_mask(file: Path) -> bool:
 
 def mask_of(directory: Path) -> Path | None:
     """Return the mask of a folder of pictures, None where it has none or several."""
-    found = [f for f in directory.iterdir() if f.suffix.lower() in PICTURES and is_mask(f)]
+    found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and is_mask(f)]
     return found[0] if len(found) == 1 else None
 
 
@@ -284,7 +284,7 @@ def _named(name: str, directory: Path, source: Path) -> Path:
     alike = [
         file
         for file in files.values()
-        if file.stem.casefold() == stem and file.suffix.lower() in PICTURES
+        if file.stem.casefold() == stem and file.suffix.lower() in IMAGE_SUFFIXES
     ]
     if len(alike) == 1:
         return alike[0]

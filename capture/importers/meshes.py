@@ -20,7 +20,7 @@ MM_PER_UNIT: Final[Mapping[str, float]] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "
 EXTENT_RANGE_MM: Final = (20.0, 3000.0)
 """Longest side of a scan of a face, a head or a person."""
 MAX_FILE_BYTES: Final = 2**31
-SCAN: Final = "scan.ply"
+SCAN_FILE: Final = "scan.ply"
 """Name of the attachment that holds a session's scanned mesh."""
 
 _PLY_COUNT: Final = re.compile(rb"element[ \t]+(vertex|face)[ \t]+(\d+)")
@@ -159,9 +159,9 @@ def import_mesh(
     """
     mesh = read_mesh(path, unit=unit)
     found = Session.open(session)
-    if SCAN in found.attachments():
+    if SCAN_FILE in found.attachments():
         advice = "What is attached stays: make a new session for another scan."
-        faults = [Fault("attachment", f"{SCAN}, attached before", "none of that name")]
+        faults = [Fault("attachment", f"{SCAN_FILE}, attached before", "none of that name")]
         raise SessionError("holds a scan already", where=str(session), faults=faults, advice=advice)
     if found.closed and out is None:
         advice = "Name a folder for a copy that holds the mesh: --out COPY."
@@ -169,11 +169,11 @@ def import_mesh(
     if out is not None:
         opened, reason = reopen_copy(session, out)
         with opened:
-            opened.attach(SCAN, mesh.to_ply(), about=mesh.about)
+            opened.attach(SCAN_FILE, mesh.to_ply(), about=mesh.about)
             opened.close(missing_because=reason)
     else:
         with Session.resume(session) as opened:
-            opened.attach(SCAN, mesh.to_ply(), about=mesh.about)
+            opened.attach(SCAN_FILE, mesh.to_ply(), about=mesh.about)
     width, height, depth = (float(x) for x in np.ptp(mesh.vertices_mm, axis=0))
     return ImportedMesh(
         str(out if out is not None else session),

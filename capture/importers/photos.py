@@ -22,14 +22,14 @@ from capture.session import Session, SessionDiskError, Subject
 
 logger = logging.getLogger(__name__)
 
-RIG_NAME = "imported"
+IMPORTED_RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
 RAW_CURVES = "Nikon 5100 (NPL)"  # what stands in for a camera nobody measured
-PICTURE_CURVES = "linear sRGB"
-SIDECARS = frozenset(
+IMAGE_CURVES = "linear sRGB"
+SIDECAR_SUFFIXES = frozenset(
     ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
 )
-_POLARIZERS = {"parallel": "parallel", "crossed": "crossed", "cross": "crossed"}
+_POLARIZER_WORDS = {"parallel": "parallel", "crossed": "crossed", "cross": "crossed"}
 _SENSOR_MM = 36.0  # width of the full-frame sensor that stands in for an unknown one
 _DISTANCE_MM = 1000.0
 
@@ -198,7 +198,7 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
         )
     files, ignored = [], []
     for file in sorted(directory.iterdir()):
-        if file.is_dir() or file.name.startswith(".") or file.suffix.lower() in SIDECARS:
+        if file.is_dir() or file.name.startswith(".") or file.suffix.lower() in SIDECAR_SUFFIXES:
             ignored.append(file.name)
         else:
             files.append(file)
@@ -278,7 +278,7 @@ def _rig(
     names = {camera: "cam" if k == 0 else f"cam{k + 1}" for k, camera in enumerate(cameras)}
     first = {entry.camera: entry for entry in reversed(entries)}
     made = Rig(
-        name=RIG_NAME,
+        name=IMPORTED_RIG_NAME,
         lights=(
             Light(
                 name="unknown",
@@ -317,7 +317,7 @@ def _view(name: str, entry: _Entry, serial: str, sensitivity: str | None) -> Vie
         black_level=black,
         white_level=white,
         spectral_sensitivity=sensitivity
-        or (RAW_CURVES if entry.encoding == "raw" else PICTURE_CURVES),
+        or (RAW_CURVES if entry.encoding == "raw" else IMAGE_CURVES),
         analyser_axis_deg=0.0,
         full_well_e=20_000.0,
         read_noise_e=10.0,
@@ -333,8 +333,10 @@ def _named(stem: str) -> tuple[str, str | None]:
     (('anna-2', 'crossed'), ('portrait', None), ('neutral', 'crossed'))
     """
     words = [word for word in re.split(r"[^A-Za-z0-9]+", stem) if word]
-    polarizer = next((_POLARIZERS[w.lower()] for w in words if w.lower() in _POLARIZERS), None)
-    rest = [word for word in words if word.lower() not in _POLARIZERS]
+    polarizer = next(
+        (_POLARIZER_WORDS[w.lower()] for w in words if w.lower() in _POLARIZER_WORDS), None
+    )
+    rest = [word for word in words if word.lower() not in _POLARIZER_WORDS]
     return "-".join(rest)[:60] or "neutral", polarizer
 
 

@@ -7,13 +7,22 @@ from capture.plan.flash import (
     flash_calibration_plan,
     flash_plan,
 )
-from capture.plan.steps import KINDS, POLARIZERS, Kind, Plan, PlanError, Polarizer, Step, Value
+from capture.plan.steps import (
+    POLARIZER_STATES,
+    STEP_KINDS,
+    Kind,
+    Plan,
+    PlanError,
+    Polarizer,
+    Step,
+    Value,
+)
 
 __all__ = [
     "FLAT_POWERS",
-    "KINDS",
     "MALUS_ANGLES_DEG",
-    "POLARIZERS",
+    "POLARIZER_STATES",
+    "STEP_KINDS",
     "Kind",
     "Plan",
     "PlanError",

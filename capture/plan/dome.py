@@ -19,15 +19,15 @@ DomeTarget = Literal["charuco", "mirror", "white", "dark"]
 EXPOSURES_S = (0.06, 0.015)
 """Two stops apart; the longer one and its read-out fit into a twelfth of a second."""
 FRAMES_PER_S = 12.0
-TRACKING_EVERY = 25
+TRACKING_INTERVAL_LIGHTS = 25
 """Lights between two tracking frames."""
-TRACKING_LIGHTS = 6
-TRACKING_FLOOR = 0.25
+N_TRACKING_LIGHTS = 6
+MIN_TRACKING_LIGHT = 0.25
 """Least light of a tracking frame at the eyes, of the brightest single light."""
-LEAST_COSINE = 0.15
+MIN_PLATE_COSINE = 0.15
 """Lights that meet a plate flatter than this tell nothing of it."""
-OUTLINE_LIGHTS = 24
-MIRROR_GROUP = 8
+N_OUTLINE_LIGHTS = 24
+N_MIRROR_LIGHTS = 8
 """Lights that are on together to show a sphere's outline, and in a sphere."""
 MIRROR_LEVEL = 0.002
 """Of these: a sphere shows the radiance of an LED, thousands of times that of a lit white."""
@@ -40,7 +40,7 @@ def dome_plan(
     *,
     exposures_s: Sequence[float] = EXPOSURES_S,
     frames_per_s: float = FRAMES_PER_S,
-    tracking_every: int = TRACKING_EVERY,
+    tracking_every: int = TRACKING_INTERVAL_LIGHTS,
     darks: int = 2,
     level: float = 1.0,
     iso: int = 100,
@@ -183,7 +183,7 @@ def dome_calibration_plan(
         normal = None if plate_normals is None else plate_normals[pose]
         for light in order:
             name = rig.lights[light].name
-            if normal is None or _cosine(rig.lights[light].position_mm, normal) > LEAST_COSINE:
+            if normal is None or _cosine(rig.lights[light].position_mm, normal) > MIN_PLATE_COSINE:
                 series.add(
                     f"W{pose}-{name}",
                     "white",
@@ -208,7 +208,7 @@ def tracking_lights(rig: Rig) -> list[int]:
     place /= np.linalg.norm(place, axis=1)[:, None]
     front = [k for k in range(len(place)) if place[k, 2] > 0.0] or list(range(len(place)))
     chosen = [max(front, key=lambda k: place[k, 2])]
-    while len(chosen) < min(TRACKING_LIGHTS, len(front)):
+    while len(chosen) < min(N_TRACKING_LIGHTS, len(front)):
         nearest = (place[front] @ place[chosen].T).max(axis=1)
         chosen.append(front[int(np.argmin(nearest))])
     return sorted(chosen)
@@ -277,7 +277,7 @@ class _Series:
         So it is no flash among its neighbours.
         """
         brightest = level * float(self._eye.max())
-        wanted = max(level * float(self._eye[before]), TRACKING_FLOOR * brightest)
+        wanted = max(level * float(self._eye[before]), MIN_TRACKING_LIGHT * brightest)
         self.several(
             f"T{number}-{after:03d}",
             "tracking",
@@ -311,8 +311,8 @@ class _Series:
 
         The lights of a group are far apart in the order, and so on the dome and in the sphere.
         """
-        some = max(1, math.ceil(len(order) / min(OUTLINE_LIGHTS, self._limits.max_at_once)))
-        groups = math.ceil(len(order) / min(MIRROR_GROUP, self._limits.max_at_once))
+        some = max(1, math.ceil(len(order) / min(N_OUTLINE_LIGHTS, self._limits.max_at_once)))
+        groups = math.ceil(len(order) / min(N_MIRROR_LIGHTS, self._limits.max_at_once))
         for sphere in range(count):
             self._lit(
                 f"M{sphere}-outline",

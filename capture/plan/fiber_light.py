@@ -23,7 +23,7 @@ SKIN_APERTURE_MM = 3.5
 
 
 @dataclass(frozen=True, slots=True)
-class FibreLight:
+class FiberLight:
     """Light out of the source fibre."""
 
     led: str
@@ -40,7 +40,7 @@ class FibreLight:
     """After which an eye at the fibre would be at the blue-light limit, s."""
 
 
-def fibre_light(plan: Plan, rig: Rig) -> FibreLight:
+def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
     """Return the light that a plan of the fibre probe gives.
 
     Examples
@@ -48,7 +48,7 @@ def fibre_light(plan: Plan, rig: Rig) -> FibreLight:
     >>> from capture.plan.probe import probe_plan
     >>> from capture.rig import load_rig
     >>> rig = load_rig("probe")
-    >>> light = fibre_light(probe_plan(rig), rig)
+    >>> light = fiber_light(probe_plan(rig), rig)
     >>> round(light.led_ws, 3), round(light.placement_ws, 3), round(light.skin_w_m2)
     (0.243, 0.081, 104)
     """
@@ -64,7 +64,7 @@ def fibre_light(plan: Plan, rig: Rig) -> FibreLight:
     # a cone of half angle asin(NA), evenly filled: etendue of the core
     etendue_m2_sr = core_m2 * math.pi * probe.source_numerical_aperture**2
     stare_s = BLUE_LIMIT_J_M2_SR * etendue_m2_sr / power_w if power_w > 0 else math.inf
-    return FibreLight(
+    return FiberLight(
         led=source.name,
         led_ws=source_energy_ws(plan, rig),
         placement_ws=max(by_placement.values(), default=0.0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, get_args
 
-from capture.plan.steps import POLARIZERS, Kind, Plan, Polarizer, Step, Value, require
+from capture.plan.steps import POLARIZER_STATES, Kind, Plan, Polarizer, Step, Value, require
 from capture.rig import Rig
 
 Target = Literal["dark", "flat", "chart", "malus"]
@@ -131,7 +131,7 @@ def flash_calibration_plan(
     elif target == "flat":
         conditions = [({"power": p}, {"polarizer": "parallel", "power": p}) for p in FLAT_POWERS]
     elif target == "chart":
-        conditions = [({"polarizer": p}, {"polarizer": p, "power": 1.0}) for p in POLARIZERS]
+        conditions = [({"polarizer": p}, {"polarizer": p, "power": 1.0}) for p in POLARIZER_STATES]
     else:
         conditions = [
             ({"analyser_deg": a}, {"polarizer": "parallel", "analyser_deg": a, "power": 1.0})

@@ -23,12 +23,12 @@ from capture.rig import LedLimits, Rig
 
 BAND_HZ = (3.0, 65.0)
 FUSION_HZ = 65.0
-FLASH_SHARE = 0.1
+MIN_FLASH_CHANGE = 0.1
 """Least change of a flash, of the brightest light of the plan."""
-SAMPLE_S = 1e-3
-REST_S = 1.0
+EYE_SAMPLE_S = 1e-3
+DARK_PADDING_S = 1.0
 """Darkness before and after each piece of a plan."""
-RMS_FROM_S = 2.0
+MIN_RMS_DURATION_S = 2.0
 """Shorter pieces are judged by their flashes alone: of one flash, any rms over mean is large."""
 
 
@@ -53,7 +53,7 @@ class FlickerReport:
 def eye_signal(
     rows: Sequence[LedRow], weights: Float64Array, *, overlap_s: float = 0.0
 ) -> Float64Array:
-    """Return the light at the eyes, averaged over each `SAMPLE_S`, with rest before and after.
+    """Return the light at the eyes, averaged over each `EYE_SAMPLE_S`, with rest before and after.
 
     Parameters
     ----------
@@ -72,19 +72,21 @@ def eye_signal(
     ends = np.cumsum([row.dwell_s for row in rows])
     starts = np.concatenate([[0.0], ends[:-1] - overlap_s]) if len(rows) else ends
     # the integral of each row's light up to t is a ramp from its start to its end
-    count = int(np.ceil((float(ends[-1]) + 2.0 * REST_S) / SAMPLE_S)) if len(rows) else 0
-    edges = np.arange(count + 1) * SAMPLE_S - REST_S
+    count = (
+        int(np.ceil((float(ends[-1]) + 2.0 * DARK_PADDING_S) / EYE_SAMPLE_S)) if len(rows) else 0
+    )
+    edges = np.arange(count + 1) * EYE_SAMPLE_S - DARK_PADDING_S
     times = np.concatenate([starts, ends])
     slopes = np.concatenate([light, -light])
     order = np.argsort(times, kind="stable")
     times, rates = times[order], np.cumsum(slopes[order])
     held = np.concatenate([[0.0], np.cumsum(rates[:-1] * np.diff(times))])
-    return np.asarray(np.diff(np.interp(edges, times, held)) / SAMPLE_S)
+    return np.asarray(np.diff(np.interp(edges, times, held)) / EYE_SAMPLE_S)
 
 
-def fused(signal: Float64Array) -> Float64Array:
+def average_over_flicker_fusion(signal: Float64Array) -> Float64Array:
     """Return a signal averaged over 1/65 s, as the eye sees it."""
-    width = round(1.0 / FUSION_HZ / SAMPLE_S)
+    width = round(1.0 / FUSION_HZ / EYE_SAMPLE_S)
     return np.convolve(signal, np.full(width, 1.0 / width), mode="same")
 
 
@@ -112,10 +114,10 @@ def count_flashes(signal: Float64Array, *, least: float) -> float:
         elif abs(value - extreme) >= least:
             rising, extreme = not rising, value
             turns.append(number)
-    times = np.array(turns) * SAMPLE_S
+    times = np.array(turns) * EYE_SAMPLE_S
     if times.size == 0:
         return 0.0
-    inside = np.searchsorted(times, times + 1.0 - 0.5 * SAMPLE_S) - np.arange(times.size)
+    inside = np.searchsorted(times, times + 1.0 - 0.5 * EYE_SAMPLE_S) - np.arange(times.size)
     return float(inside.max()) / 2.0
 
 
@@ -124,7 +126,7 @@ def band_rms(signal: Float64Array) -> float:
 
     Examples
     --------
-    >>> t = np.arange(10_000) * SAMPLE_S
+    >>> t = np.arange(10_000) * EYE_SAMPLE_S
     >>> round(band_rms(1.0 + 0.1 * np.sin(2 * np.pi * 12.0 * t)), 6)
     0.070711
     """
@@ -132,7 +134,7 @@ def band_rms(signal: Float64Array) -> float:
     if mean <= 0.0:
         return 0.0
     power = np.abs(np.fft.rfft(signal)) ** 2
-    frequency_hz = np.fft.rfftfreq(signal.size, SAMPLE_S)
+    frequency_hz = np.fft.rfftfreq(signal.size, EYE_SAMPLE_S)
     inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
     return float(np.sqrt(2.0 * power[inside].sum()) / signal.size / mean)
 
@@ -151,10 +153,10 @@ def flicker_of_rows(
     seconds = sum(row.dwell_s for row in rows)
     if not signal.size or signal.max() <= 0.0:
         return FlickerReport(0.0, 0.0, seconds, 0.0)
-    rest = round(REST_S / SAMPLE_S)
-    seen = fused(signal)
-    rms = band_rms(signal[rest:-rest]) if seconds >= RMS_FROM_S else 0.0
-    flashes = count_flashes(seen, least=FLASH_SHARE * float(seen.max()))
+    rest = round(DARK_PADDING_S / EYE_SAMPLE_S)
+    seen = average_over_flicker_fusion(signal)
+    rms = band_rms(signal[rest:-rest]) if seconds >= MIN_RMS_DURATION_S else 0.0
+    flashes = count_flashes(seen, least=MIN_FLASH_CHANGE * float(seen.max()))
     return FlickerReport(flashes, rms, seconds, float(signal[rest:-rest].mean()))
 
 

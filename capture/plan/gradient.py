@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from capture.plan.rows import led_rows, passes
-from capture.plan.steps import PATTERNS, POLARIZERS, Kind, Plan, Step, Value, require
+from capture.plan.steps import LIGHT_PATTERNS, POLARIZER_STATES, Kind, Plan, Step, Value, require
 from capture.rig import Caliper, LedLimits, Rig
 
 GradientTarget = Literal["ball", "dark", "flat"]
@@ -75,7 +75,7 @@ def gradient_plan(
     *,
     angles: Sequence[float] | None = None,
     steps: tuple[int, int] | None = None,
-    patterns: Sequence[str] = PATTERNS,
+    patterns: Sequence[str] = LIGHT_PATTERNS,
     darks: int = 2,
     exposure_s: float = EXPOSURE_S,
     dwell_s: float = DWELL_S,
@@ -94,7 +94,7 @@ def gradient_plan(
         First (<= 0) and last (>= 0) position; all of the caliper's by default. How far skin really
         follows is found out when it is captured.
     patterns : sequence of str
-        Of :data:`capture.plan.steps.PATTERNS`.
+        Of :data:`capture.plan.steps.LIGHT_PATTERNS`.
     darks : int
         Frames without light at the beginning, >= 0, beside the "dark" of each scan.
     exposure_s, dwell_s : float
@@ -143,7 +143,7 @@ def gradient_plan(
     for angle in chosen:
         for position in (0, *range(-1, first - 1, -1), *range(1, last + 1)):
             name = state_name(angle, position).replace("_", "-")
-            for polarizer in POLARIZERS:
+            for polarizer in POLARIZER_STATES:
                 for pattern in ordered:
                     series.add(
                         f"{name}-{polarizer[:3]}-{pattern}",
@@ -224,7 +224,7 @@ def gradient_calibration_plan(
                 )
     else:
         for reading, levels in BALL_SERIES.items():
-            polarizer = POLARIZERS[round(reading / 90)]
+            polarizer = POLARIZER_STATES[round(reading / 90)]
             every: dict[str, Value] = {} if reading in (0, 90) else {"analyser_deg": reading}
             for number, share in enumerate((*levels, 0.0)):
                 pattern = "full" if share else "dark"
@@ -299,7 +299,7 @@ def _whole(angle_deg: float) -> int | float:
 def _ordered(patterns: Sequence[str]) -> list[str]:
     chosen = list(patterns)
     for pattern in chosen:
-        require(pattern in PATTERNS, "patterns", pattern, f"of {', '.join(PATTERNS)}")
+        require(pattern in LIGHT_PATTERNS, "patterns", pattern, f"of {', '.join(LIGHT_PATTERNS)}")
     require(len(set(chosen)) == len(chosen) > 0, "patterns", chosen, "at least one, none twice")
     return sorted(chosen, key=SCAN_ORDER.index)
 

@@ -17,7 +17,7 @@ from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.rows import LedRow
 from capture.rig import Rig
 
-BANDS = 6
+N_ORDER_BANDS = 6
 """Bands of eye light within which the path is kept short."""
 
 
@@ -55,7 +55,7 @@ def rise_and_fall_nearby(rig: Rig) -> list[int]:
     legs = [rising[::2], rising[1::2][::-1]]
     order: list[int] = []
     for leg in legs:
-        for band in np.array_split(leg, BANDS):
+        for band in np.array_split(leg, N_ORDER_BANDS):
             rest = [int(k) for k in band]
             if rest:
                 start = order[-1] if order else rest[0]
@@ -64,7 +64,7 @@ def rise_and_fall_nearby(rig: Rig) -> list[int]:
     return order
 
 
-ORDERS: Mapping[str, Callable[[Rig], list[int]]] = MappingProxyType(
+LIGHT_ORDERS: Mapping[str, Callable[[Rig], list[int]]] = MappingProxyType(
     {
         "name": by_name,
         "spiral": spiral,
@@ -90,7 +90,7 @@ def compare_orders(rig: Rig, *, dwell_s: float) -> dict[str, FlickerReport]:
         name: flicker_of_rows(
             [LedRow((k,), 1.0, dwell_s) for k in order(rig)], weights, overlap_s=overlap_s
         )
-        for name, order in ORDERS.items()
+        for name, order in LIGHT_ORDERS.items()
     }
 
 
@@ -111,7 +111,7 @@ def best_order(rig: Rig, *, dwell_s: float) -> list[int]:
     """
     found = compare_orders(rig, dwell_s=dwell_s)
     best = min(found, key=lambda name: (found[name].flashes_per_s, found[name].rms))
-    return ORDERS[best](rig)
+    return LIGHT_ORDERS[best](rig)
 
 
 def _directions(rig: Rig) -> Float64Array:

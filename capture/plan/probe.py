@@ -18,22 +18,22 @@ from capture.rig import Probe, Rig, is_id
 
 ProbeTarget = Literal["phantom", "dark"]
 
-SITES = ("forehead", "cheek", "chin")
+PROBE_SITES = ("forehead", "cheek", "chin")
 """Where Weyrich et al. (2006) placed their head; "chin" is below it."""
-PHANTOM = "phantom"
+PHANTOM_SITE = "phantom"
 """Site of the block of known optics."""
-CAP = "cap"
+CAP_SITE = "cap"
 """Where the head is while frames without light are taken."""
-BRACKETS = 23
-LONGEST_S = 30.0
-STEP_EV = 2.0 / 3.0
+N_BRACKETS = 23
+MAX_EXPOSURE_S = 30.0
+BRACKET_STEP_EV = 2.0 / 3.0
 """Weyrich et al. (2006), section 8 (doi 10.1145/1141911.1141987): 23 pictures, 2/3 stop apart, in
 about 88 s. From 30 s down they take 81 s, and 0.3 s each to be read out."""
-DARK_SHARES = (0.0, 0.75, 1.0)
+DARK_POSITIONS = (0.0, 0.75, 1.0)
 """Where in the series, from its shortest to its longest exposure, frames without light stand."""
-MASK_EVERY = 3
+MASK_INTERVAL = 3
 """Every third exposure of the series is planned for a covered head: two stops apart."""
-MASK_LONGEST_S = 8.0
+MAX_MASK_EXPOSURE_S = 8.0
 """A covered head is exposed no longer: cross-talk from a fibre that is dim after this is lost in
 the noise, and does not matter."""
 
@@ -41,12 +41,12 @@ the noise, and does not matter."""
 def probe_plan(
     rig: Rig,
     *,
-    sites: Sequence[str] = SITES,
+    sites: Sequence[str] = PROBE_SITES,
     repeats: int = 1,
     angles: int = 1,
-    brackets: int = BRACKETS,
-    longest_s: float = LONGEST_S,
-    step_ev: float = STEP_EV,
+    brackets: int = N_BRACKETS,
+    longest_s: float = MAX_EXPOSURE_S,
+    step_ev: float = BRACKET_STEP_EV,
     darks: int = 2,
     level: float = 1.0,
     iso: int = 100,
@@ -108,8 +108,8 @@ def probe_plan(
     """
     chosen = tuple(sites)
     for site in chosen:
-        named = is_id(site) and site not in (PHANTOM, CAP)
-        require(named, "sites", site, f"a name, not {PHANTOM!r} or {CAP!r}")
+        named = is_id(site) and site not in (PHANTOM_SITE, CAP_SITE)
+        require(named, "sites", site, f"a name, not {PHANTOM_SITE!r} or {CAP_SITE!r}")
     require(len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice")
     require(repeats >= 1, "repeats", repeats, ">= 1")
     require(1 <= angles <= 360, "angles", angles, "1 to 360")
@@ -129,9 +129,9 @@ def probe_calibration_plan(
     target: ProbeTarget = "phantom",
     *,
     repeats: int = 1,
-    brackets: int = BRACKETS,
-    longest_s: float = LONGEST_S,
-    step_ev: float = STEP_EV,
+    brackets: int = N_BRACKETS,
+    longest_s: float = MAX_EXPOSURE_S,
+    step_ev: float = BRACKET_STEP_EV,
     darks: int = 4,
     level: float = 1.0,
     iso: int = 100,
@@ -144,7 +144,7 @@ def probe_calibration_plan(
         With a probe.
     target : {"phantom", "dark"}
         "phantom": darks; the series of exposures on a block of known optics; then per fibre some
-        exposures with all other fibres covered, `MASK_EVERY` brackets apart. Of those only two
+        exposures with all other fibres covered, `MASK_INTERVAL` brackets apart. Of those only two
         that serve are taken unless all are asked for, see `capture.acquire.probe.mask_choice`;
         "dark": the darks only.
     repeats : int
@@ -174,14 +174,17 @@ def probe_calibration_plan(
     series.darks(darks)
     if target == "phantom":
         for repeat in range(repeats):
-            series.measure("phantom", PHANTOM, repeat, 0.0)
+            series.measure("phantom", PHANTOM_SITE, repeat, 0.0)
             if repeat == 0:
                 series.masks()
     return series.plan()
 
 
 def exposure_series_s(
-    brackets: int = BRACKETS, *, longest_s: float = LONGEST_S, step_ev: float = STEP_EV
+    brackets: int = N_BRACKETS,
+    *,
+    longest_s: float = MAX_EXPOSURE_S,
+    step_ev: float = BRACKET_STEP_EV,
 ) -> tuple[float, ...]:
     """Return the exposures of a series, s, from short to long.
 
@@ -252,7 +255,7 @@ class _Series:
     def darks(self, count: int) -> None:
         require(count >= 0, "darks", count, ">= 0")
         last = len(self._exposures_s) - 1
-        for bracket in dict.fromkeys(round(share * last) for share in DARK_SHARES):
+        for bracket in dict.fromkeys(round(share * last) for share in DARK_POSITIONS):
             for repeat in range(count):
                 self._add(
                     f"dark-b{bracket:02d}-r{repeat}",
@@ -273,8 +276,8 @@ class _Series:
             )
 
     def masks(self) -> None:
-        longest_s = max(MASK_LONGEST_S, self._exposures_s[0])
-        exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_EVERY][::-1]
+        longest_s = max(MAX_MASK_EXPOSURE_S, self._exposures_s[0])
+        exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_INTERVAL][::-1]
         for fibre in range(len(self._probe.fibres)):
             for bracket, exposure_s in enumerate(exposures_s):
                 self._add(

@@ -12,7 +12,7 @@ from capture.arrays import Float64Array
 from capture.plan.steps import Step, require
 from capture.rig import Rig, Vector
 
-_AXES = {"x": 0, "y": 1, "z": 2}
+_AXIS_INDEX = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> Float64Array:
     places = np.asarray(places_mm, np.float64)
     if pattern in ("full", "dark"):
         return np.full(len(places), float(pattern == "full"))
-    axis = _AXES.get(pattern.removeprefix("-"))
+    axis = _AXIS_INDEX.get(pattern.removeprefix("-"))
     require(axis is not None, "pattern", pattern, "full, x, y, z, -x, -y, -z or dark")
     coordinate = places[:, axis] / np.linalg.norm(places, axis=1)
     return 0.5 * (1.0 - coordinate if pattern.startswith("-") else 1.0 + coordinate)

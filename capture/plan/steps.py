@@ -10,7 +10,16 @@ from typing import Any, ClassVar, Literal, get_args
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, Fault, InputError, near_miss, parse, read_json, shown
+from capture.documents import (
+    STRICT_CONFIG,
+    Checks,
+    Fault,
+    InputError,
+    near_miss,
+    parse,
+    read_json,
+    shown,
+)
 from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
 
@@ -37,13 +46,13 @@ Polarizer = Literal["parallel", "crossed"]
 Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]
 """Light of the gradient sphere: 1, or (1 + w)/2 with w a coordinate of the way to the light."""
 
-PATTERNS: tuple[str, ...] = get_args(Pattern)
-KINDS: tuple[str, ...] = get_args(Kind)
-POLARIZERS: tuple[str, ...] = get_args(Polarizer)
+LIGHT_PATTERNS: tuple[str, ...] = get_args(Pattern)
+STEP_KINDS: tuple[str, ...] = get_args(Kind)
+POLARIZER_STATES: tuple[str, ...] = get_args(Polarizer)
 
 # settings every rig understands: name -> (types, test, what is expected)
-_SETTINGS: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
-    "polarizer": ((str,), lambda v: v in POLARIZERS, '"parallel" or "crossed"'),
+_SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
+    "polarizer": ((str,), lambda v: v in POLARIZER_STATES, '"parallel" or "crossed"'),
     "analyser_deg": ((int, float), lambda v: 0 <= v < 360, "0 <= degrees < 360"),
     "power": ((int, float), lambda v: 0 <= v <= 1, "0 <= power <= 1"),
     "exposure_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
@@ -51,7 +60,7 @@ _SETTINGS: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "level": ((int, float), lambda v: 0 <= v <= 1, "0 <= level <= 1"),
     "light": ((str,), lambda v: is_id(v), "a light's name, or none"),
     "leds": ((str,), lambda v: all(is_id(name) for name in v.split("+")), "names joined by +"),
-    "pattern": ((str,), lambda v: v in PATTERNS, f"one of {', '.join(PATTERNS)}"),
+    "pattern": ((str,), lambda v: v in LIGHT_PATTERNS, f"one of {', '.join(LIGHT_PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
     "fibre": ((int,), lambda v: v >= 0, "a fibre's number >= 0, or none for all"),
@@ -99,7 +108,7 @@ class Step:
       settings.exposure: got 0.1, expected a known setting; did you mean exposure_s? (in s)
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     id: str
     kind: Kind
@@ -110,7 +119,7 @@ class Step:
     def __post_init__(self) -> None:
         checks = Checks(f"Step {self.id!r}", PlanError)
         checks.that("id", self.id, is_id(self.id), ID_RULE)
-        checks.that("kind", self.kind, self.kind in KINDS, f"one of {', '.join(KINDS)}")
+        checks.that("kind", self.kind, self.kind in STEP_KINDS, f"one of {', '.join(STEP_KINDS)}")
         for table, types in (("index", (str, int, float)), ("settings", (str, int, float, bool))):
             for key, value in getattr(self, table).items():
                 good = isinstance(value, types) and (types[-1] is bool or value is not True)
@@ -146,11 +155,11 @@ def check_settings(settings: Mapping[str, Value]) -> list[Fault]:
     """Return the faults of known settings, and of names that are a near miss of a known one."""
     faults = []
     for key, value in settings.items():
-        if key in _SETTINGS:
-            types, good, expected = _SETTINGS[key]
+        if key in _SETTING_RULES:
+            types, good, expected = _SETTING_RULES[key]
             if not isinstance(value, types) or isinstance(value, bool) or not good(value):
                 faults.append(Fault(f"settings.{key}", shown(value), expected))
-        elif hint := near_miss(key, _SETTINGS):
+        elif hint := near_miss(key, _SETTING_RULES):
             faults.append(Fault(f"settings.{key}", shown(value), "a known setting", hint))
     return faults
 
@@ -169,7 +178,7 @@ class Plan:
         What the planner kept to, e.g. ``{"max_pops_per_min": 20.0, "recycle_s": 1.5}``.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     rig: str
     steps: tuple[Step, ...]

@@ -8,9 +8,9 @@ from typing import Protocol
 
 from capture.rig import Probe
 
-SLACK_S = 0.1
+WIRE_SLACK_S = 0.1
 """What words on the wire and a camera may take beside exposure and read-out, s."""
-PUMPING_S = 2.0
+PUMP_TIME_S = 2.0
 """About how long a pump takes to reach its suction, s."""
 
 
@@ -70,7 +70,7 @@ def room_s(probe: Probe) -> float:
     >>> room_s(load_rig("probe").probe)
     57.0
     """
-    return probe.max_suction_s - PUMPING_S - probe.settle_s
+    return probe.max_suction_s - PUMP_TIME_S - probe.settle_s
 
 
 def spans(seconds: Sequence[float], probe: Probe) -> list[range]:
@@ -86,10 +86,10 @@ def spans(seconds: Sequence[float], probe: Probe) -> list[range]:
     found: list[range] = []
     first, used_s = 0, 0.0
     for number, one_s in enumerate(seconds):
-        if number > first and used_s + one_s + SLACK_S > room_s(probe):
+        if number > first and used_s + one_s + WIRE_SLACK_S > room_s(probe):
             found.append(range(first, number))
             first, used_s = number, 0.0
-        used_s += one_s + SLACK_S
+        used_s += one_s + WIRE_SLACK_S
     return [*found, range(first, len(seconds))] if seconds else found
 
 
@@ -99,7 +99,7 @@ def held_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -
 
     def end_of_group() -> float:
         count = len(spans(group, probe))
-        return count * (PUMPING_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s
+        return count * (PUMP_TIME_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s
 
     for step, one_s in zip(steps, seconds, strict=True):
         place = placement_of(step) if "suction_mbar" in step.settings else None

@@ -38,18 +38,18 @@ from capture.raw.tiff import (
     entry,
 )
 
-NAMESPACE = "urn:skinrig:frame:1"
-SOFTWARE = "skinrig"
+XMP_NAMESPACE = "urn:skinrig:frame:1"
+SOFTWARE_NAME = "skinrig"
 
-_LETTERS = "RGB"
-_CFA, _LINEAR_RAW = 32803, 34892
-_ALIGNMENT = 64
+_CFA_LETTERS = "RGB"
+_CFA_PHOTOMETRIC, _LINEAR_PHOTOMETRIC = 32803, 34892
+_ALIGNMENT_BYTES = 64
 _CROP_PX = 8
 _HEAD_BYTES = 65_536
 # XYZ (D65) -> linear sRGB, IEC 61966-2-1: stands in the file where the camera's own is unknown
-_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
+_SRGB_FROM_XYZ = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
 
-_XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+_XMP_TEMPLATE = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
 <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:skinrig="{namespace}" {attributes}/>
@@ -148,7 +148,7 @@ def encode_dng(
     # lay out once with zero offsets to learn the sizes, then with the true ones
     main = directory(_main_entries(frame, pixels, 0, 0), 8)
     exif_at = 8 + len(main)
-    pixels_at = -(-(exif_at + len(directory(exif, exif_at))) // _ALIGNMENT) * _ALIGNMENT
+    pixels_at = -(-(exif_at + len(directory(exif, exif_at))) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
     main = directory(_main_entries(frame, pixels, exif_at, pixels_at), 8)
     head = struct.pack("<2sHI", b"II", 42, 8) + main + directory(exif, exif_at)
     return head.ljust(pixels_at, b"\0") + pixels
@@ -173,7 +173,7 @@ def is_ours(buffer: memoryview) -> bool:
     never guessed at by a lenient one (LibRaw knows some formats by nothing but the file's size).
     """
     head = bytes(buffer[:_HEAD_BYTES])
-    return NAMESPACE.encode() in head or f"{SOFTWARE}\0".encode() in head
+    return XMP_NAMESPACE.encode() in head or f"{SOFTWARE_NAME}\0".encode() in head
 
 
 def decode_dng(buffer: memoryview, *, where: str = "") -> RawFrame:
@@ -185,11 +185,11 @@ def decode_dng(buffer: memoryview, *, where: str = "") -> RawFrame:
         Where the file is cut short, damaged in one bit of its pixels, or not of ours.
     """
     tags = Directory(buffer, where=where)
-    if 50706 not in tags or NAMESPACE.encode() not in tags.data(700):
-        raise _error("is not a DNG of skinrig", where, "XMP", "no skinrig namespace", NAMESPACE)
+    if 50706 not in tags or XMP_NAMESPACE.encode() not in tags.data(700):
+        raise _error("is not a DNG of skinrig", where, "XMP", "no skinrig namespace", XMP_NAMESPACE)
     words = _read_xmp(tags.data(700), where)
     pixels = _pixels(buffer, tags, words.get("pixels", ""), where)
-    mono = tags.integer(262) == _LINEAR_RAW
+    mono = tags.integer(262) == _LINEAR_PHOTOMETRIC
     exif = next(iter(tags.children(34665)), None)
     if exif is None:
         raise _error("is damaged", where, "EXIF directory", "none", "one")
@@ -222,14 +222,14 @@ def decode_dng(buffer: memoryview, *, where: str = "") -> RawFrame:
             path=where,
         )
     except RawError as exc:
-        raise RawError("is damaged", where=where, faults=exc.faults, advice=_ADVICE) from exc
+        raise RawError("is damaged", where=where, faults=exc.faults, advice=_DNG_ADVICE) from exc
 
 
-_ADVICE = "Take the file from its source again, or retake the frame."
+_DNG_ADVICE = "Take the file from its source again, or retake the frame."
 
 
 def _error(what: str, where: str, path: str, got: str, expected: str) -> RawError:
-    return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_ADVICE)
+    return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_DNG_ADVICE)
 
 
 def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) -> list[Entry]:
@@ -244,8 +244,8 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
         entry(257, LONG, [height]),
         entry(258, SHORT, [16]),
         entry(259, SHORT, [1]),
-        entry(262, SHORT, [_LINEAR_RAW if mono else _CFA]),
-        entry(271, ASCII, SOFTWARE),
+        entry(262, SHORT, [_LINEAR_PHOTOMETRIC if mono else _CFA_PHOTOMETRIC]),
+        entry(271, ASCII, SOFTWARE_NAME),
         entry(272, ASCII, model),
         entry(273, LONG, [pixels_at]),
         entry(274, SHORT, [1]),
@@ -253,7 +253,7 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
         entry(278, LONG, [height]),
         entry(279, LONG, [len(pixels)]),
         entry(284, SHORT, [1]),
-        entry(305, ASCII, SOFTWARE),
+        entry(305, ASCII, SOFTWARE_NAME),
         entry(700, BYTE, _xmp(frame, pixels)),
         entry(34665, LONG, [exif_at]),
         entry(50706, BYTE, [1, 4, 0, 0]),
@@ -268,10 +268,14 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
         entry(50829, LONG, [0, 0, height, width]),
     ]
     if not mono:
-        matrix = _SRGB if frame.color_matrix is None else tuple(frame.color_matrix.ravel().tolist())
+        matrix = (
+            _SRGB_FROM_XYZ
+            if frame.color_matrix is None
+            else tuple(frame.color_matrix.ravel().tolist())
+        )
         entries += [
             entry(33421, SHORT, [2, 2]),
-            entry(33422, BYTE, [_LETTERS.index(c) for c in frame.pattern]),
+            entry(33422, BYTE, [_CFA_LETTERS.index(c) for c in frame.pattern]),
             entry(50710, BYTE, [0, 1, 2]),
             entry(50711, SHORT, [1]),
             entry(50721, SRATIONAL, matrix),
@@ -321,7 +325,7 @@ def _xmp(frame: RawFrame, pixels: bytes) -> bytes:
         "pixels": f"xxh3-128:{xxhash.xxh3_128_hexdigest(pixels)}",
     }
     attributes = " ".join(f"skinrig:{key}={quoteattr(text)}" for key, text in words.items())
-    return _XMP.format(namespace=NAMESPACE, attributes=attributes).encode("utf-8")
+    return _XMP_TEMPLATE.format(namespace=XMP_NAMESPACE, attributes=attributes).encode("utf-8")
 
 
 def _read_xmp(packet: bytes, where: str) -> dict[str, str]:
@@ -332,7 +336,7 @@ def _read_xmp(packet: bytes, where: str) -> dict[str, str]:
         root = ElementTree.fromstring(packet.rstrip(b"\0"))
     except ElementTree.ParseError as exc:
         raise _error("is damaged", where, "XMP", str(exc), "well-formed XML") from exc
-    prefix = f"{{{NAMESPACE}}}"
+    prefix = f"{{{XMP_NAMESPACE}}}"
     found: dict[str, str] = {}
     for element in root.iter():
         for key, value in element.attrib.items():
@@ -373,4 +377,4 @@ def _read_time(exif: Directory) -> datetime | None:
 
 
 def _letter(code: float) -> str:
-    return _LETTERS[int(code)] if 0 <= code < 3 else "?"
+    return _CFA_LETTERS[int(code)] if 0 <= code < 3 else "?"

@@ -12,7 +12,7 @@ import numpy as np
 
 from capture.arrays import Float64Array, UInt16Array
 from capture.documents import Checks, InputError, canonical_json
-from capture.rig import MAX_SIDE_PX, PATTERNS
+from capture.rig import CFA_PATTERNS, MAX_SIDE_PX
 
 # 2**28 pixels: ten times the largest sensor of a capture rig, and 512 MiB of memory
 MAX_PIXELS = 2**28
@@ -69,7 +69,7 @@ class RawFrame:
         checks.that("cfa", f"{dtype} {shape}", self.cfa.ndim == 2, "uint16 of shape (H, W)")
         checks.that("cfa", str(dtype), dtype == np.uint16, "uint16")
         mono = self.pattern == "MONO"
-        checks.that("pattern", self.pattern, self.pattern in PATTERNS, f"one of {PATTERNS}")
+        checks.that("pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}")
         if self.cfa.ndim == 2:
             even = mono or (shape[0] % 2 == 0 and shape[1] % 2 == 0)
             size = 1 <= min(shape) and max(shape) <= MAX_SIDE_PX and self.cfa.size <= MAX_PIXELS

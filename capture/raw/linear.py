@@ -12,11 +12,11 @@ from capture.documents import Checks, Fault
 from capture.raw.frame import RawError, RawFrame, noise_profile
 
 Demosaic = Literal["superpixel", "centered", "bilinear"]
-UNIT = "fraction of full scale"
+LINEAR_UNIT = "fraction of full scale"
 
-_COLORS = "RGB"
+_COLOR_LETTERS = "RGB"
 # bilinear interpolation of red and blue is separable; green takes its four neighbours
-_TRIANGLE = (0.5, 1.0, 0.5)
+_TRIANGLE_FILTER = (0.5, 1.0, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class LinearImage:
     """(h, w, 3) variance of ``rgb``."""
     valid: BoolArray
     """(h, w) False where a saturated pixel contributes."""
-    unit: str = UNIT
+    unit: str = LINEAR_UNIT
 
 
 def linear_rgb(
@@ -203,7 +203,7 @@ def _superpixel(
     valid = np.ones((height, width), bool)
     for cell, letter in enumerate(pattern):
         part = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
-        band = _COLORS.index(letter)
+        band = _COLOR_LETTERS.index(letter)
         weight = np.float32(1.0 / pattern.count(letter))
         rgb[..., band] += weight * x[part]
         noise[..., band] += weight**2 * variance[part]
@@ -222,7 +222,7 @@ def _centered(
     for cell, letter in enumerate(pattern):
         part = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
         ahead = (cell // 2 == 0, cell % 2 == 0)
-        band = _COLORS.index(letter)
+        band = _COLOR_LETTERS.index(letter)
         weight = np.float32(1.0 / pattern.count(letter))
         rgb[..., band] += weight * _to_middle(x[part], ahead, power=1)
         noise[..., band] += weight**2 * _to_middle(variance[part], ahead, power=2)
@@ -254,7 +254,7 @@ def _bilinear(
     noise = np.empty_like(rgb)
     valid = np.ones(x.shape, bool)
     bad = ~good
-    for band, letter in enumerate(_COLORS):
+    for band, letter in enumerate(_COLOR_LETTERS):
         mask = np.zeros(x.shape, np.float32)
         for cell in (c for c in range(4) if pattern[c] == letter):
             mask[cell // 2 :: 2, cell % 2 :: 2] = 1
@@ -269,7 +269,7 @@ def _bilinear(
 
 def _spread_sparse(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve a red or blue plane (zero elsewhere) with the triangle's ``power``, separably."""
-    side, centre = (np.float32(w**power) for w in _TRIANGLE[:2])
+    side, centre = (np.float32(w**power) for w in _TRIANGLE_FILTER[:2])
     rows = centre * plane
     rows[1:] += side * plane[:-1]
     rows[:-1] += side * plane[1:]

@@ -14,7 +14,7 @@ from capture.raw.dng import decode_dng, is_ours
 from capture.raw.frame import MAX_PIXELS, RawError, RawFrame
 from capture.raw.tiff import Directory
 
-_ADVICE = "Give a raw file as the camera wrote it; for other images use skinrig import."
+_RAW_ADVICE = "Give a raw file as the camera wrote it; for other images use skinrig import."
 _FLOAT_SAMPLES = 3
 
 
@@ -73,7 +73,7 @@ def _tags(buffer: memoryview, where: str) -> Directory | None:
 
 
 def _error(what: str, where: str, path: str, got: str, expected: str) -> RawError:
-    return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_ADVICE)
+    return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_RAW_ADVICE)
 
 
 def _foreign(buffer: memoryview, tags: Directory | None, where: str) -> RawFrame:
@@ -141,7 +141,7 @@ def _translate(raw: Any, tags: Directory | None, where: str) -> RawFrame:
         )
     except RawError as exc:
         raise RawError(
-            "cannot be understood", where=where, faults=exc.faults, advice=_ADVICE
+            "cannot be understood", where=where, faults=exc.faults, advice=_RAW_ADVICE
         ) from exc
 
 

@@ -18,8 +18,8 @@ from capture.raw.frame import RawError
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 
-_FORMATS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii"}
-_FORMATS |= {11: "f", 12: "d"}
+_TYPE_FORMATS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii"}
+_TYPE_FORMATS |= {11: "f", 12: "d"}
 _MAX_ENTRIES = 512
 _MAX_VALUE_BYTES = 2**20
 
@@ -44,9 +44,9 @@ def entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> Entry:
         top = 2**31 - 1 if kind == SRATIONAL else 2**32 - 1
         parts = [part for value in values for part in _fraction(value, top)]
         return Entry(
-            tag, kind, len(values), struct.pack(f"<{len(parts)}{_FORMATS[kind][0]}", *parts)
+            tag, kind, len(values), struct.pack(f"<{len(parts)}{_TYPE_FORMATS[kind][0]}", *parts)
         )
-    data = struct.pack(f"<{len(values)}{_FORMATS[kind]}", *values)
+    data = struct.pack(f"<{len(values)}{_TYPE_FORMATS[kind]}", *values)
     return Entry(tag, kind, len(values), data)
 
 
@@ -104,9 +104,9 @@ class Directory:
         if tag not in self._tags:
             return b""
         kind, count, at = self._tags[tag]
-        if kind not in _FORMATS:
+        if kind not in _TYPE_FORMATS:
             raise self._error("has a broken tag", f"tag {tag}", f"type {kind}", "a TIFF 6 type")
-        size = struct.calcsize("<" + _FORMATS[kind]) * count
+        size = struct.calcsize("<" + _TYPE_FORMATS[kind]) * count
         if size > _MAX_VALUE_BYTES:
             expected = f"at most {_MAX_VALUE_BYTES}"
             raise self._error("has a broken tag", f"tag {tag}", f"{size} bytes", expected)
@@ -123,7 +123,7 @@ class Directory:
         kind = self._tags[tag][0]
         if kind in (ASCII, UNDEFINED):
             return tuple(data)
-        letter = _FORMATS[kind][0]
+        letter = _TYPE_FORMATS[kind][0]
         values = struct.unpack(f"{self._order}{len(data) // struct.calcsize(letter)}{letter}", data)
         if kind not in (RATIONAL, SRATIONAL):
             return values

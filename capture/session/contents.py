@@ -13,8 +13,13 @@ from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, CloseLine, FrameLine, LeftOutLine, Walk, walk
 from capture.session.manifest import Manifest, decode
 
-MANIFEST, JOURNAL, FRAMES, ORPHANS = "session.json", "journal.jsonl", "frames", "orphans"
-ATTACHMENTS = "attachments"
+MANIFEST_FILE, JOURNAL_FILE, FRAMES_FOLDER, ORPHANS_FOLDER = (
+    "session.json",
+    "journal.jsonl",
+    "frames",
+    "orphans",
+)
+ATTACHMENTS_FOLDER = "attachments"
 MAX_MANIFEST_BYTES = 2**26
 MAX_JOURNAL_BYTES = 2**30
 
@@ -67,26 +72,26 @@ def read_contents(path: Path) -> Contents:
     def no_session() -> SessionError:
         advice = "Name the folder of a session; skinrig simulate and skinrig capture make one."
         if path.is_dir():
-            found = f"no {MANIFEST} in it"
+            found = f"no {MANIFEST_FILE} in it"
         else:
             found = "a file" if path.exists() else "no such folder"
-        faults = [Fault("folder", found, f"a folder with {MANIFEST}")]
-        if (path / JOURNAL).is_file() and (path / JOURNAL).stat().st_size > 0:
-            advice = f"Restore {MANIFEST} from a copy: frames were committed here."
+        faults = [Fault("folder", found, f"a folder with {MANIFEST_FILE}")]
+        if (path / JOURNAL_FILE).is_file() and (path / JOURNAL_FILE).stat().st_size > 0:
+            advice = f"Restore {MANIFEST_FILE} from a copy: frames were committed here."
             what = "has lost its manifest"
             return SessionDamage(what, where=str(path), faults=faults, advice=advice)
         return NotASession("is not a session", where=str(path), faults=faults, advice=advice)
 
     if path.is_file():
         raise no_session()
-    where = path / MANIFEST
+    where = path / MANIFEST_FILE
     data = read_file(where, limit=MAX_MANIFEST_BYTES, what="manifest", missing=no_session)
     manifest, seal = decode(data, where=str(where))
-    where = path / JOURNAL
+    where = path / JOURNAL_FILE
     journal = read_file(where, limit=MAX_JOURNAL_BYTES, what="journal")
-    _require_folder(path / FRAMES)
-    if os.path.lexists(path / ATTACHMENTS):  # made with the first attachment
-        _require_folder(path / ATTACHMENTS)
+    _require_folder(path / FRAMES_FOLDER)
+    if os.path.lexists(path / ATTACHMENTS_FOLDER):  # made with the first attachment
+        _require_folder(path / ATTACHMENTS_FOLDER)
     walked = walk(journal, seal=seal, where=str(where))
     if walked.damage is None:
         walked = _against_plan(walked, manifest, str(where))
@@ -135,7 +140,7 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
 
 def list_files(path: Path) -> list[str]:
     """Return the paths in the folders of frames and attachments, sorted, inside the session."""
-    folders = [folder for folder in (FRAMES, ATTACHMENTS) if (path / folder).is_dir()]
+    folders = [folder for folder in (FRAMES_FOLDER, ATTACHMENTS_FOLDER) if (path / folder).is_dir()]
     return sorted(f"{folder}/{name}" for folder in folders for name in os.listdir(path / folder))
 
 
@@ -147,7 +152,7 @@ def _require_folder(folder: Path) -> None:
         plain = False
     if not plain:
         got = "a symbolic link" if folder.is_symlink() else "no folder"
-        faults = [Fault(FRAMES, got, "a folder, not a link")]
+        faults = [Fault(FRAMES_FOLDER, got, "a folder, not a link")]
         advice = "Restore the folder from a copy."
         raise SessionDamage("is damaged", where=str(folder), faults=faults, advice=advice)
 

@@ -8,7 +8,14 @@ from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
-from capture.session.contents import FRAMES, JOURNAL, MANIFEST, ORPHANS, Contents, list_files
+from capture.session.contents import (
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    MANIFEST_FILE,
+    ORPHANS_FOLDER,
+    Contents,
+    list_files,
+)
 from capture.session.disk import Disk
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
@@ -47,6 +54,36 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.close(descriptor)
 
 
+def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
+    """Make the folder of a session with an empty journal and its manifest.
+
+    Raises
+    ------
+    SessionError
+        Unless the folder is new, empty, or the debris of an interrupted creation.
+    """
+    require_free(path)
+    with DiskErrors(path):
+        for folder in (path, path / FRAMES_FOLDER, path / ORPHANS_FOLDER):
+            if not folder.is_dir():
+                disk.make_dir(folder)
+        if not (path / JOURNAL_FILE).exists():
+            write_new(disk, path / JOURNAL_FILE, b"")
+        write_manifest(disk, path, manifest)
+
+
+def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
+    """Write the manifest under its name, last: from that moment on the session exists."""
+    part = path / f"{MANIFEST_FILE}.part"
+    if part.exists():
+        disk.remove(part)
+    write_new(disk, part, manifest)
+    disk.fsync_dir(path)
+    disk.rename(part, path / MANIFEST_FILE)
+    disk.fsync_dir(path)
+    disk.fsync_dir(path.resolve().parent)
+
+
 def require_free(path: Path) -> None:
     """Raise unless the folder is new, empty, or the debris of an interrupted creation."""
     advice = "Choose a new folder, or resume the session that is there."
@@ -59,12 +96,14 @@ def require_free(path: Path) -> None:
         raise SessionError("cannot start here", where=str(path), faults=faults)
     if not path.exists():
         return
-    debris = {FRAMES, ORPHANS, JOURNAL, f"{MANIFEST}.part"}
+    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part"}
     found = {entry.name for entry in os.scandir(path)}
     filled = any(
-        any((path / folder).iterdir()) for folder in (FRAMES, ORPHANS) if (path / folder).is_dir()
+        any((path / folder).iterdir())
+        for folder in (FRAMES_FOLDER, ORPHANS_FOLDER)
+        if (path / folder).is_dir()
     )
-    written = (path / JOURNAL).exists() and (path / JOURNAL).stat().st_size > 0
+    written = (path / JOURNAL_FILE).exists() and (path / JOURNAL_FILE).stat().st_size > 0
     if found - debris or filled or written:
         got = ", ".join(sorted(found)[:5])
         faults = [Fault("folder", f"a folder with {got}", "a new or empty folder")]
@@ -87,14 +126,14 @@ def set_orphans_aside(disk: Disk, path: Path, contents: Contents) -> None:
     orphans = [file for file in present if file not in lines]
     if not orphans:
         return
-    taken = set(os.listdir(path / ORPHANS))
+    taken = set(os.listdir(path / ORPHANS_FOLDER))
     for file in orphans:
         name, number = Path(file).name, 1
         while f"{name}.{number}" in taken:
             number += 1
         taken.add(f"{name}.{number}")
         _log.warning("%s: no line in the journal, set aside", path / file)
-        disk.rename(path / file, path / ORPHANS / f"{name}.{number}")
-    disk.fsync_dir(path / ORPHANS)
+        disk.rename(path / file, path / ORPHANS_FOLDER / f"{name}.{number}")
+    disk.fsync_dir(path / ORPHANS_FOLDER)
     for folder in sorted({Path(file).parent for file in orphans}):
         disk.fsync_dir(path / folder)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import xxhash
 
-from capture.documents import Fault
+from capture import raw
+from capture.documents import Fault, shown
 from capture.plan import Step, Value
 from capture.session.disk import read_file
-from capture.session.errors import SessionDamage
+from capture.session.errors import SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, FrameLine
 
 MAX_FRAME_BYTES = 2**30
@@ -77,3 +78,19 @@ def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
         advice = f"Restore the {what} from a copy, or take it again in a new session."
         raise SessionDamage("is damaged", where=str(path), faults=faults, advice=advice)
     return blob
+
+
+def check_blob(blob: bytes, step_id: str, session_id: str) -> None:
+    """Refuse a frame that is too large or that names another step or session."""
+    if len(blob) > MAX_FRAME_BYTES:
+        faults = [Fault("blob", f"{len(blob)} bytes", f"at most {MAX_FRAME_BYTES}")]
+        raise SessionError("the frame is absurdly large", faults=faults)
+    frame = raw.decode(memoryview(blob), where=f"frame of step {step_id}")
+    for field, got, wanted in (
+        ("step_id", frame.step_id, step_id),
+        ("session_id", frame.session_id, session_id),
+    ):
+        if got != wanted:
+            advice = "Encode the DNG with the step and session it is committed to."
+            what = "the frame says it belongs elsewhere"
+            raise SessionError(what, faults=[Fault(field, shown(got), wanted)], advice=advice)

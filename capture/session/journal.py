@@ -15,21 +15,21 @@ from typing import Any, ClassVar
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, Fault, canonical_json, parse, read_json, shown
+from capture.documents import STRICT_CONFIG, Checks, Fault, canonical_json, parse, read_json, shown
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
 from capture.session.errors import SessionDamage
 
 MAX_LINE_BYTES = 65_536
 ATTACHMENT_RULE = f"{ID_RULE}, not ending in .part"
-_XXH128 = re.compile(r"[0-9a-f]{32}")
+_XXH128_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameLine:
     """One committed frame, as the journal holds it."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     step: str
     camera: str
@@ -54,7 +54,7 @@ class FrameLine:
         expected = frame_file(self.step, self.camera, self.attempt)
         checks.that("file", self.file, self.file == expected, expected)
         checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
-        good = _XXH128.fullmatch(self.xxh128) is not None
+        good = _XXH128_PATTERN.fullmatch(self.xxh128) is not None
         checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
@@ -79,7 +79,7 @@ class FrameLine:
 class AttachmentLine:
     """One file that belongs to the capture and is no frame, as the journal holds it."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     file: str
@@ -95,7 +95,7 @@ class AttachmentLine:
         expected = attachment_file(self.name)
         checks.that("file", self.file, self.file == expected, expected)
         checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
-        good = _XXH128.fullmatch(self.xxh128) is not None
+        good = _XXH128_PATTERN.fullmatch(self.xxh128) is not None
         checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
@@ -115,7 +115,7 @@ class AttachmentLine:
 class LeftOutLine:
     """Steps of the plan that will not be captured, as the journal holds them."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     steps: tuple[str, ...]
     reason: str
@@ -148,7 +148,7 @@ class LeftOutLine:
 class CloseLine:
     """The end of a session: nothing may follow."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     frames: int
     missing: tuple[str, ...]

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict
 
-from capture.documents import STRICT, Checks, Fault, parse, read_json
+from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -24,9 +24,9 @@ SCHEMA = "skinrig.session/1"
 ANY_USE = "any"
 Source = Literal["measured", "simulated"]
 
-_SEAL = "seal"
-_SHA256 = re.compile(r"sha256:[0-9a-f]{64}")
-_PSEUDONYM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_SEAL_KEY = "seal"
+_SHA256_PATTERN = re.compile(r"sha256:[0-9a-f]{64}")
+_PSEUDONYM_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Subject:
     'P042'
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     pseudonym: str
     consent_scope: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ class Subject:
 
     def __post_init__(self) -> None:
         checks = Checks("Subject", SessionError)
-        good = _PSEUDONYM.fullmatch(self.pseudonym) is not None
+        good = _PSEUDONYM_PATTERN.fullmatch(self.pseudonym) is not None
         checks.that("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
         for scope in self.consent_scope:
             checks.that("consent_scope", scope, is_id(scope), ID_RULE)
@@ -68,7 +68,7 @@ class Subject:
 class CalibrationRef:
     """A calibration that was in force, by the hash of its file."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     kind: str
     sha256: str
@@ -79,7 +79,7 @@ class CalibrationRef:
     def __post_init__(self) -> None:
         checks = Checks("CalibrationRef", SessionError)
         checks.that("kind", self.kind, is_id(self.kind), ID_RULE)
-        good = _SHA256.fullmatch(self.sha256) is not None
+        good = _SHA256_PATTERN.fullmatch(self.sha256) is not None
         checks.that("sha256", self.sha256, good, '"sha256:" and 64 hexadecimal digits')
         checks.close()
 
@@ -88,7 +88,7 @@ class CalibrationRef:
 class Manifest:
     """The content of session.json."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     id: str
     created_at: datetime
@@ -153,7 +153,7 @@ def seal(content: Mapping[str, Any]) -> tuple[bytes, str]:
     """
     try:
         digest = hashlib.sha256(_written(content)).hexdigest()
-        return _written({**content, _SEAL: f"sha256:{digest}"}), f"sha256:{digest}"
+        return _written({**content, _SEAL_KEY: f"sha256:{digest}"}), f"sha256:{digest}"
     except (TypeError, ValueError, RecursionError) as exc:
         fault = Fault("devices, extra", str(exc), "texts, finite numbers, lists and tables")
         raise SessionError("the manifest cannot be written", faults=[fault]) from exc
@@ -178,13 +178,13 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         advice = "Read it with the version of skinrig that wrote it, or check the file."
         faults = [Fault("schema", repr(schema), SCHEMA)]
         raise SessionError("has an unknown schema", where=where, faults=faults, advice=advice)
-    found = content.pop(_SEAL, None)
+    found = content.pop(_SEAL_KEY, None)
     written, expected = seal({"schema": schema, **content})
     if found != expected or written != data:
         # equal seals with unequal bytes: a change in spacing or in the spelling of a number
         got = str(found) if found != expected else "other bytes than were sealed"
         advice = "Restore session.json from a copy: it was changed after it was written."
-        faults = [Fault(_SEAL, got, expected)]
+        faults = [Fault(_SEAL_KEY, got, expected)]
         raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
     return parse(Manifest, content, where=where, error=SessionDamage), expected
 

@@ -23,10 +23,10 @@ import xxhash
 from capture.documents import Fault
 from capture.session.errors import SessionError
 
-FOLDER, CHAIN = "ascmhl", "ascmhl_chain.xml"
-_LIST, _DIRECTORY = "urn:ASC:MHL:v2.0", "urn:ASC:MHL:DIRECTORY:v2.0"
-_BASE58 = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz"
-_UNTOLD = "withheld"
+MHL_FOLDER, CHAIN_FILE = "ascmhl", "ascmhl_chain.xml"
+_LIST_NAMESPACE, _DIRECTORY_NAMESPACE = "urn:ASC:MHL:v2.0", "urn:ASC:MHL:DIRECTORY:v2.0"
+_BASE58_ALPHABET = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz"
+_WITHHELD_HOST = "withheld"
 """Stands for the host's name, which the schema demands and which is nobody's business."""
 
 
@@ -42,8 +42,8 @@ def c4_id(data: bytes) -> str:
     digits = []
     while rest:
         rest, digit = divmod(rest, 58)
-        digits.append(_BASE58[digit])
-    return "c4" + "".join(reversed(digits)).rjust(88, _BASE58[0])
+        digits.append(_BASE58_ALPHABET[digit])
+    return "c4" + "".join(reversed(digits)).rjust(88, _BASE58_ALPHABET[0])
 
 
 def write_first_generation(folder: str | Path, *, now: datetime, version: str) -> Path:
@@ -70,30 +70,32 @@ def write_first_generation(folder: str | Path, *, now: datetime, version: str) -
     faults = []
     if link is not None:
         faults.append(Fault(str(link.relative_to(place)), "a symbolic link", "a file"))
-    if (place / FOLDER).exists():
-        faults.append(Fault(FOLDER, "a history", "none yet: other programs add their generations"))
+    if (place / MHL_FOLDER).exists():
+        faults.append(
+            Fault(MHL_FOLDER, "a history", "none yet: other programs add their generations")
+        )
     elif not files:
         faults.append(Fault("files", "none", "at least one"))
     if faults:
         raise SessionError("cannot be sealed", where=str(place), faults=faults)
     name = re.sub(r"[^A-Za-z0-9._-]", "_", place.resolve().name)
-    manifest = place / FOLDER / f"0001_{name}_{moment:%Y-%m-%d_%H%M%SZ}.mhl"
+    manifest = place / MHL_FOLDER / f"0001_{name}_{moment:%Y-%m-%d_%H%M%SZ}.mhl"
     listed = _hash_list(place, files, moment.replace(microsecond=0), version)
-    chain = ElementTree.Element("ascmhldirectory", xmlns=_DIRECTORY)
+    chain = ElementTree.Element("ascmhldirectory", xmlns=_DIRECTORY_NAMESPACE)
     entry = ElementTree.SubElement(chain, "hashlist", sequencenr="1")
     ElementTree.SubElement(entry, "path").text = manifest.name
     ElementTree.SubElement(entry, "c4").text = c4_id(listed)
     manifest.parent.mkdir()
     manifest.write_bytes(listed)
-    (manifest.parent / CHAIN).write_bytes(_bytes(chain))
+    (manifest.parent / CHAIN_FILE).write_bytes(_bytes(chain))
     return manifest
 
 
 def _hash_list(place: Path, files: Iterable[Path], moment: datetime, version: str) -> bytes:
-    root = ElementTree.Element("hashlist", version="2.0", xmlns=_LIST)
+    root = ElementTree.Element("hashlist", version="2.0", xmlns=_LIST_NAMESPACE)
     creator = ElementTree.SubElement(root, "creatorinfo")
     ElementTree.SubElement(creator, "creationdate").text = moment.isoformat()
-    ElementTree.SubElement(creator, "hostname").text = _UNTOLD
+    ElementTree.SubElement(creator, "hostname").text = _WITHHELD_HOST
     ElementTree.SubElement(creator, "tool", version=version).text = "skinrig"
     process = ElementTree.SubElement(root, "processinfo")
     ElementTree.SubElement(process, "process").text = "transfer"

@@ -6,18 +6,18 @@ from pathlib import Path
 
 from capture.documents import Fault
 from capture.session.contents import (
-    ATTACHMENTS,
-    FRAMES,
-    JOURNAL,
-    MANIFEST,
+    ATTACHMENTS_FOLDER,
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    MANIFEST_FILE,
     MAX_JOURNAL_BYTES,
     MAX_MANIFEST_BYTES,
-    ORPHANS,
+    ORPHANS_FOLDER,
     undamaged_contents,
 )
 from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionError
-from capture.session.folder import DiskErrors, require_free, write_new
+from capture.session.folder import DiskErrors, require_free, write_manifest, write_new
 from capture.session.frames import check_file
 from capture.session.journal import CloseLine
 from capture.session.store import Session
@@ -66,11 +66,15 @@ def reopen_copy(
     (start, reason) = next(
         (byte, line.reason) for byte, line in contents.walk.lines if isinstance(line, CloseLine)
     )
-    journal = read_file(place / JOURNAL, limit=MAX_JOURNAL_BYTES, what="journal")[:start]
-    manifest = read_file(place / MANIFEST, limit=MAX_MANIFEST_BYTES, what="manifest")
+    journal = read_file(place / JOURNAL_FILE, limit=MAX_JOURNAL_BYTES, what="journal")[:start]
+    manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, what="manifest")
     require_free(target)
     with DiskErrors(target):
-        folders = [FRAMES, ORPHANS, *([ATTACHMENTS] if contents.attachment_lines else [])]
+        folders = [
+            FRAMES_FOLDER,
+            ORPHANS_FOLDER,
+            *([ATTACHMENTS_FOLDER] if contents.attachment_lines else []),
+        ]
         for folder in (target, *(target / name for name in folders)):
             if not folder.is_dir():
                 disk.make_dir(folder)
@@ -78,15 +82,8 @@ def reopen_copy(
             write_new(disk, target / line.file, check_file(place / line.file, line))
         for name in folders:
             disk.fsync_dir(target / name)
-        if (target / JOURNAL).exists():  # debris of an interrupted creation, empty
-            disk.remove(target / JOURNAL)
-        write_new(disk, target / JOURNAL, journal)
-        part = target / f"{MANIFEST}.part"
-        if part.exists():
-            disk.remove(part)
-        write_new(disk, part, manifest)
-        disk.fsync_dir(target)
-        disk.rename(part, target / MANIFEST)
-        disk.fsync_dir(target)
-        disk.fsync_dir(target.resolve().parent)
+        if (target / JOURNAL_FILE).exists():  # debris of an interrupted creation, empty
+            disk.remove(target / JOURNAL_FILE)
+        write_new(disk, target / JOURNAL_FILE, journal)
+        write_manifest(disk, target, manifest)
     return Session.resume(target, disk=disk), reason

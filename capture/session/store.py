@@ -4,31 +4,22 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import xxhash
 
-from capture import raw
 from capture.documents import Checks, Fault, shown
 from capture.plan import Plan, Value
 from capture.rig import Rig
-from capture.session.contents import (
-    ATTACHMENTS,
-    FRAMES,
-    JOURNAL,
-    MANIFEST,
-    ORPHANS,
-    Contents,
-    undamaged_contents,
-)
+from capture.session.contents import ATTACHMENTS_FOLDER, JOURNAL_FILE, Contents, undamaged_contents
 from capture.session.disk import Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
-from capture.session.folder import DiskErrors, require_free, set_orphans_aside, write_new
-from capture.session.frames import MAX_FRAME_BYTES
+from capture.session.folder import DiskErrors, make_folder, set_orphans_aside, write_new
+from capture.session.frames import MAX_FRAME_BYTES, check_blob
 from capture.session.journal import (
     ATTACHMENT_RULE,
     MAX_LINE_BYTES,
@@ -57,6 +48,7 @@ class Session(SessionView):
     Examples
     --------
     >>> import tempfile, numpy as np
+    >>> from capture import raw
     >>> from capture.plan import flash_plan
     >>> from capture.rig import load_rig
     >>> rig = load_rig("flash").resized(16)
@@ -130,10 +122,9 @@ class Session(SessionView):
         """
         disk = disk or Disk()
         place = Path(path)
-        moment = (now or (lambda: datetime.now(UTC)))()
         manifest = Manifest(
             id=session_id or uuid.uuid4().hex,
-            created_at=moment,
+            created_at=(now or (lambda: datetime.now(UTC)))(),
             source=source,
             subject=subject,
             plan=plan,
@@ -144,23 +135,7 @@ class Session(SessionView):
             versions=versions(),
             extra=dict(extra or {}),
         )
-        data, _ = manifest.encode()
-        require_free(place)
-        with DiskErrors(place):
-            for folder in (place, place / FRAMES, place / ORPHANS):
-                if not folder.is_dir():
-                    disk.make_dir(folder)
-            if not (place / JOURNAL).exists():
-                write_new(disk, place / JOURNAL, b"")
-            # a session exists from the moment its manifest has its name, so that comes last
-            part = place / f"{MANIFEST}.part"
-            if part.exists():
-                disk.remove(part)
-            write_new(disk, part, data)
-            disk.fsync_dir(place)
-            disk.rename(part, place / MANIFEST)
-            disk.fsync_dir(place)
-            disk.fsync_dir(place.resolve().parent)
+        make_folder(disk, place, manifest.encode()[0])
         return cls.resume(place, disk=disk)
 
     @classmethod
@@ -197,7 +172,7 @@ class Session(SessionView):
         place = Path(path)
         undamaged_contents(place)
         with DiskErrors(place):
-            descriptor = disk.open_append(place / JOURNAL)
+            descriptor = disk.open_append(place / JOURNAL_FILE)
         try:
             if not disk.lock(descriptor):
                 what = "another process is writing this session"
@@ -208,7 +183,7 @@ class Session(SessionView):
                 raise SessionError("the session is closed", where=str(place), advice=advice)
             with DiskErrors(place):
                 if contents.walk.torn:
-                    _log.warning("%s: cut %d torn bytes", place / JOURNAL, contents.walk.torn)
+                    _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
                     disk.fdatasync(descriptor)
                 set_orphans_aside(disk, place, contents)
@@ -359,14 +334,8 @@ class Session(SessionView):
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
         )
         text, head = self._seal(line)
-        try:
-            with DiskErrors(self.path):
-                self._append(descriptor, text)
-        except SessionDiskError:
-            # how much reached the medium is unknown: only resume() can tell
-            self.release()
-            raise
-        self._head = head
+        with self._acknowledging(head):
+            self._append(descriptor, text)
         self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
@@ -374,16 +343,22 @@ class Session(SessionView):
         text, head = self._seal(line)
         target = self.path / line.file
         part = target.with_name(target.name + ".part")
+        with self._acknowledging(head):
+            if isinstance(line, AttachmentLine) and not self._attached:
+                if not target.parent.is_dir():
+                    self._disk.make_dir(self.path / ATTACHMENTS_FOLDER)
+                self._disk.fsync_dir(self.path)
+            write_new(self._disk, part, blob)
+            self._disk.rename(part, target)
+            self._disk.fsync_dir(target.parent)
+            self._append(descriptor, text)
+
+    @contextmanager
+    def _acknowledging(self, head: str) -> Iterator[None]:
+        """Advance to a head after its line is written; release the session where that fails."""
         try:
             with DiskErrors(self.path):
-                if isinstance(line, AttachmentLine) and not self._attached:
-                    if not target.parent.is_dir():
-                        self._disk.make_dir(self.path / ATTACHMENTS)
-                    self._disk.fsync_dir(self.path)
-                write_new(self._disk, part, blob)
-                self._disk.rename(part, target)
-                self._disk.fsync_dir(target.parent)
-                self._append(descriptor, text)
+                yield
         except SessionDiskError:
             # how much reached the medium is unknown: only resume() can tell
             self.release()
@@ -430,12 +405,7 @@ class Session(SessionView):
         """Return the session."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Release the lock; closing is a deliberate act."""
         self.release()
 
@@ -461,27 +431,14 @@ class Session(SessionView):
             advice = "A committed frame stays; take it again with the next attempt number."
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
-        if len(blob) > MAX_FRAME_BYTES:
-            faults = [Fault("blob", f"{len(blob)} bytes", f"at most {MAX_FRAME_BYTES}")]
-            raise SessionError("the frame is absurdly large", faults=faults)
-        frame = raw.decode(memoryview(blob), where=f"frame of step {step_id}")
-        for field, got, wanted in (
-            ("step_id", frame.step_id, step_id),
-            ("session_id", frame.session_id, self.id),
-        ):
-            if got != wanted:
-                advice = "Encode the DNG with the step and session it is committed to."
-                what = "the frame says it belongs elsewhere"
-                raise SessionError(what, faults=[Fault(field, shown(got), wanted)], advice=advice)
+        check_blob(blob, step_id, self.id)
 
     def _seal(self, line: Line) -> tuple[bytes, str]:
         try:
             text, head = seal_line(self._head, line)
         except (TypeError, ValueError, RecursionError) as exc:
-            values = (
-                "about" if isinstance(line, AttachmentLine | LeftOutLine) else "settings, actual"
-            )
-            faults = [Fault(values, str(exc), "texts, finite numbers, true or false")]
+            path = "about" if isinstance(line, AttachmentLine | LeftOutLine) else "settings, actual"
+            faults = [Fault(path, str(exc), "texts, finite numbers, true or false")]
             raise SessionError("the journal line cannot be written", faults=faults) from exc
         if len(text) > MAX_LINE_BYTES:
             faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]

@@ -8,11 +8,11 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 
 from capture.session.contents import (
-    ATTACHMENTS,
-    FRAMES,
-    JOURNAL,
-    MANIFEST,
-    ORPHANS,
+    ATTACHMENTS_FOLDER,
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    MANIFEST_FILE,
+    ORPHANS_FOLDER,
     Contents,
     list_files,
     read_contents,
@@ -21,7 +21,15 @@ from capture.session.errors import NotASession, SessionError
 from capture.session.frames import check_file
 from capture.session.journal import FrameLine
 
-_KNOWN = {MANIFEST, JOURNAL, FRAMES, ATTACHMENTS, ORPHANS, "index.sqlite", "ascmhl"}
+_KNOWN_NAMES = {
+    MANIFEST_FILE,
+    JOURNAL_FILE,
+    FRAMES_FOLDER,
+    ATTACHMENTS_FOLDER,
+    ORPHANS_FOLDER,
+    "index.sqlite",
+    "ascmhl",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +115,7 @@ def _state(place: Path, contents: Contents) -> list[str]:
     notes = []
     walk = contents.walk
     if walk.torn:
-        where = f"{place / JOURNAL}, byte {walk.end}"
+        where = f"{place / JOURNAL_FILE}, byte {walk.end}"
         notes.append(f"{where}: {walk.torn} bytes of a line cut off by a crash; resuming cuts them")
     done = {(line.step, line.camera) for line in contents.frame_lines}
     left_out = {step: line.reason for line in contents.left_out_lines for step in line.steps}
@@ -121,9 +129,11 @@ def _state(place: Path, contents: Contents) -> list[str]:
     for reason in dict.fromkeys(left_out.values()):
         count = sum(other == reason for other in left_out.values())
         notes.append(f"{place}: {count} steps left out: {reason}")
-    if (place / ORPHANS).is_dir() and (orphans := os.listdir(place / ORPHANS)):
-        notes.append(f"{place / ORPHANS}: {len(orphans)} files set aside after interruptions")
-    for name in sorted(set(os.listdir(place)) - _KNOWN):
+    if (place / ORPHANS_FOLDER).is_dir() and (orphans := os.listdir(place / ORPHANS_FOLDER)):
+        notes.append(
+            f"{place / ORPHANS_FOLDER}: {len(orphans)} files set aside after interruptions"
+        )
+    for name in sorted(set(os.listdir(place)) - _KNOWN_NAMES):
         notes.append(f"{place / name}: not a part of the session, nothing vouches for it")
     return notes
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.calibration import store as calibration_store
-from capture.calibration.record import KINDS
+from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
 from reconstruction.pipeline.hold_out import NOTHING, HoldOut
 
@@ -175,11 +175,11 @@ class Evidence:
 
 def _require_some(folder: Path, rig: str) -> None:
     """Refuse a folder without a calibration of a rig: else everything would be assumed."""
-    files = [path for kind in KINDS if (path := folder / f"{kind}.json").is_file()]
+    files = [path for kind in CALIBRATION_KINDS if (path := folder / f"{kind}.json").is_file()]
     if not files:
         raise EvidenceError(
-            f"calibration: {folder} holds none, expected {', '.join(KINDS)} or some of them "
-            "(.json); `skinrig calibrate` makes them"
+            f"calibration: {folder} holds none, expected {', '.join(CALIBRATION_KINDS)} or some of "
+            "them (.json); `skinrig calibrate` makes them"
         )
     rigs = set()
     for path in files:

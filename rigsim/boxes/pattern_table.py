@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Light
 from rigsim.arrays import Float64Array
 from rigsim.boxes.controller import Refused, number
@@ -54,8 +54,8 @@ class PatternRow:
 def pattern_name(text: str) -> str:
     """Return the pattern that a command names, or refuse."""
     name = text.lower()
-    if name not in PATTERNS:
-        raise Refused(Code.SYNTAX, f"expected {' or '.join(PATTERNS).upper()}")
+    if name not in LIGHT_PATTERNS:
+        raise Refused(Code.SYNTAX, f"expected {' or '.join(LIGHT_PATTERNS).upper()}")
     return name
 
 
@@ -95,7 +95,7 @@ def pattern_shares(lights: Sequence[Light]) -> dict[str, Float64Array]:
     for column, name in enumerate("xyz"):
         shares[name] = 0.5 * (1.0 + ways[:, column])
         shares["-" + name] = 0.5 * (1.0 - ways[:, column])
-    return {name: shares[name] for name in PATTERNS}
+    return {name: shares[name] for name in LIGHT_PATTERNS}
 
 
 def starts(

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from capture.rig import Fibre, Probe, Rig
+from capture.rig import Fiber, Probe, Rig
 from model import spectra
 from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import anisotropic_profile
@@ -208,7 +208,7 @@ def fibres_of(probe: Probe) -> Fibres:
     TissueError
         The detection fibres are not all alike.
     """
-    first: Fibre = probe.fibres[0]
+    first: Fiber = probe.fibres[0]
     for fibre in probe.fibres:
         if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
             raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")

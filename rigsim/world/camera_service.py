@@ -110,7 +110,7 @@ class CameraService:
         fault, error = "", "CameraError"
         with self._lock:
             holder = self._holders.get(name)
-            if request.get("version") != camera_wire.VERSION:
+            if request.get("version") != camera_wire.CAMERA_WIRE_VERSION:
                 fault = f"version: got {request.get('version')!r}, expected {camera_wire.VERSION}"
             elif name not in self.addresses:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"

@@ -248,7 +248,7 @@ def _mirror(
     rig: Rig,
     cameras: Mapping[str, geometry.CameraPose],
     what: DomeTargets,
-) -> mirror_lights.LightPlaces:
+) -> mirror_lights.LightPositions:
     """Return the lights' places from the frames of mirror spheres."""
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}

@@ -13,11 +13,12 @@ import numpy as np
 
 from capture.calibration import sensor, store
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
-from capture.calibration.fiber.gains import FibreCalibration, calibrate_fibres
+from capture.calibration.fiber.gains import calibrate_fibers
 from capture.calibration.fiber.merge import MergedSeries, merge_series
 from capture.calibration.fiber.phantom import PhantomCertificate
-from capture.calibration.fiber.readings import FibreReadings, sum_spots
-from capture.calibration.fiber.spots import find_fibre_spots
+from capture.calibration.fiber.probe_calibration import FiberCalibration
+from capture.calibration.fiber.readings import FiberReadings, sum_spots
+from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
@@ -35,7 +36,7 @@ class ProbeCalibration:
     """A calibration of a probe and what to say of it."""
 
     calibration: store.Calibration
-    fibres: FibreCalibration
+    fibres: FiberCalibration
     summary: tuple[tuple[str, str], ...]
     findings: tuple[str, ...]
     """What is wrong with the probe: dead fibres, spots that overlap."""
@@ -87,9 +88,9 @@ def calibrate_probe(
     masks = series.masks()
     nominal = np.array([fibre.spot_px for fibre in rig.probe.fibres])
     names = [fibre.name for fibre in rig.probe.fibres]
-    spots = find_fibre_spots(phantoms[0], nominal, names=names, pattern=noise.pattern, masks=masks)
+    spots = find_fiber_spots(phantoms[0], nominal, names=names, pattern=noise.pattern, masks=masks)
     readings = _mean([sum_spots(merged, spots, noise=noise) for merged in phantoms])
-    fibres = calibrate_fibres(
+    fibres = calibrate_fibers(
         readings,
         {fibre: sum_spots(merged, spots, noise=noise) for fibre, merged in masks.items()},
         spots=spots,
@@ -246,7 +247,7 @@ def _packaged_certificate(session: Session) -> PhantomCertificate:
     return packaged_certificate()
 
 
-def _mean(readings: Sequence[FibreReadings]) -> FibreReadings:
+def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
     """Return the mean over placements, with their scatter where it is more than the noise."""
     if len(readings) == 1:
         return readings[0]
@@ -255,7 +256,7 @@ def _mean(readings: Sequence[FibreReadings]) -> FibreReadings:
     count = len(readings)
     noise = np.mean([r.variance for r in readings], axis=0) / count
     scatter = np.var([r.signal for r in readings], axis=0, ddof=1) / count
-    return FibreReadings(
+    return FiberReadings(
         readings[0].names,
         signal,
         np.where(valid, np.maximum(noise, scatter), 0.0),
@@ -267,7 +268,7 @@ def _mean(readings: Sequence[FibreReadings]) -> FibreReadings:
     )
 
 
-def _worn(fibres: FibreCalibration) -> tuple[str, ...]:
+def _worn(fibres: FiberCalibration) -> tuple[str, ...]:
     usual = np.array(
         [
             np.median(g[v]) if v.any() else 1.0
@@ -288,7 +289,7 @@ def _worn(fibres: FibreCalibration) -> tuple[str, ...]:
 
 
 def _summary(
-    fibres: FibreCalibration, series: _Series, paper: PhantomCertificate
+    fibres: FiberCalibration, series: _Series, paper: PhantomCertificate
 ) -> tuple[tuple[str, str], ...]:
     spots, mixed = fibres.spots, fibres.crosstalk
     count = len(fibres.names)

@@ -17,7 +17,7 @@ from capture.devices.dome import Eyes
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.gradient import GradientTarget, gradient_calibration_plan, gradient_plan, state_of
-from capture.plan.probe import SITES, ProbeTarget, probe_calibration_plan, probe_plan
+from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.capturing.addresses import addresses, patiently, require_addresses
@@ -281,7 +281,9 @@ def _probe_plan(
     angles: Sequence[float] | None,
 ) -> Plan:
     if target is None:
-        return probe_plan(rig, sites=sites or SITES, repeats=repeats, angles=directions_of(angles))
+        return probe_plan(
+            rig, sites=sites or PROBE_SITES, repeats=repeats, angles=directions_of(angles)
+        )
     if target not in get_args(ProbeTarget):
         expected = ", ".join(get_args(ProbeTarget))
         raise CaptureError(f"target: got {target!r}, expected one of {expected}")

@@ -7,7 +7,7 @@ from typing import Final
 
 from capture.plan import Plan
 from capture.plan.dose import dose_report
-from capture.plan.fiber_light import SKIN_APERTURE_MM, fibre_light
+from capture.plan.fiber_light import SKIN_APERTURE_MM, fiber_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
@@ -65,7 +65,7 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     (1.0, 'allowed')
     """
     if rig.probe is not None:
-        light = fibre_light(plan, rig)
+        light = fiber_light(plan, rig)
         return {
             "led": light.led,
             "led_ws": light.led_ws,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from capture.plan import Plan
-from capture.plan.multiplexed import course_plan, multiplexed_plan, phases
+from capture.plan.multiplexed import course_plan, multiplexed_plan
+from capture.plan.phases import phases
 from capture.rig import Rig
 
 EVENTS = ("exercise", "alcohol")

@@ -18,7 +18,7 @@ import numpy as np
 
 from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
 from rigsim.scenes.gradient.truth import appearance as ground_truth
 from skinrig.arrays import Float32Array, Float64Array
@@ -31,7 +31,7 @@ PATCH_PX = 96
 SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
     ("full", "x", "y", "z", "-x", "-y", "-z"),
-    tuple(PATTERNS),
+    tuple(LIGHT_PATTERNS),
 )
 """Patterns that tell light and three gradients: one complement instead of full, which lowers the
 noise more; all complements; and dark."""
@@ -113,7 +113,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
     scene = GradientScene(small, skin, sphere=sphere, seed=seed)
     rates = {
         (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
-        for pattern in PATTERNS
+        for pattern in LIGHT_PATTERNS
         if pattern != "dark"
         for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
     }
@@ -356,7 +356,7 @@ def setting_of(plan: Plan) -> Setting:
     darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
     first = own[0].settings
     return Setting(
-        tuple(name for name in PATTERNS if name in both),
+        tuple(name for name in LIGHT_PATTERNS if name in both),
         float(first["exposure_s"]),
         darks,
         max(float(step.settings.get("level", 1.0)) for step in own),
@@ -393,7 +393,7 @@ def _choice(
         "normals", "deg", value, interval_of(value, FORECAST_SPREAD), wants.get("normals")
     )
     left_out = []
-    missing = [name for name in PATTERNS if name not in setting.patterns]
+    missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
     if missing:
         left_out.append(
             (

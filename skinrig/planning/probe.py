@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from capture.plan import Plan, PlanError
-from capture.plan.probe import BRACKETS, LONGEST_S, exposure_series_s, probe_plan
+from capture.plan.probe import MAX_EXPOSURE_S, N_BRACKETS, exposure_series_s, probe_plan
 from capture.plan.suction import placement_of
 from capture.rig import Rig
 from skinrig.planning.plans import (
@@ -47,9 +47,9 @@ __all__ = [
 
 SHORTEST_S = exposure_series_s()[0]
 """Of the rig's own series: the nearest fibre must not saturate in it."""
-SERIES = (3, 4, 6, 8, 12, BRACKETS)
+SERIES = (3, 4, 6, 8, 12, N_BRACKETS)
 """How many exposures a series may have."""
-LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, LONGEST_S)
+LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, MAX_EXPOSURE_S)
 """Its longest one, s."""
 REPEATS = (1, 2, 4)
 DARKS = (1, 2)
@@ -280,14 +280,14 @@ def _choice(
     low, high = found.interval()
     forecast = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
     left_out = []
-    if len(setting.exposures_s) < BRACKETS:
+    if len(setting.exposures_s) < N_BRACKETS:
         left_out.append(
             (
-                f"{BRACKETS - len(setting.exposures_s)} of {BRACKETS} exposures of a series",
+                f"{N_BRACKETS - len(setting.exposures_s)} of {N_BRACKETS} exposures of a series",
                 "wider steps still show every fibre unsaturated and above the noise",
             )
         )
-    if setting.exposures_s[-1] < 0.99 * LONGEST_S:
+    if setting.exposures_s[-1] < 0.99 * MAX_EXPOSURE_S:
         left_out.append(
             (
                 f"exposures above {setting.exposures_s[-1]:.3g} s",

@@ -173,7 +173,7 @@ def _fitted(
     look: Sight, read: Sequence[Float64Array], places: Sequence[int], exposures: int, *, noise: bool
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
-    from capture.calibration.fiber.gains import FibreReflectance
+    from capture.calibration.fiber.probe_calibration import FiberReflectance
     from reconstruction.pipeline.probe.images import Measurement
     from reconstruction.pipeline.probe.stages import Profile, fit_profiles
 
@@ -190,7 +190,7 @@ def _fitted(
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
         told = (value, look.phantom, value / look.phantom)
         doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
-        reflectance = FibreReflectance(
+        reflectance = FiberReflectance(
             names,
             radius,
             value,

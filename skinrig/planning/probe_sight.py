@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.plan.probe import SITES
+from capture.plan.probe import PROBE_SITES
 from capture.rig import Rig
 from skinrig.arrays import Float64Array
 from skinrig.planning.plans import PlanningError
@@ -41,7 +41,7 @@ class Sight:
     probe: Any
 
 
-def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES) -> Sight:
+def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES) -> Sight:
     """Look at simulated skin through the fibres.
 
     Parameters

@@ -10,8 +10,8 @@ from typing import Any, cast, get_args
 
 from capture.plan import Plan
 from capture.plan.probe import (
-    PHANTOM,
-    SITES,
+    PHANTOM_SITE,
+    PROBE_SITES,
     ProbeTarget,
     all_series,
     probe_calibration_plan,
@@ -65,7 +65,7 @@ def simulate_probe(order: Order) -> Simulated:
         "size": order.size,
         "subject": shown,
         "target": order.target or "",
-        "sites": ",".join(order.sites or SITES),
+        "sites": ",".join(order.sites or PROBE_SITES),
         "repeats": order.repeats,
         "angles": directions_of(order.angles),
         "all_brackets": order.all_brackets,
@@ -73,7 +73,7 @@ def simulate_probe(order: Order) -> Simulated:
     }
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
-        _check_sites(scene.tissue, order.sites or SITES, rig)
+        _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
     figures = light_figures(plan, rig)
     if order.progress is not None:
         for line in light_lines(plan, rig):
@@ -143,7 +143,10 @@ def plan_of(rig: Rig, order: Order) -> Plan:
     if order.plan is not None:
         return order.plan
     return probe_plan(
-        rig, sites=order.sites or SITES, repeats=order.repeats, angles=directions_of(order.angles)
+        rig,
+        sites=order.sites or PROBE_SITES,
+        repeats=order.repeats,
+        angles=directions_of(order.angles),
     )
 
 
@@ -170,7 +173,7 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim.fiber.probe_tissue import PHANTOM as BLOCK
+    from rigsim.fiber.probe_tissue import PHANTOM_SITE as BLOCK
     from rigsim.fiber.probe_tissue import TissueError
     from rigsim.population import files as subject_file
     from rigsim.scenes.probe.scene import ProbeScene
@@ -211,7 +214,7 @@ class HeadLog:
         if not resume:
             self._path.unlink(missing_ok=True)
         entries = self._read()
-        if any(session.frames(kind) for kind in ("fibres", PHANTOM)) and not entries:
+        if any(session.frames(kind) for kind in ("fibres", PHANTOM_SITE)) and not entries:
             raise SimulationError(
                 f"{self._path}: is gone, and with it the truth of what was captured before; "
                 "simulate the session anew"

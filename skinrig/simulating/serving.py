@@ -160,7 +160,7 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
-    from capture.plan.probe import PHANTOM, SITES
+    from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
     from rigsim.fiber import probe_tissue
     from rigsim.population import files as subject_file
     from rigsim.scenes.probe.scene import ProbeScene
@@ -174,10 +174,10 @@ def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
     block = ProbeScene(rig, probe_tissue.PHANTOM, seed=seed, photons=PROBE_PHOTONS)
     # the photons of the usual places are traced before anybody asks: the box holds the head on the
     # skin meanwhile, and waits for its host for some seconds only
-    for site in (*SITES, PHANTOM):
-        scene = block if site == PHANTOM else skin
+    for site in (*PROBE_SITES, PHANTOM_SITE):
+        scene = block if site == PHANTOM_SITE else skin
         scene.fibre_light(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
-    return _SkinAndBlock(skin, block, PHANTOM)
+    return _SkinAndBlock(skin, block, PHANTOM_SITE)
 
 
 class _SkinAndBlock:

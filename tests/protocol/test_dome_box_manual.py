@@ -12,7 +12,7 @@ from capture.devices.wire import Code, Event, Request
 from capture.plan.dome import as_table, dome_plan
 from capture.plan.eye_light import eye_light
 from capture.plan.flicker import flicker_of_rows
-from capture.plan.light_order import ORDERS
+from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
 from rigsim.boxes.led_table import LEVEL_STEPS, Row, table_crc
@@ -469,7 +469,7 @@ def test_the_planned_order_is_accepted_and_a_bad_one_refused():
     assert abs(flashes - host.flashes_per_s) <= 0.5
     assert duty < rig.leds.max_duty
     assert dose < 1.0
-    bad = [LedRow((k,), 1.0, 1 / 12) for k in ORDERS["name"](rig)]
+    bad = [LedRow((k,), 1.0, 1 / 12) for k in LIGHT_ORDERS["name"](rig)]
     bench.load([Row(r.leds, 1000, 83333, 0xFFFF) for r in bad])
     assert bench.code("SEQ:ARM 150") == Code.FLICKER
 

@@ -11,7 +11,8 @@ from capture.acquire import run_plan
 from capture.devices.camera import open_camera
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port
-from capture.plan.multiplexed import course_plan, multiplexed_plan, reorder
+from capture.plan.multiplexed import course_plan, multiplexed_plan
+from capture.plan.phases import reorder
 from capture.rig import load_rig
 from capture.session import Session, Subject
 from rigsim.world import World

@@ -10,7 +10,7 @@ from fixtures.framed_bench import ANY, SHARED_COMMANDS
 from capture.devices import wire
 from capture.devices.gradient_sphere import PatternRow as HostRow
 from capture.devices.wire import Code, Request
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from rigsim.boxes.pattern_table import PatternRow
 from rigsim.world import World
@@ -193,7 +193,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 
 
 def test_host_and_box_spell_a_row_alike(bench):
-    every = itertools.product(PATTERNS, (0.0, 90.0, 7.25), (1.0, 0.3333))
+    every = itertools.product(LIGHT_PATTERNS, (0.0, 90.0, 7.25), (1.0, 0.3333))
     for name, angle_deg, level in every:
         row = HostRow(name, angle_deg, level, 0.0301235, 1)
         bench.ask(f"SEQ:DEF 0,{row.text()}")
@@ -203,7 +203,7 @@ def test_host_and_box_spell_a_row_alike(bench):
 # patterns --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", PATTERNS)
+@pytest.mark.parametrize("name", LIGHT_PATTERNS)
 def test_a_pattern_weighs_each_led_by_its_place(bench, name):
     axis = "xyz".find(name[-1])
     sign = -1.0 if name[0] == "-" else 1.0

@@ -1,6 +1,7 @@
 """Requests, retries and lost links, byte by byte, on a line that a script plays."""
 
 import errno
+import importlib.metadata
 import sys
 import termios
 import threading
@@ -9,7 +10,6 @@ from collections import deque
 import pytest
 import serial
 
-from capture.devices import port as ports
 from capture.devices.port import (
     BadAnswer,
     BoxRebooted,
@@ -289,9 +289,7 @@ def test_an_import_error_inside_a_url_handler_shows(monkeypatch, tmp_path):
     class EntryPoint:
         name, value = "broken", "broken_handlers"
 
-    monkeypatch.setattr(
-        ports.importlib.metadata, "entry_points", lambda *, group, name: [EntryPoint]
-    )
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group, name: [EntryPoint])
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
         Port("broken://box")
     sys.modules.pop("broken_handlers", None)

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from capture.calibration import geometry, store
 from capture.calibration.geometry import CameraPose, bundle, moved_camera
 from capture.calibration.geometry.board import Board, find_board
+from capture.calibration.geometry.bundle_equations import LensPrior
 from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
 from capture.calibration.lights.white_plate import PlateWindow, WhitePlate
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
@@ -103,7 +104,7 @@ def test_cameras_are_found_to_a_third_of_a_pixel_with_a_lens_that_nobody_knew(ge
     # it could have failed: the nominal cameras, and cameras without distortion, do
     nominal = geometry.nominal_cameras(rig)
     assert min(reprojection_px(nominal[name], dome, name) for name in nominal) > 0.5
-    blind = bundle.LensPrior(k1=0.0, k2=0.0, tangential=0.0)
+    blind = LensPrior(k1=0.0, k2=0.0, tangential=0.0)
     without = bundle.adjust(sightings, BOARD, nominal, prior=blind)
     assert max(without.rms_px.values()) > max(found.rms_px.values())
     assert without.sigma_px > 1.2 * found.sigma_px

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.calibration.fiber.gains import FibreCalibration
+from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.session import Session
 from rigsim.as_built.probe import build_probe
 from skinrig.cli import main
@@ -35,7 +35,7 @@ def test_a_probe_is_calibrated_from_its_phantom(phantom, tmp_path, capsys):
 
     rig = Session.open(phantom).rig
     built = build_probe(rig, seed=0)
-    known = FibreCalibration.load(out, rig)
+    known = FiberCalibration.load(out, rig)
     assert known.valid.all()
     away = (known.spots.center_px - built.spot_px) / known.spots.center_stderr_px
     assert np.abs(away).max() < 5  # of 56: once in 30,000

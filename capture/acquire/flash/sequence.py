@@ -31,13 +31,13 @@ from capture.session import Session
 
 log = logging.getLogger(__name__)
 
-SLICE_S = 1.0
+MAX_SLEEP_S = 1.0
 """Longest sleep, after which the operator is asked whether to stop."""
-BEFORE_RELEASE_S = 0.05
+PROMPT_LEAD_S = 0.05
 """Prompts are given by the clock up to here before a frame is due; then it is waited for."""
-COMMANDS_S = 0.1
+COMMAND_LEAD_S = 0.1
 """No prompt is due so soon after the commands that set the light begin."""
-ALMOST_S = 1e-6
+TIME_ROUNDING_S = 1e-6
 """Rounding of times that are sums of periods."""
 
 
@@ -150,8 +150,8 @@ class _Rhythm:
 
     def wait(self, until_s: float) -> None:
         """Let time pass; stop in good order where that is asked for."""
-        while (rest_s := until_s - self.now_s()) > ALMOST_S:
-            self.operator.timer.sleep(min(rest_s, SLICE_S))
+        while (rest_s := until_s - self.now_s()) > TIME_ROUNDING_S:
+            self.operator.timer.sleep(min(rest_s, MAX_SLEEP_S))
             self.operator.stop_if_asked()
 
     def find_quiet(self, span_s: float) -> None:
@@ -184,7 +184,7 @@ class _Prompted(_Rhythm):
         first_s = min(float(step.settings["start_s"]) for step in steps)
         cycle_s = 2 * period_s
         # a resumed run begins with the cycle of its first shot
-        self._first_s = cycle_s * math.floor(first_s / cycle_s + ALMOST_S)
+        self._first_s = cycle_s * math.floor(first_s / cycle_s + TIME_ROUNDING_S)
         self._lead_s = float(plan.limits.get("lead_s", 0.0))
         self._next = 0
         self._given: list[tuple[float, str]] = []
@@ -202,13 +202,13 @@ class _Prompted(_Rhythm):
         due_s = float(step.settings["start_s"])
         cycle_s = 2 * self._period_s
         behind_s = max(free_s, self._first_s) - due_s
-        return due_s + cycle_s * max(0, math.ceil(behind_s / cycle_s - ALMOST_S))
+        return due_s + cycle_s * max(0, math.ceil(behind_s / cycle_s - TIME_ROUNDING_S))
 
     def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
         return [(step, attempt + 1)]
 
     def wait(self, until_s: float) -> None:
-        while (prompt_s := self._next * self._period_s) <= until_s + ALMOST_S:
+        while (prompt_s := self._next * self._period_s) <= until_s + TIME_ROUNDING_S:
             super().wait(prompt_s)
             state = self._states[self._next % 2]
             self.operator.signal(state)
@@ -299,6 +299,6 @@ class _Moment:
         if self._then is not None:
             # waiting for the charge would keep a prompt waiting, and so would the commands
             self._rhythm.wait(time_s + self._charged_s)
-            self._rhythm.find_quiet(COMMANDS_S)
+            self._rhythm.find_quiet(COMMAND_LEAD_S)
             set_light(self._then, self._box)
-        self._rhythm.wait(time_s + self._busy_s - BEFORE_RELEASE_S)
+        self._rhythm.wait(time_s + self._busy_s - PROMPT_LEAD_S)

@@ -15,9 +15,9 @@ from capture.rig import Rig
 from capture.session import Session
 
 CHARGE_TIMEOUT_S = 60.0
-HAND_S = 60.0
+SHUTTER_PRESS_TIMEOUT_S = 60.0
 """How long a person has for pressing a shutter."""
-MAX_TOKEN = 48
+MAX_TOKEN_CHARS = 48
 """Characters of the longest token that a box takes."""
 
 
@@ -129,7 +129,7 @@ def expose(
             operator.prompt(
                 f"step {step.id}: press the shutter of camera {name} ({camera.info.serial}) once, "
                 f"at {want.exposure_s:g} s and ISO {want.iso}, without any light; within "
-                f"{HAND_S:g} s"
+                f"{SHUTTER_PRESS_TIMEOUT_S:g} s"
             )
     if meanwhile is not None:
         meanwhile(report)
@@ -137,7 +137,7 @@ def expose(
     stale = 0
     for name, camera in chosen.items():
         timeout_s = frame_timeout_s(step, rig.view(name))
-        timeout_s += HAND_S if triggers[name] is Trigger.HAND else 0.0
+        timeout_s += SHUTTER_PRESS_TIMEOUT_S if triggers[name] is Trigger.HAND else 0.0
         frames[name], dropped = next_frame(
             camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
         )
@@ -164,7 +164,7 @@ def trigger_of(name: str, camera: Camera, lit: bool) -> Trigger:
 
 def token_of(prefix: str, attempt: int, step: Step) -> str:
     """Name one flash: run, number in the run, try; then as much of the step as a box takes."""
-    return f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN]
+    return f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN_CHARS]
 
 
 def light_of(report: Any | None) -> dict[str, str | float]:

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 CALIPER_LEASE_S = 5.0
 """A camera's frames may keep the host busy for a while; after this silence the skin is let go."""
-FORCE_READINGS = 8
+N_FORCE_READINGS = 8
 
 
 class CaliperDriver(Protocol):
@@ -243,7 +243,7 @@ class SkinStates:
 
     def _settle(self, reading_mm: float) -> None:
         self._scanner.pause(self._drawn.settle_s)
-        readings = [self._caliper.force_n() for _ in range(FORCE_READINGS)]
+        readings = [self._caliper.force_n() for _ in range(N_FORCE_READINGS)]
         self._reading_mm, self._force_n = reading_mm, sum(readings) / len(readings)
 
     def _take(self, state: _State, ended: str) -> None:

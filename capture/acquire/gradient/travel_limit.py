@@ -10,12 +10,12 @@ from capture.rig import Caliper
 
 EndKind = Literal["buckled", "detached", "force"]
 
-GROWS_BY = 0.7
+BUCKLING_FORCE_RATIO = 0.7
 """Skin whose push grows by less than this part of its growth a step before has buckled."""
-GROWS_NO_MORE = 0.05
+PLATEAU_FORCE_RATIO = 0.05
 """Below this part the step before had reached the plateau already."""
 
-_WORDS: dict[EndKind, str] = {
+_END_DESCRIPTIONS: dict[EndKind, str] = {
     "buckled": "the skin buckled: its push grew no more",
     "detached": "the skin came off the tape",
     "force": "the force limit was met",
@@ -44,7 +44,9 @@ class EndOfSkin(Exception):
     """
 
     def __init__(self, end: End) -> None:
-        super().__init__(f"{_WORDS[end.kind]} at {end.reading_mm:.2f} mm ({end.force_n:+.3f} N)")
+        super().__init__(
+            f"{_END_DESCRIPTIONS[end.kind]} at {end.reading_mm:.2f} mm ({end.force_n:+.3f} N)"
+        )
         self.end = end
 
 
@@ -63,9 +65,9 @@ class ForceWatch:
     Notes
     -----
     Compressed skin pushes the jaws apart, about in proportion, until it buckles out of its plane;
-    from then on its push stays. A position whose push has grown by less than `GROWS_BY` of the mean
-    growth a step is behind the onset. Where it has not grown at all the position before was behind
-    it, too, by less than what would have shown then: it is given up as well.
+    from then on its push stays. A position whose push has grown by less than `BUCKLING_FORCE_RATIO`
+    of the mean growth a step is behind the onset. Where it has not grown at all the position before
+    was behind it, too, by less than what would have shown then: it is given up as well.
     """
 
     def __init__(self, caliper: Caliper, direction: int, *, at_rest_n: float) -> None:
@@ -93,9 +95,9 @@ class ForceWatch:
             return
         growth = pushes[-1] - pushes[-2]
         before = (pushes[-2] - pushes[0]) / (len(pushes) - 2)
-        if growth >= GROWS_BY * before:
+        if growth >= BUCKLING_FORCE_RATIO * before:
             return
         # of two steps the first may already be on the plateau
-        early = growth < GROWS_NO_MORE * before and len(pushes) > 3
+        early = growth < PLATEAU_FORCE_RATIO * before and len(pushes) > 3
         first = position + 1 if early else position
         raise EndOfSkin(End("buckled", first, report.reading_mm, force_n))

@@ -17,7 +17,7 @@ from capture import raw
 from capture.acquire.frames import encode
 from capture.acquire.outcome import MAX_ATTEMPTS, Operator, attempts_so_far, given_up, steps_to_do
 from capture.acquire.probe.driver import ProbeDriver
-from capture.acquire.probe.fiber_signal import FibreSignal, said_of, why_enough
+from capture.acquire.probe.fiber_signal import FiberSignal, describe_fibers, why_enough
 from capture.acquire.probe.head import Head, HeadLost, NotHeld
 from capture.acquire.probe.mask_choice import masks_not_needed
 from capture.acquire.probe.source_exposure import Exposed, ShutterFault, expose, expose_dark
@@ -143,7 +143,7 @@ class BracketSeries:
         self, placement: Placement, wanted: Sequence[Step]
     ) -> tuple[list[tuple[Exposed, dict[str, Value], int]], str]:
         """Take a series of one placement; return it, and why the rest of it is not needed."""
-        signal = FibreSignal(self._probe, self._rig.view(wanted[0].cameras[0]))
+        signal = FiberSignal(self._probe, self._rig.view(wanted[0].cameras[0]))
         taken: list[tuple[Exposed, dict[str, Value], int]] = []
         self._head.at(placement)
         fibre = wanted[0].settings.get("fibre")
@@ -223,7 +223,7 @@ class BracketSeries:
 
     # what is not needed -----------------------------------------------------------------------
 
-    def _tell_what_is_missing(self, placement: Placement, signal: FibreSignal) -> None:
+    def _tell_what_is_missing(self, placement: Placement, signal: FiberSignal) -> None:
         """Say of a whole series which fibres it does not show."""
         verdict = signal.verdict([])
         for pairs, what in (
@@ -231,7 +231,9 @@ class BracketSeries:
             (verdict.saturated, "is saturated in every exposure: less level shows it"),
         ):
             if pairs:
-                self._operator.progress(f"{placement}: {said_of(pairs, signal.probe)} {what}")
+                self._operator.progress(
+                    f"{placement}: {describe_fibers(pairs, signal.probe)} {what}"
+                )
 
     def _leave_out(self, steps: Sequence[Step], reason: str) -> None:
         if not steps:

@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 from capture.devices.probe import Opening, ProbeStatus, SuctionReport, SuctionState
 
-LEASE_S = 5.0
+PROBE_LEASE_S = 5.0
 """A frame may keep the host busy for a while; after this silence the box lets go."""
-RENEW_S = 1.0
+LEASE_RENEWAL_S = 1.0
 """Silence between two renewals of the lease while nothing but time is waited for."""
 
 

@@ -18,20 +18,20 @@ from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.plan import Step
 from capture.rig import Probe, View
 
-LEVEL = 0.5
+MIN_PEAK_LEVEL = 0.5
 """Share of full scale that a spot has to reach, unsaturated: at two thirds of a stop the next
 exposure would reach 0.8 and saturate after that."""
-LEAST_SNR = 100.0
+MIN_SERIES_SNR = 100.0
 """Signal to noise that all unsaturated exposures of a spot together have to reach: a per cent."""
-FAINTEST_SNR = 3.0
+MIN_MEASURABLE_SNR = 3.0
 """What would stay below this even with all exposures that are left cannot be measured."""
-BRIGHTEST_PX = 8
+PEAK_RANK_PX = 8
 """The eighth brightest pixel of a color counts as a spot's peak: fewer may be hot."""
-SPOT_SHARE = 0.4
+SPOT_HALF_SIDE_PITCH = 0.4
 """Half the side of the square in which a spot is sought, of the distance between spots."""
-AROUND_SHARE = 0.55
+BACKGROUND_DISTANCE_PITCH = 0.55
 """Farther than this from every spot, of that distance, is what no fibre lights."""
-_COLORS = {"R": 0, "G": 1, "B": 2}
+_COLOR_INDEX = {"R": 0, "G": 1, "B": 2}
 COLOR_NAMES = ("red", "green", "blue")
 
 
@@ -47,7 +47,7 @@ class Verdict:
     """The same of what saturates in every one."""
 
 
-class FibreSignal:
+class FiberSignal:
     """Light of each fibre in each color, exposure by exposure of one series.
 
     Parameters
@@ -77,14 +77,14 @@ class FibreSignal:
         count = 1 if view.cfa == "MONO" else 3
         self._windows = [
             [
-                _in_color(self._colors, _window(view, spot, SPOT_SHARE * pitch_px), c)
+                _in_color(self._colors, _window(view, spot, SPOT_HALF_SIDE_PITCH * pitch_px), c)
                 for c in range(count)
             ]
             for spot in spots
         ]
         lit = np.zeros((view.height_px, view.width_px), bool)
         for spot in spots:
-            lit[_window(view, spot, AROUND_SHARE * pitch_px)] = True
+            lit[_window(view, spot, BACKGROUND_DISTANCE_PITCH * pitch_px)] = True
         self._around = [np.flatnonzero(~lit & (self._colors == c)) for c in range(count)]
         shape = (len(spots), count)
         self.level = np.zeros(shape)
@@ -106,7 +106,7 @@ class FibreSignal:
             zero = float(np.median(pixels[around])) if len(around) else float(view.black_level)
             for fibre, windows in enumerate(self._windows):
                 values = pixels[windows[color]]
-                rank = max(len(values) - BRIGHTEST_PX, 0)
+                rank = max(len(values) - PEAK_RANK_PX, 0)
                 peak = float(np.partition(values, rank)[rank])
                 if peak >= view.white_level:
                     continue
@@ -136,27 +136,27 @@ class FibreSignal:
         above its estimate; only what even that would leave in the noise is given up.
         """
         snr = self.signal_to_noise
-        measured = (self.level >= LEVEL) & (snr >= LEAST_SNR)
+        measured = (self.level >= MIN_PEAK_LEVEL) & (snr >= MIN_SERIES_SNR)
         saturated = self._always_saturated & (self._looked > 0)
         seconds = np.maximum(self._seconds, 1e-12)
         error = np.sqrt(self._variance)
-        rate = np.maximum((self._sum + FAINTEST_SNR * error) / seconds, 0.0)
+        rate = np.maximum((self._sum + MIN_MEASURABLE_SNR * error) / seconds, 0.0)
         more_s = float(sum(left_s))
         signal = np.maximum(self._sum, 0.0) + rate * more_s
         per_frame = self._variance / max(self._looked, 1)
         noise = self._variance + per_frame * len(left_s) + rate * more_s / self._view.gain_e_per_dn
-        hopeless = ~measured & ~saturated & (signal < FAINTEST_SNR * np.sqrt(noise))
+        hopeless = ~measured & ~saturated & (signal < MIN_MEASURABLE_SNR * np.sqrt(noise))
         return Verdict(
             bool((measured | hopeless | saturated).all()), _pairs(hopeless), _pairs(saturated)
         )
 
 
-def why_enough(signal: FibreSignal, last: Step, left: Sequence[Step]) -> str:
+def why_enough(signal: FiberSignal, last: Step, left: Sequence[Step]) -> str:
     """Return why the exposures that are left after the last show no more; empty where they may.
 
     Parameters
     ----------
-    signal : FibreSignal
+    signal : FiberSignal
         Of the exposures up to the last.
     last : Step
     left : sequence of Step
@@ -170,21 +170,25 @@ def why_enough(signal: FibreSignal, last: Step, left: Sequence[Step]) -> str:
     what = f"all {len(signal.probe.fibres)} fibres"
     what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
     at_s = float(last.settings["exposure_s"])
-    reason = f"{span} left out: {what} above {100 * LEVEL:g} % of full scale at {at_s:.2g} s"
+    reason = (
+        f"{span} left out: {what} above {100 * MIN_PEAK_LEVEL:g} % of full scale at {at_s:.2g} s"
+    )
     if verdict.hopeless:
-        reason += f"; {said_of(verdict.hopeless, signal.probe)} would stay in the noise"
+        reason += f"; {describe_fibers(verdict.hopeless, signal.probe)} would stay in the noise"
     if verdict.saturated:
-        reason += f"; {said_of(verdict.saturated, signal.probe)} saturated in every exposure"
+        reason += (
+            f"; {describe_fibers(verdict.saturated, signal.probe)} saturated in every exposure"
+        )
     return reason
 
 
-def said_of(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:
+def describe_fibers(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:
     """Return fibres and colors as words.
 
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> said_of([(26, 2), (27, 2)], load_rig("probe").probe)
+    >>> describe_fibers([(26, 2), (27, 2)], load_rig("probe").probe)
     'blue of F27, F28'
     """
     parts = []
@@ -201,7 +205,7 @@ def _color_of(view: View) -> NDArray[np.int8]:
     colors = np.zeros((view.height_px, view.width_px), np.int8)
     if view.cfa != "MONO":
         for place, letter in enumerate(view.cfa):
-            colors[place // 2 :: 2, place % 2 :: 2] = _COLORS[letter]
+            colors[place // 2 :: 2, place % 2 :: 2] = _COLOR_INDEX[letter]
     return colors
 
 

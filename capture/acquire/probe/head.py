@@ -13,20 +13,20 @@ from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
 from capture.acquire.probe.driver import ProbeDriver
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
-from capture.plan.probe import CAP
-from capture.plan.suction import SLACK_S, Placement
+from capture.plan.probe import CAP_SITE
+from capture.plan.suction import WIRE_SLACK_S, Placement
 from capture.rig import Probe
 
 log = logging.getLogger(__name__)
 
-LISTEN_S = 0.1
-REACH_MARGIN_S = 1.0
+SUCTION_POLL_S = 0.1
+SUCTION_MARGIN_S = 1.0
 """Beyond the box's own time for reaching a suction."""
-OFF_SHARE = 0.5
+DETACHED_SUCTION_RATIO = 0.5
 """A head under less than this of its suction has come off."""
-COOL_S = 180.0
+CAMERA_TEMPERATURE_TIMEOUT_S = 180.0
 """How long a camera that is too warm, or too cold, is waited for, s."""
-COOL_LISTEN_S = 1.0
+CAMERA_TEMPERATURE_POLL_S = 1.0
 
 
 class HeadLost(Exception):
@@ -94,7 +94,7 @@ class Head:
         """Tell a box that has let go of everything meanwhile that the cap is where it was."""
         if not self._box.status().placed:
             self._box.arm()
-            self._box.place(CAP, 0.0)
+            self._box.place(CAP_SITE, 0.0)
 
     def let_go(self) -> None:
         """Vent, disarm and forget the placement: a person's hands are at the head now."""
@@ -117,13 +117,13 @@ class Head:
             Where the gauge is dead.
         """
         state = self._box.suction()
-        if state.on and state.left_s >= next_s + SLACK_S:
+        if state.on and state.left_s >= next_s + WIRE_SLACK_S:
             return
         if state.on:
             self.release()
         self._check_place()
         while (state := self._box.suction()).left_s > 0.0 and not state.on:
-            self._box.listen(min(state.left_s, LISTEN_S))
+            self._box.listen(min(state.left_s, SUCTION_POLL_S))
         self._cool()
         try:
             self._box.set_level(level)
@@ -150,7 +150,7 @@ class Head:
         suction_mbar, camera_c = self._box.pressure_mbar(), self._box.camera_c()
         if not self._box.suction().on:
             raise HeadLost(self._how_it_ended())
-        if suction_mbar < OFF_SHARE * probe.suction_mbar:
+        if suction_mbar < DETACHED_SUCTION_RATIO * probe.suction_mbar:
             raise HeadLost(f"the suction fell to {self._compared(suction_mbar)}")
         if abs(suction_mbar - probe.suction_mbar) > probe.suction_tolerance_mbar:
             self.release()
@@ -183,7 +183,7 @@ class Head:
     def _settle(self) -> None:
         """Wait until the suction has stayed within its limits for as long as the rig says."""
         probe = self._probe
-        reach_s = float(self._box.limits["reach_ms"]) / 1e3 + REACH_MARGIN_S
+        reach_s = float(self._box.limits["reach_ms"]) / 1e3 + SUCTION_MARGIN_S
         waited_s, within_s = 0.0, 0.0
         suction_mbar = 0.0
         while True:
@@ -197,7 +197,7 @@ class Head:
                     raise HeadLost(f"the suction is {self._compared(suction_mbar)}")
             elif within_s >= probe.settle_s:
                 return
-            pause_s = LISTEN_S if not good else min(LISTEN_S, probe.settle_s - within_s)
+            pause_s = SUCTION_POLL_S if not good else min(SUCTION_POLL_S, probe.settle_s - within_s)
             self._box.listen(max(pause_s, 1e-3))
             waited_s += pause_s
             within_s += pause_s if good else 0.0
@@ -209,15 +209,15 @@ class Head:
             if waited_s == 0.0:
                 text = f"the camera is at {self._temperature(camera_c)}; waiting for it"
                 self._operator.progress(text)
-            if waited_s >= COOL_S:
+            if waited_s >= CAMERA_TEMPERATURE_TIMEOUT_S:
                 raise AcquisitionError(
-                    f"camera: still at {self._temperature(camera_c)} after {COOL_S:g} s; its dark "
-                    "current would not be that of the dark frames: check its cooling, then run "
-                    "the same command with --resume"
+                    f"camera: still at {self._temperature(camera_c)} after"
+                    f" {CAMERA_TEMPERATURE_TIMEOUT_S:g} s; its dark current would not be that of"
+                    " the dark frames: check its cooling, then run the same command with --resume"
                 )
             self._operator.stop_if_asked()
-            self._box.listen(COOL_LISTEN_S)
-            waited_s += COOL_LISTEN_S
+            self._box.listen(CAMERA_TEMPERATURE_POLL_S)
+            waited_s += CAMERA_TEMPERATURE_POLL_S
         return camera_c
 
     def _check_place(self) -> None:

@@ -10,19 +10,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.acquire.probe.fiber_signal import FibreSignal
+from capture.acquire.probe.fiber_signal import FiberSignal
 from capture.arrays import Float64Array
 from capture.plan import Step
 from capture.session import Session
 
-MOST_LEVEL = 0.7
+MAX_UNSATURATED_LEVEL = 0.7
 """Share of full scale up to which a spot is safely unsaturated."""
-OVER = 64.0
+MAX_OVEREXPOSURE = 64.0
 """How many times longer its neighbors are looked at: a thousandth of it then stands at some per
 cent of full scale, and what is saturated does not yet spill over."""
 
 
-def serving(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
+def usable_exposures(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
     """Return the ids of those exposures of covered heads that serve.
 
     Parameters
@@ -37,7 +37,7 @@ def serving(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
     >>> steps = [
     ...     Step(f"m{k}", "mask", {"fibre": 0, "bracket": k},
     ...          {"exposure_s": 0.01 * 4.0**k, "fibre": 0}, ("cam",)) for k in range(6)]
-    >>> sorted(serving(steps, np.array([[1.0, 3.0, 0.2]])))
+    >>> sorted(usable_exposures(steps, np.array([[1.0, 3.0, 0.2]])))
     ['m2', 'm5']
     """
     kept: set[str] = set()
@@ -48,9 +48,9 @@ def serving(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
         ordered = sorted(some, key=lambda step: float(step.settings["exposure_s"]))
         seconds = np.array([float(step.settings["exposure_s"]) for step in ordered])
         brightest = float(rate_per_s[fibre].max())
-        own = max(int(np.count_nonzero(seconds * brightest <= MOST_LEVEL)) - 1, 0)
+        own = max(int(np.count_nonzero(seconds * brightest <= MAX_UNSATURATED_LEVEL)) - 1, 0)
         # exposures are whole milliseconds on some boxes: a hair of room
-        others = int(np.count_nonzero(seconds <= 1.01 * OVER * seconds[own])) - 1
+        others = int(np.count_nonzero(seconds <= 1.01 * MAX_OVEREXPOSURE * seconds[own])) - 1
         kept |= {ordered[own].id, ordered[others].id}
     return kept
 
@@ -68,11 +68,11 @@ def masks_not_needed(session: Session) -> tuple[list[Step], str]:
     if not phantom or chosen or session.rig.probe is None:
         return [], ""
     camera = masks[0].cameras[0]
-    signal = FibreSignal(session.rig.probe, session.rig.view(camera))
+    signal = FiberSignal(session.rig.probe, session.rig.view(camera))
     for record in phantom:
         if record.camera == camera:
             signal.look(np.asarray(session.read(record).cfa), float(record.settings["exposure_s"]))
-    kept = serving(masks, signal.rate_per_s)
+    kept = usable_exposures(masks, signal.rate_per_s)
     rest = [step for step in masks if step.id not in kept]
     return rest, (
         f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one that "

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from capture.acquire.outcome import Acquired, Operator, tear_down
 from capture.acquire.probe.bracket_series import BracketSeries
 from capture.acquire.probe.checks import check_cameras, check_probe
-from capture.acquire.probe.driver import LEASE_S, ProbeDriver
+from capture.acquire.probe.driver import PROBE_LEASE_S, ProbeDriver
 from capture.devices.camera import Camera
 from capture.plan import Plan
 from capture.rig import Rig
@@ -41,7 +41,7 @@ def run_probe(
     series = BracketSeries(rig, box, cameras, session, operator, all_brackets=all_brackets)
     try:
         box.dark()  # whatever was going on before
-        box.set_lease(LEASE_S)
+        box.set_lease(PROBE_LEASE_S)
         if not session.frames():
             box.new_subject(session.id[:32])
         series.darks()

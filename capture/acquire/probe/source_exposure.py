@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from capture.acquire.frames import configure, wanted_exposure
-from capture.acquire.probe.driver import RENEW_S, ProbeDriver
+from capture.acquire.probe.driver import LEASE_RENEWAL_S, ProbeDriver
 from capture.acquire.probe.head import HeadLost
 from capture.devices.camera import Camera, Frame, FrameRefused, Trigger, next_frame
 from capture.devices.port import CommandRefused
@@ -20,9 +20,9 @@ from capture.devices.wire import Code
 from capture.plan import Step
 from capture.rig import Rig
 
-FRAME_S = 3.0
+FRAME_TIMEOUT_S = 3.0
 """How long a frame may take after its read-out, s: the box waits a little longer for its host."""
-CLOSING_S = 0.2
+SHUTTER_REPORT_TIMEOUT_S = 0.2
 """How long the end of an opening may take to be told, s."""
 SHUTTER_DEVIATION = 0.02
 """How far the light's time may be off what was asked for, relative; a fibre's light is as much."""
@@ -76,7 +76,7 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
             opening = box.open_shutter(seconds)
         except CommandRefused as error:
             if error.code == Code.HARDWARE:
-                mend(box, step)
+                recover_shutter(box, step)
                 raise ShutterFault(str(error)) from error
             if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
                 raise HeadLost("the box did not hold the head") from error
@@ -85,8 +85,8 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
             return opening.t_open_s, _light_s(step, box, opening)
         except (ShutterFault, HeadLost):
             # the camera still exposes or reads out, and would miss the next pulse
-            over_s = opening.t_open_s + seconds + readout_s + CLOSING_S
-            box.listen(over_s - box.ping(), every_s=RENEW_S)
+            over_s = opening.t_open_s + seconds + readout_s + SHUTTER_REPORT_TIMEOUT_S
+            box.listen(over_s - box.ping(), every_s=LEASE_RENEWAL_S)
             raise
 
     return _expose(step, rig, box, cameras, release)
@@ -95,18 +95,18 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
 def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
     """Wait until the shutter has closed and return how long its light lasted, s."""
     seconds = float(step.settings["exposure_s"])
-    box.listen(seconds, every_s=RENEW_S)
+    box.listen(seconds, every_s=LEASE_RENEWAL_S)
     last = box.last_opening()
     waited_s = 0.0
-    while last is not None and last.ended == "open" and waited_s < CLOSING_S:
-        box.listen(CLOSING_S / 10.0)
-        waited_s += CLOSING_S / 10.0
+    while last is not None and last.ended == "open" and waited_s < SHUTTER_REPORT_TIMEOUT_S:
+        box.listen(SHUTTER_REPORT_TIMEOUT_S / 10.0)
+        waited_s += SHUTTER_REPORT_TIMEOUT_S / 10.0
         last = box.last_opening()
     ended = "not at all" if last is None or last.number != opening.number else last.ended
     if last is None or ended != "timed":
         if ended in ("pump", "interlock", "dark"):
             raise HeadLost("the suction failed while the shutter was open")
-        mend(box, step)
+        recover_shutter(box, step)
         raise ShutterFault(f"the shutter closed as {ended!r} instead of by its own end")
     open_s = last.t_shut_s - last.t_open_s
     if abs(open_s - seconds) > SHUTTER_DEVIATION * seconds + SHUTTER_MARGIN_S:
@@ -114,7 +114,7 @@ def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
     return open_s
 
 
-def mend(box: ProbeDriver, step: Step) -> None:
+def recover_shutter(box: ProbeDriver, step: Step) -> None:
     """Try to close a shutter that is stuck, and to light the LED again that was put out for it."""
     try:
         box.close_shutter()
@@ -142,12 +142,12 @@ def _expose(
     readout_s = max(rig.view(name).readout_s for name in chosen)
     # the lease is renewed up to the moment at which the frame should be there
     dark_s = 0.0 if open_s else want.exposure_s
-    box.listen(dark_s + readout_s, every_s=RENEW_S)
+    box.listen(dark_s + readout_s, every_s=LEASE_RENEWAL_S)
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():
         frames[name], dropped = next_frame(
-            camera, seq=0, not_before_s=not_before[name], want=want, timeout_s=FRAME_S
+            camera, seq=0, not_before_s=not_before[name], want=want, timeout_s=FRAME_TIMEOUT_S
         )
         stale += dropped
     return Exposed(step, frames, t_box_s, open_s, stale)

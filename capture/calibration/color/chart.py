@@ -16,10 +16,10 @@ __all__ = ["ChartError", "Patches", "find_chart", "measure_patches"]
 logger = logging.getLogger(__name__)
 
 
-ROWS, COLUMNS = 4, 6
-PATCH_SHARE = 0.87  # side of a patch over the distance of neighbours, ColorChecker Classic
+CHART_ROWS, CHART_COLUMNS = 4, 6
+PATCH_SIDE_PITCH = 0.87  # side of a patch over the distance of neighbours, ColorChecker Classic
 MAX_DETECTION_PX = 2000  # longer sides are shrunk for detection only
-MISFIT_LIMIT = 0.35  # of the spread of the patches' colors that an affine map may leave
+MAX_AFFINE_MISFIT = 0.35  # of the spread of the patches' colors that an affine map may leave
 
 
 class ChartError(CalibrationError):
@@ -175,7 +175,9 @@ def _detect(unit: Float64Array) -> Float64Array:
 
 def _grid() -> Float64Array:
     """Model coordinates (column, row) of the 24 patches."""
-    return np.array([(c, r) for r in range(ROWS) for c in range(COLUMNS)], dtype=np.float64)
+    return np.array(
+        [(c, r) for r in range(CHART_ROWS) for c in range(CHART_COLUMNS)], dtype=np.float64
+    )
 
 
 def _homography(model: Float64Array, points: Float64Array, weight: Float64Array) -> Float64Array:
@@ -198,13 +200,16 @@ def _project(h: Float64Array, model: Float64Array) -> Float64Array:
 def _grid_from_corners(corners: Float64Array) -> Float64Array:
     if corners.shape != (4, 2) or not np.isfinite(corners).all():
         raise ChartError(f"corners: got shape {corners.shape}, expected four points x, y")
-    model = np.array([(0, 0), (COLUMNS - 1, 0), (COLUMNS - 1, ROWS - 1), (0, ROWS - 1)], float)
+    model = np.array(
+        [(0, 0), (CHART_COLUMNS - 1, 0), (CHART_COLUMNS - 1, CHART_ROWS - 1), (0, CHART_ROWS - 1)],
+        float,
+    )
     return _project(_homography(model, corners, np.ones(4)), _grid())
 
 
 def _pitch(centers: Float64Array) -> float:
     """Smallest distance of neighbouring patches, pixels."""
-    grid = centers.reshape(ROWS, COLUMNS, 2)
+    grid = centers.reshape(CHART_ROWS, CHART_COLUMNS, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     return float(min(steps))
 
@@ -245,7 +250,7 @@ def _refine(unit: Float64Array, centers: Float64Array) -> Float64Array:
         if not distance[inside].max() < 0.5 * contrast:
             continue
         share = inside.mean() * (1.24**2)  # of a patch cell
-        if not 0.6 < share / PATCH_SHARE**2 < 1.3:
+        if not 0.6 < share / PATCH_SIDE_PITCH**2 < 1.3:
             continue
         rows, columns = np.nonzero(inside)
         shift = np.array([columns.mean() + area[1].start - x, rows.mean() + area[0].start - y])
@@ -277,7 +282,7 @@ def _check_order(unit: Float64Array, centers: Float64Array) -> Float64Array:
         colors[i] = np.median(unit[window].reshape(-1, 3), axis=0)
     target = np.cbrt(np.maximum(xyz_to_linear_srgb(chart_reference("D50"), illuminant="D50"), 0.0))
     design = np.column_stack([np.cbrt(colors), np.ones(24)])
-    order = np.arange(24).reshape(ROWS, COLUMNS)
+    order = np.arange(24).reshape(CHART_ROWS, CHART_COLUMNS)
     layouts = {
         "upright": order,
         "upside down": order[::-1, ::-1],
@@ -290,13 +295,16 @@ def _check_order(unit: Float64Array, centers: Float64Array) -> Float64Array:
         rest = target - chosen @ np.linalg.lstsq(chosen, target, rcond=None)[0]
         misfit[name] = float(np.sqrt((rest**2).mean() / target.var(axis=0).mean()))
     best = min(misfit, key=misfit.__getitem__)
-    if misfit[best] > MISFIT_LIMIT:
+    if misfit[best] > MAX_AFFINE_MISFIT:
         raise ChartError(
             "image: what looks like a chart has not the colors of a ColorChecker Classic (an affine"
             f" map leaves {100 * misfit[best]:.0f} % of their spread); use that chart, unobstructed"
         )
     centers = centers[layouts[best].ravel()]
-    (ax, ay), (bx, by) = centers[COLUMNS - 1] - centers[0], centers[-COLUMNS] - centers[0]
+    (ax, ay), (bx, by) = (
+        centers[CHART_COLUMNS - 1] - centers[0],
+        centers[-CHART_COLUMNS] - centers[0],
+    )
     if ax * by - ay * bx < 0:  # x right, y down: columns turn clockwise into rows
         raise ChartError("image: the chart is mirrored; turn off mirroring in the camera program")
     return centers

@@ -31,14 +31,14 @@ WHITE_XYZ: dict[str, tuple[float, float, float]] = {  # 2 degree observer, Y = 1
 }
 
 # Cone responses of the Bradford adaptation: Lam 1985; as in ICC.1:2010 annex E
-_BRADFORD = np.array(
+_BRADFORD_CONES = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
 
 # Primaries of IEC 61966-2-1 (sRGB) as chromaticities x, y
 _SRGB_XY = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 
-_EPSILON = (6.0 / 29.0) ** 3  # CIE 15:2004, where the cube root begins
+_LAB_CUBE_ROOT_START = (6.0 / 29.0) ** 3  # CIE 15:2004, where the cube root begins
 
 
 def white_point(illuminant: str) -> Float64Array:
@@ -57,7 +57,7 @@ def white_point(illuminant: str) -> Float64Array:
 def lab_from_xyz(xyz: ArrayLike, white: ArrayLike) -> Float64Array:
     """Return CIE L*a*b* of XYZ, shape (..., 3), for a white of the same scale."""
     t = np.asarray(xyz, dtype=np.float64) / np.asarray(white, dtype=np.float64)
-    f = np.where(t > _EPSILON, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    f = np.where(t > _LAB_CUBE_ROOT_START, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = f[..., 0], f[..., 1], f[..., 2]
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
@@ -82,7 +82,9 @@ def lab_jacobian(xyz: ArrayLike, white: ArrayLike) -> Float64Array:
     w = np.asarray(white, dtype=np.float64)
     t = np.asarray(xyz, dtype=np.float64) / w
     slope = np.where(
-        t > _EPSILON, 1 / (3 * np.cbrt(np.maximum(t, _EPSILON)) ** 2), 1 / (3 * (6 / 29) ** 2)
+        t > _LAB_CUBE_ROOT_START,
+        1 / (3 * np.cbrt(np.maximum(t, _LAB_CUBE_ROOT_START)) ** 2),
+        1 / (3 * (6 / 29) ** 2),
     )
     mix = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
     return mix * (slope / w)[..., None, :]
@@ -97,9 +99,9 @@ def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
 
 def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float64Array:
     """Return XYZ seen under another white, by the Bradford transform, shape (..., 3)."""
-    source = _BRADFORD @ np.asarray(source_white, dtype=np.float64)
-    target = _BRADFORD @ np.asarray(target_white, dtype=np.float64)
-    matrix = np.linalg.solve(_BRADFORD, (target / source)[:, None] * _BRADFORD)
+    source = _BRADFORD_CONES @ np.asarray(source_white, dtype=np.float64)
+    target = _BRADFORD_CONES @ np.asarray(target_white, dtype=np.float64)
+    matrix = np.linalg.solve(_BRADFORD_CONES, (target / source)[:, None] * _BRADFORD_CONES)
     return np.asarray(xyz, dtype=np.float64) @ matrix.T
 
 

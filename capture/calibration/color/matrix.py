@@ -32,7 +32,7 @@ __all__ = [
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
-NEUTRALS = slice(18, 23)  # white to neutral 3.5; the black patch is too glossy to balance by
+NEUTRAL_PATCHES = slice(18, 23)  # white to neutral 3.5; the black patch is too glossy to balance by
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +207,11 @@ def neutral_white(
     Quantity
         Shape (3,), in the unit of `camera_rgb`; the error is from the scatter of the patches.
     """
-    rgb = np.asarray(camera_rgb, dtype=np.float64)[NEUTRALS]
-    y = np.asarray(chart_reference() if reference is None else reference)[NEUTRALS, 1]
+    rgb = np.asarray(camera_rgb, dtype=np.float64)[NEUTRAL_PATCHES]
+    y = np.asarray(chart_reference() if reference is None else reference)[NEUTRAL_PATCHES, 1]
     use = np.isfinite(rgb).all(axis=1) & (rgb > 0).all(axis=1)
     if valid is not None:
-        use &= np.asarray(valid, dtype=bool)[NEUTRALS]
+        use &= np.asarray(valid, dtype=bool)[NEUTRAL_PATCHES]
     if use.sum() < 2:
         raise ValueError(
             f"camera_rgb: got {int(use.sum())} usable neutral patches, expected at least 2; expose"

@@ -15,7 +15,7 @@ from capture.calibration.sensor.transfer_curve import block_sums
 __all__ = ["WhiteReference", "white_reference"]
 
 
-BLOCKS = 24  # samples along the shorter side for the smooth fit
+N_WHITE_BLOCKS = 24  # samples along the shorter side for the smooth fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ def _smooth(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Replace a shaded white tile by its polynomial, with the error of the fit."""
     height, width = good.shape
-    side = max(min(height, width) // BLOCKS, 1)
+    side = max(min(height, width) // N_WHITE_BLOCKS, 1)
     count = block_sums(good.astype(np.float64), side)
     r, c = np.nonzero(count >= side * side / 2)
     rows, columns = r * side + (side - 1) / 2, c * side + (side - 1) / 2

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.arrays import Float64Array
-from capture.calibration.fiber.readings import FibreReadings
+from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.record import CalibrationError
 
 __all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
@@ -18,15 +18,15 @@ __all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
-FAR: Final = 4
+GROUP_MEAN_DISTANCE: Final = 4
 """Places apart, out of `DISTANCE_EDGES`, from which pairs are known by their group's mean alone."""
-LEAST_SCATTER: Final = 0.3
+MIN_PAIR_SCATTER: Final = 0.3
 """Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
-OVERLAP: Final = 0.05
+MAX_SPOT_OVERLAP: Final = 0.05
 """Above this a pair's spots overlap: they tell nothing of others as far apart."""
-UNEVEN_COVER: Final = 0.3
+COVER_TRANSMITTANCE_SCATTER: Final = 0.3
 """By how much covers may differ in what they let through, relative."""
-ROUNDS: Final = 30
+MAX_CROSSTALK_ITERATIONS: Final = 30
 
 
 class CrossTalkError(CalibrationError):
@@ -131,8 +131,9 @@ class CrossTalk:
     ) -> Float64Array:
         """Change of `light` for one standard error of each far group of pairs, shape (G, F, C).
 
-        Pairs of fibres that are `FAR` places apart or more are fainter than their noise: what is
-        known of them is the mean of their group, whose error is the same in all of them.
+        Pairs of fibres that are `GROUP_MEAN_DISTANCE` places apart or more are fainter than
+        their noise: what is known of them is the mean of their group, whose error is the same in
+        all of them.
 
         Parameters
         ----------
@@ -142,7 +143,7 @@ class CrossTalk:
         place = np.arange(len(light))
         group = np.searchsorted(DISTANCE_EDGES, np.abs(place[:, None] - place), side="right") - 1
         moved = light[None] - ratio[:, None] * reference[None]
-        each = range(DISTANCE_EDGES.index(FAR), len(DISTANCE_EDGES))
+        each = range(DISTANCE_EDGES.index(GROUP_MEAN_DISTANCE), len(DISTANCE_EDGES))
         return np.stack(
             [-np.einsum("ji,jic->jc", np.where(group == g, self.stderr, 0.0), moved) for g in each]
         )
@@ -154,15 +155,15 @@ def no_crosstalk(count: int, colors: int) -> CrossTalk:
     return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, nothing, False)
 
 
-def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings) -> CrossTalk:
+def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings) -> CrossTalk:
     """Measure cross-talk and stray light with one fibre uncovered at a time.
 
     Parameters
     ----------
-    masks : mapping of int to FibreReadings
+    masks : mapping of int to FiberReadings
         By the number of the uncovered fibre, on one bright target with one light; not all fibres
         need to be there.
-    phantom : FibreReadings
+    phantom : FiberReadings
         The same with no fibre covered: tells what leaks through the covers from stray light.
 
     Returns
@@ -200,7 +201,7 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings
     offset, offset_variance = np.zeros((count, colors)), np.zeros((count, colors))
     matrix, variance = np.zeros((count, count)), np.zeros((count, count))
     information = np.einsum("jic,ic->ji", weight, source**2)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_CROSSTALK_ITERATIONS):
         # each pair by itself, given the stray light
         seen = np.einsum("jic,ic->ji", weight * (value - offset[:, None]), source)
         matrix, variance = _pooled(seen, information, group)
@@ -223,7 +224,7 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings
 
 
 def _stray(
-    steady: Float64Array, variance: Float64Array, phantom: FibreReadings
+    steady: Float64Array, variance: Float64Array, phantom: FiberReadings
 ) -> tuple[float, float, Float64Array, Float64Array, Float64Array]:
     """Part light that is the same in all masks into a cover's leak and stray light.
 
@@ -235,9 +236,11 @@ def _stray(
     source = np.where(good, np.maximum(phantom.signal, 0.0), 0.0)
     leak, leak_variance = 0.0, 0.0
     level = np.zeros(colors)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_CROSSTALK_ITERATIONS):
         # one leak and a stray light in each color; covers differ, so bright fibres do not rule
-        spread = np.where(good, variance + (UNEVEN_COVER * leak * source) ** 2, np.inf)
+        spread = np.where(
+            good, variance + (COVER_TRANSMITTANCE_SCATTER * leak * source) ** 2, np.inf
+        )
         design = np.zeros((count, colors, 1 + colors))
         design[..., 0] = source
         design[:, np.arange(colors), 1 + np.arange(colors)] = 1.0
@@ -252,7 +255,7 @@ def _stray(
         if abs(leak - before) <= 1e-3 * leak:
             break
     rest = steady - leak * source
-    doubt = variance + source**2 * (leak_variance + (UNEVEN_COVER * leak) ** 2)
+    doubt = variance + source**2 * (leak_variance + (COVER_TRANSMITTANCE_SCATTER * leak) ** 2)
     stray = np.tile(level, (count, 1))
     own, common = np.zeros((count, colors)), np.zeros((count, colors))
     for c in range(colors):
@@ -270,13 +273,13 @@ def _pooled(
     matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
     own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
     last = 0.0
-    overlap = own > OVERLAP
+    overlap = own > MAX_SPOT_OVERLAP
     matrix[overlap] = own[overlap]
     variance[overlap] = 1.0 / information[overlap]
     for number in range(int(group.max(initial=-1)) + 1):
         here = (group == number) & ~overlap
         if (information[here] > 0).any():
-            matrix[here], alone, common = shrunk(own[here], information[here], LEAST_SCATTER)
+            matrix[here], alone, common = shrunk(own[here], information[here], MIN_PAIR_SCATTER)
             variance[here] = alone**2 + common**2
             last = float(np.median(np.abs(matrix[here])))
         else:

@@ -13,21 +13,21 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 from capture.calibration.sensor import SensorCalibration
 from capture.documents import Checks
-from capture.rig import PATTERNS, View
+from capture.rig import CFA_PATTERNS, View
 
 __all__ = ["CameraNoise", "DarkError", "DarkModel", "measure_darks"]
 
 
-HOT_SIGMAS: Final = 6.0
-LEAST_HOT_DN: Final = 1.0
+HOT_FIT_SIGMAS: Final = 6.0
+MIN_HOT_DN: Final = 1.0
 """What no hot pixel stays below at the longest exposure."""
 DOUBLING_K: Final = 7.0
 DOUBLING_STDERR_K: Final = 1.0
 """By how much a sensor warms until its dark current doubles; Widenhorn et al. 2002, doi
 10.1117/12.463446, find silicon near 0 C to double each 6 to 8 K."""
-FARTHEST_K: Final = 10.0
+MAX_TEMPERATURE_GAP_K: Final = 10.0
 """Beyond this a dark current is not carried from one temperature to another."""
-SAME_K: Final = 0.5
+SAME_TEMPERATURE_K: Final = 0.5
 
 
 class DarkError(CalibrationError):
@@ -64,7 +64,7 @@ class CameraNoise:
         checks.positive(gain_e_per_dn=self.gain_e_per_dn)
         checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < np.inf, ">= 0")
         checks.that("black_dn", self.black_dn, 0 <= self.black_dn < self.white_dn, "0 to white")
-        checks.that("pattern", self.pattern, self.pattern in PATTERNS, f"one of {PATTERNS}")
+        checks.that("pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}")
         checks.close()
 
     @classmethod
@@ -163,13 +163,13 @@ class DarkModel:
         if temperature_c is None or self.temperature_c is None:
             return self
         apart = temperature_c - self.temperature_c
-        if abs(apart) <= SAME_K:
+        if abs(apart) <= SAME_TEMPERATURE_K:
             return self
-        if abs(apart) > FARTHEST_K:
+        if abs(apart) > MAX_TEMPERATURE_GAP_K:
             raise DarkError(
                 f"dark frames: got a camera at {self.temperature_c:.1f} C, but the frames were"
-                f" taken at {temperature_c:.1f} C, expected at most {FARTHEST_K:g} K apart; capture"
-                " darks at the frames' temperature"
+                f" taken at {temperature_c:.1f} C, expected at most"
+                f" {MAX_TEMPERATURE_GAP_K:g} K apart; capture darks at the frames' temperature"
             )
         factor = 2.0 ** (apart / DOUBLING_K)
         relative = abs(np.log(factor)) * DOUBLING_STDERR_K / DOUBLING_K
@@ -255,9 +255,9 @@ def measure_darks(
     error = np.linalg.inv(normal)
     own_bias, own_rate = error[0, 0] * z0 + error[0, 1] * z1, error[1, 0] * z0 + error[1, 1] * z1
     hot = np.logical_or.reduce(bright)
-    hot |= _outliers(own_bias, LEAST_HOT_DN)
+    hot |= _outliers(own_bias, MIN_HOT_DN)
     if many:
-        hot |= _outliers(own_rate, LEAST_HOT_DN / longest)
+        hot |= _outliers(own_rate, MIN_HOT_DN / longest)
     spread = np.zeros((2, 2))
     kept = ~hot
     for i, own in enumerate((own_bias, own_rate)):
@@ -304,4 +304,4 @@ def _line(times: Float64Array, level: Float64Array, variance: float) -> tuple[fl
 def _outliers(values: Float64Array, least: float) -> BoolArray:
     center = float(np.median(values))
     away = np.abs(values - center)
-    return np.asarray(away > np.maximum(HOT_SIGMAS * 1.4826 * float(np.median(away)), least))
+    return np.asarray(away > np.maximum(HOT_FIT_SIGMAS * 1.4826 * float(np.median(away)), least))

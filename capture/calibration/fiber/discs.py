@@ -20,19 +20,19 @@ DiscFit = tuple[Float64Array, Float64Array, float]
 """x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
 brighter than half."""
 
-SMOOTH_PITCH: Final = 0.12
+SEARCH_BLUR_PITCH: Final = 0.12
 """Blur of the search for spots, in distances between neighbors."""
-SIGMAS: Final = 8.0
+SPOT_NOISE_SIGMAS: Final = 8.0
 """What a spot stands out of the noise by."""
-CONTRAST: Final = 0.3
+MIN_SPOT_CONTRAST: Final = 0.3
 """What a spot stands out of the light around it by, at least."""
 BORDER_PITCH: Final = 0.2
 """Nearer to the image's border than this no spot is sought, in distances between neighbors."""
-WORST_PITCH: Final = 0.04
+MAX_CENTER_STDERR_PITCH: Final = 0.04
 """Standard error of a place that is no place any more."""
-STRUCTURE: Final = 0.03
+SPOT_STRUCTURE: Final = 0.03
 """How far pixels of a spot scatter about a smooth disc, relative."""
-UNEVEN: Final = 0.1
+SPOT_GRADIENT_PRIOR: Final = 0.1
 """Slopes and bend of the light over a spot, relative, as large as they may well be."""
 
 
@@ -60,7 +60,7 @@ def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
 def candidates(image: GrayImage, pitch: float) -> Float64Array:
     """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
     gray, variance = image
-    blur = SMOOTH_PITCH * pitch
+    blur = SEARCH_BLUR_PITCH * pitch
     smooth = gaussian_filter(gray, blur, mode="nearest")
     # the blurred noise of a cell's sum, whose neighbors share pixels: at most 4 pixels' worth
     noise = np.sqrt(gaussian_filter(variance, blur, mode="nearest") * 4.0) / (2.0 * blur)
@@ -70,7 +70,9 @@ def candidates(image: GrayImage, pitch: float) -> Float64Array:
     above = np.pad(smooth, ((lift, 0), (0, 0)), mode="edge")[: smooth.shape[0]]
     below = np.pad(smooth, ((0, lift), (0, 0)), mode="edge")[lift:]
     around = np.minimum(above, below)
-    stands = (smooth - around > SIGMAS * noise) & (smooth - around > CONTRAST * np.abs(around))
+    stands = (smooth - around > SPOT_NOISE_SIGMAS * noise) & (
+        smooth - around > MIN_SPOT_CONTRAST * np.abs(around)
+    )
     # beside the border the blur doubles what noise there is
     border = round(BORDER_PITCH * pitch)
     inner = np.zeros_like(top)
@@ -112,13 +114,16 @@ def fit_disc(
         [max(float(np.quantile(data[color == c], 0.9)), 0.0) for c in range(len(colors))]
     )
     scale = max(float(levels.max()), 1e-30)
-    sigma = np.sqrt(spread.ravel()[index] + (STRUCTURE * levels[color]) ** 2) / scale
+    sigma = np.sqrt(spread.ravel()[index] + (SPOT_STRUCTURE * levels[color]) ** 2) / scale
     sigma = np.maximum(sigma, 1e-9)
     data = data / scale
 
     parts = [np.flatnonzero(color == c) for c in range(len(colors))]
     # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
-    stiff = [np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (UNEVEN * max(v / scale, 1e-3)) for v in levels]
+    stiff = [
+        np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (SPOT_GRADIENT_PRIOR * max(v / scale, 1e-3))
+        for v in levels
+    ]
 
     def split(p: Float64Array) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
         """Return residuals of each color's best linear model, and their amplitudes.
@@ -162,7 +167,7 @@ def fit_disc(
     except np.linalg.LinAlgError:
         return None
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not np.isfinite(error).all() or error[:2].max() > WORST_PITCH * pitch:
+    if not np.isfinite(error).all() or error[:2].max() > MAX_CENTER_STDERR_PITCH * pitch:
         return None
     return done.x, error, start_radius
 

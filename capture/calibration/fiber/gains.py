@@ -3,388 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import date
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from capture.arrays import BoolArray, Float64Array, FloatArray
+from capture.arrays import FloatArray
 from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk, no_crosstalk
 from capture.calibration.fiber.phantom import ExpectedReflectance
-from capture.calibration.fiber.readings import FibreReadings
-from capture.calibration.fiber.spots import FibreSpots
-from capture.calibration.record import (
-    Calibration,
-    CalibrationError,
-    CalibrationMismatch,
-    Quantity,
-    Source,
-    default_validity,
-)
-from capture.calibration.store import load
-from capture.calibration.validity import require
-from capture.rig import Rig
+from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberError, fill_invalid
+from capture.calibration.fiber.readings import FiberReadings
+from capture.calibration.fiber.spots import FiberSpots
 
-__all__ = ["FibreCalibration", "FibreError", "FibreReflectance", "calibrate_fibres"]
+__all__ = ["calibrate_fibers"]
 
 
-DEAD_SHARE: Final = 0.05
+DEAD_FIBER_GAIN: Final = 0.05
 """Of the usual gain: a fibre that surely gives less is dead."""
-LEAST_SIGMAS: Final = 3.0
+MIN_GAIN_SIGMAS: Final = 3.0
 """Of a gain over its standard error."""
 
 
-class FibreError(CalibrationError):
-    """Readings that a fibre probe cannot be calibrated from, or that are not this probe's."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FibreReflectance:
-    """Reflectance in each fibre, with what its errors have in common kept apart.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of the F fibres.
-    radius_mm : ndarray of float64, shape (F,)
-        Distance from the source.
-    reflectance_per_mm2 : ndarray of float64, shape (F, C)
-        May be negative where there is no light; 0 where not valid.
-    variance : ndarray of float64, shape (F, C)
-        1/mm^4, of each fibre by itself: readings, stray light, cross-talk, gain.
-    common_per_mm2 : ndarray of float64, shape (T, F, C)
-        One pattern for each of T causes at one standard uncertainty of it: what the phantom's
-        certificate leaves uncertain, and last the error of stray light that the fibres share.
-    valid : ndarray of bool, shape (F, C)
-    saturated : ndarray of bool, shape (F, C)
-    reasons : mapping of str to str
-        By fibre: why it is not valid in some color.
-    """
-
-    names: tuple[str, ...]
-    radius_mm: Float64Array
-    reflectance_per_mm2: Float64Array
-    variance: Float64Array
-    common_per_mm2: Float64Array
-    valid: BoolArray
-    saturated: BoolArray
-    reasons: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def stderr(self) -> Float64Array:
-        """Standard error of each fibre, with the common part, 1/mm^2, shape (F, C)."""
-        return np.sqrt(self.variance + (self.common_per_mm2**2).sum(axis=0))
-
-    @property
-    def covariance(self) -> Float64Array:
-        """Covariance of the fibres in each color, 1/mm^4, shape (C, F, F)."""
-        count = len(self.names)
-        own = self.variance.T[:, :, None] * np.eye(count)
-        return np.asarray(own + np.einsum("tfc,tgc->cfg", self.common_per_mm2, self.common_per_mm2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FibreCalibration:
-    """Gains, cross-talk and stray light of a fibre probe.
-
-    Attributes
-    ----------
-    spots : FibreSpots
-        Where the fibres end in the image, and their names.
-    radius_mm : ndarray of float64, shape (F,)
-        Distance of each fibre from the source.
-    gain, gain_stderr : ndarray of float64, shape (F, C)
-        Full scales per second for a reflectance of 1/mm^2, the source at level 1; the error is of
-        each fibre by itself, without cross-talk's.
-    common : ndarray of float64, shape (T, F, C)
-        Relative errors of all gains together, see `ExpectedReflectance.common`.
-    light : ndarray of float64, shape (F, C)
-        Of the phantom, unmixed, full scales per second at level 1.
-    crosstalk : CrossTalk
-        Its offset at level 1.
-    valid : ndarray of bool, shape (F, C)
-        Where the gain is known.
-    dead : ndarray of bool, shape (F,)
-        Fibres that give no light.
-    """
-
-    spots: FibreSpots
-    radius_mm: Float64Array
-    gain: Float64Array
-    gain_stderr: Float64Array
-    common: Float64Array
-    light: Float64Array
-    crosstalk: CrossTalk
-    valid: BoolArray
-    dead: BoolArray
-
-    def __post_init__(self) -> None:
-        """Convert and check the arrays against each other."""
-        count, colors = np.shape(self.gain)
-        for name, shape, kind in (
-            ("radius_mm", (count,), np.float64),
-            ("gain", (count, colors), np.float64),
-            ("gain_stderr", (count, colors), np.float64),
-            ("light", (count, colors), np.float64),
-            ("common", (len(self.common), count, colors), np.float64),
-            ("valid", (count, colors), np.bool_),
-            ("dead", (count,), np.bool_),
-        ):
-            _freeze(self, name, shape, kind)
-        if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
-            raise ValueError(
-                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"
-                f" {self.crosstalk.offset.shape}, expected {count} fibres in {colors} colors"
-            )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the fibres."""
-        return self.spots.names
-
-    def reflectance(self, readings: FibreReadings, *, level: float = 1.0) -> FibreReflectance:
-        """Return the reflectance in each fibre.
-
-        Parameters
-        ----------
-        readings : FibreReadings
-            Of this probe, by the same apertures.
-        level : float
-            Of the source, 0 < level <= 1.
-
-        Returns
-        -------
-        FibreReflectance
-
-        Raises
-        ------
-        FibreError
-            Where the readings are of other fibres or colors.
-
-        Notes
-        -----
-        ``R = X^-1 (s - o) / gain``. A fibre that is saturated still leaks into its neighbors: its
-        light is guessed from theirs, with an error as large as the guess.
-        """
-        if readings.names != self.names or readings.signal.shape != self.gain.shape:
-            raise FibreError(
-                f"readings: got {len(readings.names)} fibres from {readings.names[:1]} in"
-                f" {readings.signal.shape[-1]} colors, expected those of the calibration,"
-                f" {len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}"
-            )
-        if not 0 < level <= 1:
-            raise FibreError(f"level: got {level}, expected 0 < level <= 1")
-        signal, variance, told = _guessed(readings)
-        light, spread = self.crosstalk.unmix(signal / level, variance / level**2)
-        valid = np.asarray(readings.valid & self.valid & told, np.bool_)
-        gain = np.where(self.valid, self.gain, 1.0)
-        ratio = np.where(self.valid, light / np.where(self.valid, self.light, 1.0), 0.0)
-        spread = spread + self.crosstalk.matrix_variance(light, self.light, ratio)
-        value = np.where(valid, light / gain, 0.0)
-        own = spread / gain**2 + (value * self.gain_stderr / gain) ** 2
-        # the phantom's light has the same error of stray light, which cancels in part
-        stray = -self.crosstalk.offset_common / gain * (1.0 - ratio)
-        # weighed as if each fibre's own, and once more as what moves all far fibres together
-        mixed = self.crosstalk.shared_changes(light, self.light, ratio) / gain
-        common = np.concatenate([value * self.common, stray[None], mixed])
-        return FibreReflectance(
-            self.names,
-            self.radius_mm,
-            value,
-            np.where(valid, own, 0.0),
-            np.where(valid, common, 0.0),
-            valid,
-            readings.saturated,
-            self._reasons(readings),
-        )
-
-    def _reasons(self, readings: FibreReadings) -> dict[str, str]:
-        reasons = {}
-        for i, name in enumerate(self.names):
-            if self.dead[i]:
-                reasons[name] = "dead: gives no light of the phantom"
-            elif not self.spots.found[i]:
-                reasons[name] = "has no spot of its own in the image"
-            elif not self.valid[i].all():
-                reasons[name] = (
-                    "its gain is not known: too little light of the phantom, or saturated"
-                )
-            elif readings.saturated[i].any():
-                reasons[name] = "saturated even in the shortest exposure"
-            elif not readings.valid[i].all():
-                reasons[name] = "too many hot pixels in its spot"
-        return reasons
-
-    def to_calibration(
-        self, *, serial: str, rig: str, source: Source, created: date, **about: Any
-    ) -> Calibration:
-        """Return this as a `Calibration` of kind "fibre", by fibre, and of the camera.
-
-        Parameters
-        ----------
-        serial
-            Of the camera.
-        rig, source, created
-            As in `Calibration`.
-        **about
-            ``valid_until``, ``notes``, ``inputs``, ``versions`` of `Calibration`.
-        """
-        spots, mixed = self.spots, self.crosstalk
-        values: dict[str, dict[str, Quantity]] = {
-            name: {
-                "spot_px": Quantity(spots.center_px[i], spots.center_stderr_px[i]),
-                "spot_radius_px": _one(spots.radius_px[i], spots.radius_stderr_px[i]),
-                "spot_edge_px": _one(spots.edge_px[i]),
-                "found": _one(float(spots.found[i])),
-                "radius_mm": _one(self.radius_mm[i]),
-                "gain": Quantity(self.gain[i], self.gain_stderr[i]),
-                "gain_common": Quantity(self.common[:, i]),
-                "phantom_light": Quantity(self.light[i]),
-                "stray": Quantity(mixed.offset[i], mixed.offset_stderr[i]),
-                "stray_common": Quantity(mixed.offset_common[i]),
-                "crosstalk": Quantity(mixed.matrix[i], mixed.stderr[i]),
-                "valid": Quantity(self.valid[i].astype(np.float64)),
-                "dead": _one(float(self.dead[i])),
-            }
-            for i, name in enumerate(self.names)
-        }
-        values[serial] = {
-            "aperture_px": _one(spots.aperture_px),
-            "row_shift_px": Quantity(np.array(spots.shift_px)),
-            "row_rotation_rad": _one(spots.rotation_rad),
-            "crosstalk_measured": _one(float(mixed.measured)),
-            "cover_leak": _one(mixed.cover_leak, mixed.cover_leak_stderr),
-        }
-        notes = {
-            "unit": "gain: full scales per second, summed over a spot, for a reflectance in the"
-            " fibre of 1/mm^2 with the source at level 1",
-            "crosstalk": "row: what this spot reads of each fibre's light",
-            "gain_common": "relative, at one standard uncertainty of each cause",
-        }
-        return Calibration(
-            kind="fibre",
-            rig=rig,
-            serials=tuple(values),
-            created=created,
-            valid_until=about.get("valid_until") or default_validity(created),
-            source=source,
-            values=values,
-            notes={**notes, **(about.get("notes") or {})},
-            inputs=dict(about.get("inputs") or {}),
-            versions=dict(about.get("versions") or {}),
-        )
-
-    @classmethod
-    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FibreCalibration:
-        """Return the calibrated probe of a rig, in the rig's order.
-
-        Raises
-        ------
-        CalibrationMismatch
-            If the calibration is of another rig or camera, or lacks one of the rig's fibres.
-        """
-        if calibration.kind != "fibre" or calibration.rig != rig.name or rig.probe is None:
-            raise CalibrationMismatch(
-                f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
-                f" 'fibre' of {rig.name!r}, a rig with a probe"
-            )
-        names = tuple(fibre.name for fibre in rig.probe.fibres)
-
-        def value(name: str) -> Float64Array:
-            return np.array([calibration.quantity(n, name).value for n in names])
-
-        def stderr(name: str) -> Float64Array:
-            rows = [calibration.quantity(n, name) for n in names]
-            return np.array(
-                [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
-            )
-
-        def camera(name: str) -> Float64Array:
-            return calibration.quantity(serial, name).value
-
-        shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
-        return cls(
-            FibreSpots(
-                names,
-                value("spot_px"),
-                stderr("spot_px"),
-                value("spot_radius_px"),
-                stderr("spot_radius_px"),
-                value("spot_edge_px"),
-                value("found") > 0,
-                float(camera("aperture_px")),
-                (float(shift[0]), float(shift[1])),
-                float(camera("row_rotation_rad")),
-            ),
-            value("radius_mm"),
-            value("gain"),
-            stderr("gain"),
-            value("gain_common").transpose(1, 0, 2),
-            value("phantom_light"),
-            CrossTalk(
-                value("crosstalk"),
-                stderr("crosstalk"),
-                value("stray"),
-                stderr("stray"),
-                value("stray_common"),
-                bool(camera("crosstalk_measured")),
-                float(leak.value),
-                0.0 if leak.stderr is None else float(leak.stderr),
-            ),
-            value("valid") > 0,
-            value("dead") > 0,
-        )
-
-    @classmethod
-    def load(
-        cls, folder: str | Path, rig: Rig, *, view: str = "cam", on: date | None = None
-    ) -> FibreCalibration:
-        """Return the calibrated probe of a rig from a CALIBRATION/ folder.
-
-        Parameters
-        ----------
-        folder : str or Path
-        rig : Rig
-        view : str
-            Name of the camera behind the fibres.
-        on : date, optional
-            Day of use; None does not ask how old the calibration is.
-
-        Raises
-        ------
-        CalibrationMissing
-            If there is none.
-        CalibrationMismatch, CalibrationExpired, CalibrationDamaged
-            If it cannot be used.
-        """
-        serial = rig.view(view).serial
-        found = load(folder, "fibre")
-        if on is not None:
-            require(found, rig=rig.name, serials=[serial], on_date=on, kind="fibre")
-        return cls.from_calibration(found, rig, serial)
-
-
-def calibrate_fibres(
-    phantom: FibreReadings,
-    masks: Mapping[int, FibreReadings],
+def calibrate_fibers(
+    phantom: FiberReadings,
+    masks: Mapping[int, FiberReadings],
     *,
-    spots: FibreSpots,
+    spots: FiberSpots,
     radius_mm: FloatArray | tuple[float, ...],
     expected: ExpectedReflectance,
     level: float = 1.0,
-) -> FibreCalibration:
+) -> FiberCalibration:
     """Calibrate a probe from its readings of a phantom of known optics.
 
     Parameters
     ----------
-    phantom : FibreReadings
+    phantom : FiberReadings
         All fibres uncovered.
-    masks : mapping of int to FibreReadings
+    masks : mapping of int to FiberReadings
         One fibre uncovered, by its number, on the same phantom; empty: cross-talk and stray light
         are taken to be none.
-    spots : FibreSpots
+    spots : FiberSpots
         The apertures of all readings.
     radius_mm : array_like, shape (F,)
         Distance of each fibre from the source.
@@ -395,41 +52,41 @@ def calibrate_fibres(
 
     Returns
     -------
-    FibreCalibration
+    FiberCalibration
 
     Raises
     ------
-    FibreError
+    FiberError
         Where the shapes do not fit, or no fibre gives light.
     """
     count, colors = phantom.signal.shape
     if expected.per_mm2.shape != (count, colors) or len(spots.names) != count:
-        raise FibreError(
+        raise FiberError(
             f"expected reflectance: got shape {expected.per_mm2.shape} and {len(spots.names)}"
             f" spots, expected those of the readings, {(count, colors)}"
         )
     if not 0 < level <= 1:
-        raise FibreError(f"level: got {level}, expected 0 < level <= 1")
+        raise FiberError(f"level: got {level}, expected 0 < level <= 1")
     mixed = measure_crosstalk(masks, phantom) if masks else no_crosstalk(count, colors)
-    signal, variance, told = _guessed(phantom)
+    signal, variance, told = fill_invalid(phantom)
     light, spread = mixed.unmix(signal, variance)
     doubt = mixed.matrix_variance(light, light, np.zeros_like(light))
     error = np.sqrt(spread + doubt + mixed.offset_common**2)
     gain = light / expected.per_mm2
-    bright = np.asarray(phantom.valid & told & (light > LEAST_SIGMAS * error), np.bool_)
+    bright = np.asarray(phantom.valid & told & (light > MIN_GAIN_SIGMAS * error), np.bool_)
     usual = np.array([np.median(g[b]) if b.any() else 0.0 for g, b in zip(gain.T, bright.T)])  # noqa: B905
     if phantom.saturated.all():
-        raise FibreError(
+        raise FiberError(
             "phantom: all fibres are saturated in every exposure; take shorter ones, or a lower"
             " level of the source"
         )
     if not (usual > 0).any():
-        raise FibreError(
+        raise FiberError(
             "phantom: no fibre gives light; check the source, its shutter, the head's contact with"
             " the phantom, and the exposures"
         )
-    most = (light + LEAST_SIGMAS * error) / expected.per_mm2
-    dim = np.asarray(phantom.valid & (most < DEAD_SHARE * usual), np.bool_)
+    most = (light + MIN_GAIN_SIGMAS * error) / expected.per_mm2
+    dim = np.asarray(phantom.valid & (most < DEAD_FIBER_GAIN * usual), np.bool_)
     dead = np.asarray(dim.any(axis=1) & ~bright.any(axis=1), np.bool_)
     valid = np.asarray(bright & spots.found.reshape(-1, 1), np.bool_)
     relative = np.hypot(
@@ -445,7 +102,7 @@ def calibrate_fibres(
         mixed.cover_leak,
         mixed.cover_leak_stderr,
     )
-    return FibreCalibration(
+    return FiberCalibration(
         spots,
         np.asarray(radius_mm, np.float64),
         np.where(valid, gain / level, 0.0),
@@ -456,46 +113,3 @@ def calibrate_fibres(
         valid,
         dead,
     )
-
-
-def _guessed(readings: FibreReadings) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return signal and variance, those of fibres that are not valid guessed from the next ones.
-
-    And in which colors that can be done, shape (C,): where all are saturated nothing is known of
-    the light that leaks.
-    """
-    signal, variance = readings.signal.copy(), readings.variance.copy()
-    possible = np.ones(signal.shape[1], np.bool_)
-    place = np.arange(len(signal))
-    for c in range(signal.shape[1]):
-        told = readings.detected[:, c]
-        gap = ~readings.valid[:, c]
-        if not gap.any():
-            continue
-        if not told.any():
-            possible[c] = not readings.saturated[:, c].any()
-            continue
-        # at the ends of the row by the slope of the two next ones
-        known, value = place[told], np.log(signal[told, c])
-        guess = np.interp(place, known, value)
-        if len(known) > 1:
-            slope = (value[1] - value[0]) / (known[1] - known[0])
-            guess = np.where(place < known[0], value[0] + slope * (place - known[0]), guess)
-        signal[gap, c] = np.exp(np.minimum(guess, value.max() + 10.0))[gap]
-        variance[gap, c] = signal[gap, c] ** 2
-    return signal, variance, possible
-
-
-def _one(value: float | Float64Array, stderr: float | Float64Array | None = None) -> Quantity:
-    return Quantity(np.array(value), None if stderr is None else np.array(stderr))
-
-
-def _freeze(row: Any, name: str, shape: tuple[int, ...], kind: Any) -> None:
-    array = np.array(getattr(row, name), dtype=kind)
-    if array.shape != shape or (kind is np.float64 and not np.isfinite(array).all()):
-        raise ValueError(
-            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-            f" shape {shape}"
-        )
-    array.setflags(write=False)
-    object.__setattr__(row, name, array)

@@ -19,14 +19,14 @@ from capture.hdr import BracketError
 __all__ = ["MergedSeries", "color_masks", "merge_series"]
 
 
-SMOOTH: Final = 3
+NOISE_WINDOW_PX: Final = 3
 """Side of the square of one color's pixels that the noise of each is told from."""
-MARGIN_SIGMAS: Final = 4.0
-LEAST_SIGMAS: Final = 20.0
+SATURATION_MARGIN_SIGMAS: Final = 4.0
+MIN_RIPPLE_SIGMAS: Final = 20.0
 """Of a pixel's light over its error, to tell how bright the source was in each frame."""
-WIDEST_RIPPLE: Final = 0.1
+MAX_RIPPLE: Final = 0.1
 """Standard deviation of the source's light from frame to frame, relative, at most."""
-LEAST_EVIDENCE: Final = 3.0
+MIN_RIPPLE_LOG_EVIDENCE: Final = 3.0
 """By how much the logarithm of the evidence for a ripple has to be more than for none."""
 
 
@@ -127,7 +127,7 @@ def merge_series(
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
     light = np.maximum(smooth, 0.0)
     rate, seen, variance = _weigh(stack, times, lit, base, usable, darks, noise, light)
-    clear = np.flatnonzero(seen & ~hot & (rate > LEAST_SIGMAS * np.sqrt(variance)))
+    clear = np.flatnonzero(seen & ~hot & (rate > MIN_RIPPLE_SIGMAS * np.sqrt(variance)))
     scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
     if len(times) > 1 and clear.size:
         scale, scale_stderr = _scales(
@@ -202,7 +202,7 @@ def _check(
 def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[BoolArray]:
     """Return in which pixels each frame is not saturated, nor would be by chance."""
     spread = np.sqrt(noise.span_dn / noise.gain_e_per_dn + noise.floor_dn2)
-    highest = noise.white_dn - MARGIN_SIGMAS * spread
+    highest = noise.white_dn - SATURATION_MARGIN_SIGMAS * spread
     result = []
     for frame in stack:
         use = frame < noise.white_dn
@@ -274,8 +274,8 @@ def _scales(
     # the prior's width of most evidence; where the frames tell little of each other, none
     values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
     values, along = np.maximum(values, 0.0), vectors.T @ right
-    best, width2 = LEAST_EVIDENCE, 0.0
-    for width in np.geomspace(1e-4, WIDEST_RIPPLE, 16):
+    best, width2 = MIN_RIPPLE_LOG_EVIDENCE, 0.0
+    for width in np.geomspace(1e-4, MAX_RIPPLE, 16):
         grown = 1.0 + width**2 * values
         evidence = 0.5 * float(width**2 * (along**2 / grown).sum() - np.log(grown).sum())
         if evidence > best:
@@ -292,9 +292,9 @@ def _smooth(values: Float64Array, valid: BoolArray, pattern: str) -> Float64Arra
     for row in range(step):
         for column in range(step):
             place = (slice(row, None, step), slice(column, None, step))
-            share = uniform_filter(valid[place].astype(np.float64), SMOOTH, mode="nearest")
+            share = uniform_filter(valid[place].astype(np.float64), NOISE_WINDOW_PX, mode="nearest")
             total = uniform_filter(
-                np.where(valid[place], values[place], 0.0), SMOOTH, mode="nearest"
+                np.where(valid[place], values[place], 0.0), NOISE_WINDOW_PX, mode="nearest"
             )
             result[place] = np.where(share > 1e-6, total / np.maximum(share, 1e-6), 0.0)
     return result

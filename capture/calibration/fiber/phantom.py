@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 
 from capture.arrays import Float64Array
 from capture.calibration.record import CalibrationError
-from capture.documents import STRICT, Checks, Fault, parse, read_json, shown
+from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json, shown
 
 __all__ = [
     "SCHEMA",
@@ -33,7 +33,7 @@ class CertificateError(CalibrationError):
 class CertificateUncertainty:
     """Relative standard uncertainties (68 %), each common to all wavelengths."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     sigma_a: float
     """Of the absorption coefficients, 0 <= u < 0.5."""
@@ -62,7 +62,7 @@ class PhantomCertificate:
     [1.429]
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     eta: float
     """Refractive index, 1 to 2."""

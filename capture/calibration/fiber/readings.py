@@ -12,25 +12,25 @@ from numpy.typing import ArrayLike, NDArray
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.darks import CameraNoise, DarkModel
 from capture.calibration.fiber.merge import MergedSeries, color_masks, merge_series
-from capture.calibration.fiber.spots import FibreSpots
+from capture.calibration.fiber.spots import FiberSpots
 
-__all__ = ["FibreReadings", "read_fibres", "sum_spots"]
+__all__ = ["FiberReadings", "read_fibers", "sum_spots"]
 
 
-GUARD_PX: Final = 6.0
+APERTURE_GUARD_PX: Final = 6.0
 """Between the row's apertures and the pixels that tell the light around them."""
-COLUMNS_PITCH: Final = 2.0
+BACKGROUND_HALF_WIDTH_PITCH: Final = 2.0
 """How far to the sides of a spot that light is looked at, in distances between neighbors."""
-LEAST_AROUND: Final = 200
+MIN_BACKGROUND_PIXELS: Final = 200
 """Pixels of a color that tell the light around a spot."""
-FILL_STDERR: Final = 0.1
+FILLED_PIXEL_STDERR: Final = 0.1
 """Of a pixel that is filled from its neighbors, relative."""
-MOST_FILLED: Final = 0.2
+MAX_FILLED_FRACTION: Final = 0.2
 """Share of an aperture's pixels of one color that may be filled."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FibreReadings:
+class FiberReadings:
     """Light out of each fibre in each color.
 
     Attributes
@@ -92,16 +92,16 @@ class FibreReadings:
         return np.asarray(self.valid & (self.signal > 3.0 * self.stderr))
 
 
-def read_fibres(
+def read_fibers(
     frames: Sequence[NDArray[np.integer]],
     exposures_s: ArrayLike,
     *,
-    spots: FibreSpots,
+    spots: FiberSpots,
     darks: DarkModel,
     noise: CameraNoise,
     temperature_c: float | None = None,
     light_s: ArrayLike | None = None,
-) -> FibreReadings:
+) -> FiberReadings:
     """Read the fibres from a series of exposures.
 
     Parameters
@@ -110,7 +110,7 @@ def read_fibres(
         Raw DN of one series, nothing subtracted; one frame or more.
     exposures_s : array_like, shape (N,)
         s, > 0, any order.
-    spots : FibreSpots
+    spots : FiberSpots
         Where the fibres end in these frames.
     darks : DarkModel
         See `fibre_darks.measure_darks`.
@@ -122,7 +122,7 @@ def read_fibres(
 
     Returns
     -------
-    FibreReadings
+    FiberReadings
 
     Raises
     ------
@@ -135,19 +135,19 @@ def read_fibres(
     return sum_spots(merged, spots, noise=noise)
 
 
-def sum_spots(merged: MergedSeries, spots: FibreSpots, *, noise: CameraNoise) -> FibreReadings:
+def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) -> FiberReadings:
     """Sum a merged series over the apertures of the spots.
 
     Parameters
     ----------
     merged : MergedSeries
-    spots : FibreSpots
+    spots : FiberSpots
     noise : CameraNoise
         For its color filter pattern.
 
     Returns
     -------
-    FibreReadings
+    FiberReadings
 
     Notes
     -----
@@ -173,7 +173,9 @@ def sum_spots(merged: MergedSeries, spots: FibreSpots, *, noise: CameraNoise) ->
             filled = pixels & hot
             saturated[i, c] = bool(full.any())
             gaps = int(filled.sum())
-            valid[i, c] = number > 0 and not saturated[i, c] and gaps <= MOST_FILLED * number
+            valid[i, c] = (
+                number > 0 and not saturated[i, c] and gaps <= MAX_FILLED_FRACTION * number
+            )
             if not valid[i, c]:
                 continue
             measured = pixels & ~filled
@@ -181,27 +183,27 @@ def sum_spots(merged: MergedSeries, spots: FibreSpots, *, noise: CameraNoise) ->
             # a neighbor's noise in place of a pixel's own, and how unlike neighbors are
             spread = merged.variance[measured]
             variance[i, c] = spread.sum() + gaps * spread.mean()
-            variance[i, c] += FILL_STDERR**2 * float((merged.smooth[filled] ** 2).sum())
+            variance[i, c] += FILLED_PIXEL_STDERR**2 * float((merged.smooth[filled] ** 2).sum())
             level = beside & color
-            if (seen := int(level.sum())) >= LEAST_AROUND:
+            if (seen := int(level.sum())) >= MIN_BACKGROUND_PIXELS:
                 around[i, c] = merged.rate[level].mean()
                 signal[i, c] -= number * around[i, c]
                 variance[i, c] += number**2 * float(merged.variance[level].sum()) / seen**2
-    return FibreReadings(
+    return FiberReadings(
         spots.names, signal, variance, valid, saturated, around, merged.exposures_s, noise.origin
     )
 
 
-def _beside(spots: FibreSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
+def _beside(spots: FiberSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
     """Return the pixels above and below the row, near one spot."""
     height, width = shape[:2]
     center = spots.center_px[fibre]
     gaps = np.linalg.norm(np.diff(spots.center_px, axis=0), axis=1)
-    reach = COLUMNS_PITCH * (float(np.median(gaps)) if len(gaps) else 40.0)
+    reach = BACKGROUND_HALF_WIDTH_PITCH * (float(np.median(gaps)) if len(gaps) else 40.0)
     mask = np.zeros((height, width), np.bool_)
     left, right = max(int(center[0] - reach), 0), min(int(center[0] + reach) + 1, width)
     near = np.abs(spots.center_px[:, 0] - center[0]) <= reach + spots.aperture_px
-    clear = spots.aperture_px + GUARD_PX
+    clear = spots.aperture_px + APERTURE_GUARD_PX
     top = int(np.floor(spots.center_px[near, 1].min() - clear))
     bottom = int(np.ceil(spots.center_px[near, 1].max() + clear)) + 1
     mask[: max(top, 0), left:right] = True

@@ -23,12 +23,14 @@ __all__ = [
 ]
 
 
-CLIP_SIGMAS = 3.0  # pixels of the background further off than this belong to something else
-LEAST_RING = 8
-PLANE_SHARE = 0.02  # how far the background, bright spots' wings, may differ from a plane
-CENTERING = 12
-CENTERED_PX = 0.01
-RING = (1.3, 1.8)  # inner and outer radius of the background, of the disc's
+# pixels of the background further off than this belong to something else
+BACKGROUND_CLIP_SIGMAS = 3.0
+MIN_RING_PIXELS = 8
+# how far the background, bright spots' wings, may differ from a plane
+BACKGROUND_PLANE_MISFIT = 0.02
+MAX_CENTERING_STEPS = 12
+CENTERING_TOL_PX = 0.01
+RING_RADII = (1.3, 1.8)  # inner and outer radius of the background, of the disc's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,7 +216,7 @@ def measure_middles(
     saturated = np.zeros(len(pixels), bool)
     for k, start in enumerate(pixels):
         at = start
-        for _step in range(CENTERING):
+        for _step in range(MAX_CENTERING_STEPS):
             window = _window(at, image.rate.shape, float(aperture_px[k]), pixels)
             if window is None:
                 break
@@ -224,16 +226,16 @@ def measure_middles(
             level, _ = _background(values, noise, around, dx, dy)
             light = weight * (values - level)
             total = light.sum()
-            if not total > CLIP_SIGMAS * np.sqrt(np.sum(weight**2 * noise)):
+            if not total > BACKGROUND_CLIP_SIGMAS * np.sqrt(np.sum(weight**2 * noise)):
                 break
             step = np.array([np.sum(light * dx), np.sum(light * dy)]) / total
             at = at + step
             if not np.hypot(*(at - start)) <= aperture_px[k]:
                 break
-            if np.hypot(*step) < CENTERED_PX:
+            if np.hypot(*step) < CENTERING_TOL_PX:
                 middle[k] = at
                 square = 0.5 * (dx**2 + dy**2)
-                bent = PLANE_SHARE * np.abs(np.sum(weight * level)) * aperture_px[k] / 4
+                bent = BACKGROUND_PLANE_MISFIT * np.abs(np.sum(weight * level)) * aperture_px[k] / 4
                 stderr[k] = np.hypot(np.sqrt(np.sum(weight**2 * noise * square)), bent) / total
                 saturated[k] = not image.valid[rows, columns][weight > 0].all()
                 break
@@ -264,7 +266,7 @@ def measure_flux(part: Shot, pixels: Float64Array, *, aperture_px: Float64Array)
         level, level_variance = _background(values, noise, around, dx, dy)
         value[k] = np.sum(weight * (values - level))
         variance[k] = np.sum(weight**2 * noise) + weight.sum() ** 2 * level_variance
-        variance[k] += (PLANE_SHARE * np.sum(weight * level)) ** 2
+        variance[k] += (BACKGROUND_PLANE_MISFIT * np.sum(weight * level)) ** 2
         saturated[k] = not part.valid[rows, columns][weight > 0].all()
         whole[k] = True
     return Flux(value, variance, saturated, whole)
@@ -292,7 +294,7 @@ def share_within(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
     [0.9654, 0.9827]
     """
     beyond = 2 / np.pi**2 * airy_px / np.asarray(aperture_px, np.float64)
-    near, far = RING
+    near, far = RING_RADII
     in_ring = (1 / near - 1 / far) / (far**2 - near**2)
     return 1.0 - (1.0 + in_ring) * beyond
 
@@ -303,7 +305,7 @@ def _window(
     """Return slices, weights of the disc, the ring, and offsets; None where it is not whole."""
     if not np.isfinite(at).all():
         return None
-    near, outer = RING[0] * aperture_px, RING[1] * aperture_px
+    near, outer = RING_RADII[0] * aperture_px, RING_RADII[1] * aperture_px
     low = np.floor(at - outer).astype(int)
     high = np.ceil(at + outer).astype(int) + 1
     if (low < 0).any() or high[0] > shape[1] or high[1] > shape[0]:
@@ -315,7 +317,7 @@ def _window(
     gaps = np.hypot(*(every - at).T)
     for other in every[(gaps > aperture_px) & (gaps < outer + near)] - at:
         around &= np.hypot(dx - other[0], dy - other[1]) > near
-    if around.sum() < LEAST_RING:
+    if around.sum() < MIN_RING_PIXELS:
         return None
     rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
     return rows, columns, weight, around, dx, dy
@@ -327,12 +329,12 @@ def _background(
     """Return a plane through a ring without what sticks out of it, and its middle's variance."""
     basis = np.stack([np.ones(int(around.sum())), dx[around], dy[around]], axis=1)
     ring, sigma = values[around], np.sqrt(noise[around])
-    near = np.abs(ring - np.median(ring)) <= CLIP_SIGMAS * sigma
+    near = np.abs(ring - np.median(ring)) <= BACKGROUND_CLIP_SIGMAS * sigma
     plane = np.array([float(np.median(ring)), 0.0, 0.0])
     for _ in range(2):
-        if near.sum() < LEAST_RING:
+        if near.sum() < MIN_RING_PIXELS:
             break
         plane = np.linalg.lstsq(basis[near], ring[near], rcond=None)[0]
-        near = np.abs(ring - basis @ plane) <= CLIP_SIGMAS * sigma
+        near = np.abs(ring - basis @ plane) <= BACKGROUND_CLIP_SIGMAS * sigma
     level = plane[0] + plane[1] * dx + plane[2] * dy
     return level, float(noise[around].mean() / max(near.sum(), 1))

@@ -13,15 +13,15 @@ from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_d
 from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.record import CalibrationError
 
-__all__ = ["FibreSpots", "SpotError", "find_fibre_spots"]
+__all__ = ["FiberSpots", "SpotError", "find_fiber_spots"]
 
-GATE_PITCH: Final = 0.35
+MAX_SPOT_OFFSET_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
-SHIFT_PITCH: Final = 0.5
+MAX_ROW_SHIFT_PITCH: Final = 0.5
 """Beyond half a distance between neighbors nobody can tell whose a spot is."""
-LEAST_SHARE: Final = 0.5
+MIN_SPOT_FRACTION: Final = 0.5
 """Of the fibres must show, or the image is not one of this probe."""
-EDGES: Final = 2.5
+APERTURE_EDGE_WIDTHS: Final = 2.5
 """Widths of the blurred edge that an aperture reaches beyond the radius."""
 
 
@@ -30,7 +30,7 @@ class SpotError(CalibrationError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FibreSpots:
+class FiberSpots:
     """Where each fibre ends in the image.
 
     Attributes
@@ -89,7 +89,7 @@ class FibreSpots:
         """Return the pixels whose centres lie in a fibre's aperture, shape (H, W)."""
         return _within(shape, self.center_px[fibre], self.aperture_px)
 
-    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FibreSpots, Float64Array]:
+    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FiberSpots, Float64Array]:
         """Return the spots where they lie in another series, and how far they went.
 
         Parameters
@@ -101,7 +101,7 @@ class FibreSpots:
 
         Returns
         -------
-        spots : FibreSpots
+        spots : FiberSpots
             Shifted as one, by the mean of the spots that stand out, weighed by their errors.
         shift_px : ndarray of float64, shape (2,)
             0 where too few stand out to tell.
@@ -121,14 +121,14 @@ class FibreSpots:
         return replace(self, center_px=self.center_px + shift), shift
 
 
-def find_fibre_spots(
+def find_fiber_spots(
     merged: MergedSeries,
     nominal_px: FloatArray,
     *,
     names: Sequence[str],
     pattern: str,
     masks: Mapping[int, MergedSeries] | None = None,
-) -> FibreSpots:
+) -> FiberSpots:
     """Find the fibres' ends in the image of a bright target.
 
     Parameters
@@ -147,7 +147,7 @@ def find_fibre_spots(
 
     Returns
     -------
-    FibreSpots
+    FiberSpots
         Fibres without a spot are reported, not an error.
 
     Raises
@@ -184,12 +184,12 @@ def find_fibre_spots(
             " shines into the camera, and the places in the rig's file"
         )
     found = spot >= 0
-    if found.sum() < max(LEAST_SHARE * count, 2):
+    if found.sum() < max(MIN_SPOT_FRACTION * count, 2):
         where = ", ".join(f"{x:.0f}" for x in sorted(places[:, 0]))
         raise SpotError(
             f"fibre spots: found {int(found.sum())} (at x {where} px), expected {count}, at least"
-            f" {int(np.ceil(LEAST_SHARE * count))}; check the phantom's contact, the light and the"
-            " exposures"
+            f" {int(np.ceil(MIN_SPOT_FRACTION * count))}; check the phantom's contact,"
+            " the light and the exposures"
         )
     best: list[DiscFit | None] = [whole[k] if k >= 0 else None for k in spot]
     findings = [
@@ -224,7 +224,10 @@ def _consult_masks(
             continue  # too faint to tell
         brightest = alone[0]
         nearest = int(np.argmin(np.linalg.norm(model - brightest, axis=1)))
-        if nearest != i and np.linalg.norm(model[nearest] - brightest) < GATE_PITCH * pitch:
+        if (
+            nearest != i
+            and np.linalg.norm(model[nearest] - brightest) < MAX_SPOT_OFFSET_PITCH * pitch
+        ):
             if best[i] is None:
                 continue  # dark: what shows is a neighbor's leak
             raise SpotError(
@@ -244,7 +247,7 @@ def _table(
     nominal: Float64Array,
     names: Sequence[str],
     findings: list[str],
-) -> FibreSpots:
+) -> FiberSpots:
     found = np.array([fit is not None for fit in best])
     fits = [fit for fit in best if fit is not None]
     size, edge = (float(np.median([fit[0][k] for fit in fits])) for k in (2, 3))
@@ -264,7 +267,7 @@ def _table(
     )
     radius = np.where(found, value[:, 2], size)
     pitch = _pitch(value[:, :2])
-    reach = size + EDGES * edge
+    reach = size + APERTURE_EDGE_WIDTHS * edge
     aperture = min(reach, 0.5 * pitch)
     touching = " ".join(findings)
     for i in np.flatnonzero(~found).tolist():
@@ -276,7 +279,7 @@ def _table(
         )
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
-    table = FibreSpots(
+    table = FiberSpots(
         tuple(names),
         value[:, :2],
         error[:, :2],
@@ -304,7 +307,7 @@ def _assign(
 ) -> tuple[Int64Array, Float64Array]:
     """Return the spot of each fibre (-1: none), and where each fibre should end."""
     offset = (places[:, None] - nominal[None]).reshape(-1, 2)
-    offset = offset[(np.abs(offset) <= SHIFT_PITCH * pitch).all(axis=1)]
+    offset = offset[(np.abs(offset) <= MAX_ROW_SHIFT_PITCH * pitch).all(axis=1)]
     spot = np.full(len(nominal), -1)
     if len(offset) == 0:
         return spot, nominal.copy()
@@ -317,7 +320,7 @@ def _assign(
         spot = np.full(len(nominal), -1)
         for i in range(len(nominal)):
             k = int(np.argmin(distance[:, i]))
-            if distance[k, i] < GATE_PITCH * pitch and int(np.argmin(distance[k])) == i:
+            if distance[k, i] < MAX_SPOT_OFFSET_PITCH * pitch and int(np.argmin(distance[k])) == i:
                 spot[i] = k
         seen = np.flatnonzero(spot >= 0)
         if len(seen) < 4:

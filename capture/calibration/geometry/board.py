@@ -34,13 +34,13 @@ logger = logging.getLogger(__name__)
 
 Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]
 
-MARKER_SHARE = 0.75  # side of a marker over that of a square, as most boards are printed
-LEAST_CORNERS = 6  # of a board in an image: fewer fix its place badly
-LEAST_IMAGES = 3
-REFINE_SHARE = 0.35  # half window of corner refinement over the distance of neighbours
-SIDE_SAMPLES = 17  # across each side of a marker
-SIDE_REACH = 0.45  # of a marker's bit, on both sides of its border
-REFINE_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+MARKER_SIDE_RATIO = 0.75  # side of a marker over that of a square, as most boards are printed
+MIN_BOARD_CORNERS = 6  # of a board in an image: fewer fix its place badly
+MIN_BOARD_IMAGES = 3
+REFINE_HALF_WINDOW_PITCH = 0.35  # half window of corner refinement over the distance of neighbours
+N_SIDE_SAMPLES = 17  # across each side of a marker
+SIDE_SEARCH_BITS = 0.45  # of a marker's bit, on both sides of its border
+CORNER_STOP_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
 
 
 class BoardError(CalibrationError):
@@ -101,7 +101,7 @@ class Board:
         dictionary = str(pattern[3]).removeprefix("DICT_") if len(pattern) == 4 else ""
         if dictionary and not hasattr(cv2.aruco, f"DICT_{dictionary}"):
             raise BoardError(f"dictionary: got {dictionary!r}, expected one such as '4X4_50'")
-        marker = MARKER_SHARE * square_mm if dictionary else 0.0
+        marker = MARKER_SIDE_RATIO * square_mm if dictionary else 0.0
         chosen: Any = kind
         return cls(chosen, int(pattern[1]), int(pattern[2]), square_mm, marker, dictionary)
 
@@ -230,7 +230,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
         return Sighting(np.arange(len(pixels)), _refined(gray, pixels, board))
     corners, ids, _, _ = board.detector.detectBoard(gray)
-    if ids is None or len(ids) < LEAST_CORNERS:
+    if ids is None or len(ids) < MIN_BOARD_CORNERS:
         return None
     number = np.asarray(ids, np.int64).ravel()
     pixels = np.asarray(corners, np.float64).reshape(-1, 2)
@@ -242,9 +242,9 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
 def _refined(gray: UInt8Array, pixels: Float64Array, board: Board) -> Float64Array:
     grid = pixels.reshape(board.rows, board.columns, 2)
     gaps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1)]
-    half = int(np.clip(REFINE_SHARE * min(gaps), 2, 11))
+    half = int(np.clip(REFINE_HALF_WINDOW_PITCH * min(gaps), 2, 11))
     points = pixels.astype(np.float32)
-    cv2.cornerSubPix(gray, points, (half, half), (-1, -1), REFINE_STOP)
+    cv2.cornerSubPix(gray, points, (half, half), (-1, -1), CORNER_STOP_CRITERIA)
     return points.astype(np.float64)
 
 
@@ -290,13 +290,13 @@ def _square_corners(gray: Float64Array, corners: Float64Array) -> Float64Array |
 
     None where a side shows no clear edge.
     """
-    along = np.linspace(0.12, 0.88, SIDE_SAMPLES)[:, None]
+    along = np.linspace(0.12, 0.88, N_SIDE_SAMPLES)[:, None]
     places = corners.copy()
     for _ in range(2):
         lines = []
         middle = places.mean(axis=0)
         cell = np.linalg.norm(np.diff(places, axis=0, append=places[:1]), axis=1).min() / 6
-        reach = max(SIDE_REACH * cell, 1.5)
+        reach = max(SIDE_SEARCH_BITS * cell, 1.5)
         steps = np.arange(-reach, reach + 0.125, 0.25)
         for k in range(4):
             a, b = places[k], places[(k + 1) % 4]
@@ -389,10 +389,10 @@ def calibrate_intrinsics(
             raise BoardError(
                 f"images: got {a} px of {one} and {b} px of {other}, expected one size"
             )
-    if len(used) < LEAST_IMAGES:
+    if len(used) < MIN_BOARD_IMAGES:
         raise BoardError(
             f"images: the {board.kind} of {board.columns} x {board.rows} was found in"
-            f" {len(used)} of {len(sizes)}, expected at least {LEAST_IMAGES}; not in"
+            f" {len(used)} of {len(sizes)}, expected at least {MIN_BOARD_IMAGES}; not in"
             f" {', '.join(missing) or 'any, there were none'}"
         )
     size = next(iter(sizes.values()))

@@ -9,142 +9,36 @@ camera that saw few boards keeps a sensible lens.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal, Protocol, TypeAlias
+from dataclasses import replace
 
 import cv2
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import LEAST_CORNERS, Board, Sighting
-from capture.calibration.geometry.intrinsics import CameraPose, distort
-from capture.calibration.record import CalibrationError
+from capture.calibration.geometry.board import Board
+from capture.calibration.geometry.board_pose import (
+    BoardPose,
+    Target,
+    gaps_px,
+    motion_between,
+    move_pose,
+)
+from capture.calibration.geometry.bundle_equations import (
+    Bundle,
+    BundleError,
+    BundleProblem,
+    Gauge,
+    LensPrior,
+    Sightings,
+)
+from capture.calibration.geometry.intrinsics import CameraPose
 
-__all__ = [
-    "BoardPlace",
-    "Bundle",
-    "BundleError",
-    "LensPrior",
-    "Sightings",
-    "adjust",
-    "gaps_px",
-    "place_board",
-]
-
-Gauge: TypeAlias = Literal["board", "cameras"]
-Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
-
-CAMERA, LENS, PLACE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
-HUBER = 2.5  # robust sigmas beyond which a corner counts less
-MAX_STEPS = 100
-STOP = 1e-10  # relative decrease of the cost
-LEAST_SIGMA_PX = 1e-9
-LEAST_SHARED = 2  # places that a camera must share with others
+__all__ = ["Bundle", "BundleError", "adjust", "place_board"]
 
 
-class Target(Protocol):
-    """A flat target with known points."""
-
-    @property
-    def points_mm(self) -> Float64Array:
-        """Points in the target's own axes, shape (N, 3), z = 0."""
-
-
-class BundleError(CalibrationError):
-    """Sightings that do not tie the cameras together; the message names what is missing."""
-
-
-@dataclass(frozen=True, slots=True)
-class LensPrior:
-    """Standard deviations of a lens about its nominal values; 0 holds a number fixed.
-
-    Attributes
-    ----------
-    focal : float
-        Relative.
-    principal : float
-        Of the principal point, relative to the image's width.
-    k1, k2, tangential, k3 : float
-        Of the distortion.
-    """
-
-    focal: float = 0.02
-    principal: float = 0.02
-    k1: float = 0.3
-    k2: float = 1.0
-    tangential: float = 0.01
-    k3: float = 0.0
-
-    def sigmas(self, camera: CameraPose) -> Float64Array:
-        """Return the deviations of a camera's nine lens numbers."""
-        fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-        shift = self.principal * camera.image_size[0]
-        return np.array(
-            [
-                self.focal * fx,
-                self.focal * fy,
-                shift,
-                shift,
-                self.k1,
-                self.k2,
-                self.tangential,
-                self.tangential,
-                self.k3,
-            ]
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardPlace:
-    """Where a board stood: ``x_rig = rotation x_board + translation_mm``."""
-
-    rotation: Float64Array
-    translation_mm: Float64Array
-
-    def to_rig(self, points_mm: Float64Array) -> Float64Array:
-        """Return points of the board in the rig frame."""
-        return points_mm @ self.rotation.T + self.translation_mm
-
-    @classmethod
-    def in_jig(cls, board: Board) -> BoardPlace:
-        """Return the jig's place: the board's middle in the rig's origin, its front towards +z."""
-        width, height = board.size_mm
-        rotation = np.diag([1.0, -1.0, -1.0])
-        return cls(rotation, -rotation @ np.array([width / 2, height / 2, 0.0]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bundle:
-    """What an adjustment found.
-
-    Attributes
-    ----------
-    cameras : dict of str to CameraPose
-        By view name, with standard errors.
-    places : dict of int to BoardPlace
-        By pose number.
-    rms_px : dict of str to float
-        Root mean square distance of a camera's corners to where the fit puts them.
-    sigma_px : float
-        Noise of a corner's coordinate that the residuals show.
-    corners : dict of str to int
-        How many corners each camera gave.
-    outliers : dict of tuple to int
-        Corners of each image (view, pose) farther than five sigmas; images without are left out.
-    center_covariance_mm2 : dict of str to ndarray of float64, shape (3, 3)
-        Of each camera's centre of projection, rig frame.
-    """
-
-    cameras: dict[str, CameraPose]
-    places: dict[int, BoardPlace]
-    rms_px: dict[str, float]
-    sigma_px: float
-    corners: dict[str, int]
-    outliers: dict[tuple[str, int], int]
-    center_covariance_mm2: dict[str, Float64Array]
+MIN_SHARED_POSES = 2  # places that a camera must share with others
 
 
 def adjust(
@@ -165,7 +59,7 @@ def adjust(
     start : mapping of str to CameraPose
         Nominal or earlier cameras, by view name; those without sightings are named in an error.
     gauge : {"board", "cameras"}
-        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPlace.in_jig`), or the
+        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
         nominal cameras' centres, which the result is moved onto as a rigid body.
     prior : LensPrior, optional
         What is known of the lenses.
@@ -190,12 +84,12 @@ def adjust(
         for pose in sorted({pose for _, pose in sightings})
     }
     if gauge == "board":
-        to_jig = _between(places[0], BoardPlace.in_jig(board))
-        places = {pose: _moved_place(place, *to_jig) for pose, place in places.items()}
+        to_jig = motion_between(places[0], BoardPose.in_jig(board))
+        places = {pose: move_pose(place, *to_jig) for pose, place in places.items()}
         cameras = {name: _moved_camera(camera, *to_jig) for name, camera in start.items()}
     else:
         cameras = dict(start)
-    problem = _Problem(sightings, board, start, prior or LensPrior(), gauge)
+    problem = BundleProblem(sightings, board, start, prior or LensPrior(), gauge)
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
         cameras, places = problem.solve(cameras, places)
     if gauge == "cameras":
@@ -203,13 +97,13 @@ def adjust(
         wanted = np.array([start[name].center_mm for name in problem.names])
         rigid = _procrustes(found, wanted)
         cameras = {name: _moved_camera(camera, *rigid) for name, camera in cameras.items()}
-        places = {pose: _moved_place(place, *rigid) for pose, place in places.items()}
+        places = {pose: move_pose(place, *rigid) for pose, place in places.items()}
     return problem.judged(cameras, places)
 
 
 def place_board(
     sightings: Sightings, board: Target, cameras: Mapping[str, CameraPose], pose: int
-) -> BoardPlace:
+) -> BoardPose:
     """Return where the board stood, from all its images, with the cameras as given.
 
     Each image alone gives a guess; the one that suits all images best is refined on all of them.
@@ -220,7 +114,7 @@ def place_board(
         If no image of that pose fits.
     """
     seen = {name: s for (name, number), s in sightings.items() if number == pose}
-    best: tuple[float, BoardPlace] | None = None
+    best: tuple[float, BoardPose] | None = None
     for name, sighting in seen.items():
         camera = cameras[name]
         points = board.points_mm[sighting.ids]
@@ -229,7 +123,7 @@ def place_board(
         )
         for turn, shift in zip(turns, shifts, strict=True) if solved else ():
             local = Rotation.from_rotvec(np.ravel(turn)).as_matrix()
-            place = BoardPlace(
+            place = BoardPose(
                 camera.rotation.T @ local,
                 camera.rotation.T @ (np.ravel(shift) - camera.translation_mm),
             )
@@ -247,17 +141,9 @@ def place_board(
         raise BundleError(f"pose {pose}: no image of it fits a flat board; leave it out")
     images = {(name, pose): sighting for name, sighting in seen.items()}
     used = {name: cameras[name] for name in seen}
-    problem = _Problem(images, board, used, LensPrior(), "cameras", cameras_fixed=True)
+    problem = BundleProblem(images, board, used, LensPrior(), "cameras", cameras_fixed=True)
     _, places = problem.solve(used, {pose: best[1]})
     return places[pose]
-
-
-def gaps_px(
-    camera: CameraPose, place: BoardPlace, board: Target, sighting: Sighting
-) -> Float64Array:
-    """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
-    found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
-    return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
 
 
 def _check_shared(sightings: Sightings, cameras: Mapping[str, CameraPose], gauge: Gauge) -> None:
@@ -269,10 +155,10 @@ def _check_shared(sightings: Sightings, cameras: Mapping[str, CameraPose], gauge
     count = {p: sum(p in seen for seen in poses.values()) for seen in poses.values() for p in seen}
     for name, seen in poses.items():
         shared = sum(count[p] > 1 for p in seen) if len(cameras) > 1 else len(seen)
-        if shared < LEAST_SHARED:
+        if shared < MIN_SHARED_POSES:
             raise BundleError(
                 f"camera {name}: shares {shared} board poses with other cameras (it saw"
-                f" {len(seen)}), expected at least {LEAST_SHARED}; show the board where it and"
+                f" {len(seen)}), expected at least {MIN_SHARED_POSES}; show the board where it and"
                 " another camera see it, tilted between them"
             )
     if gauge == "board" and not count.get(0, 0):
@@ -290,319 +176,6 @@ def _check_shared(sightings: Sightings, cameras: Mapping[str, CameraPose], gauge
             f"cameras {', '.join(sorted(small))}: share no board pose with the others, expected one"
             " rig; show the board between the two groups"
         )
-
-
-class _Problem:
-    """Sightings as arrays, and the normal equations of their residuals."""
-
-    def __init__(
-        self,
-        sightings: Sightings,
-        board: Target,
-        start: Mapping[str, CameraPose],
-        prior: LensPrior,
-        gauge: Gauge,
-        *,
-        cameras_fixed: bool = False,
-    ) -> None:
-        self.images = {k: s for k, s in sorted(sightings.items()) if len(s.ids) >= LEAST_CORNERS}
-        self.board = board
-        self.names = sorted({name for name, _ in self.images})
-        self.poses = sorted({pose for _, pose in self.images})
-        self.start = start
-        self.gauge = gauge
-        self.sigmas = {name: prior.sigmas(start[name]) for name in self.names}
-        free = np.zeros(len(self.names) * CAMERA + len(self.poses) * PLACE, bool)
-        if not cameras_fixed:
-            for i, name in enumerate(self.names):
-                free[i * CAMERA : i * CAMERA + LENS] = self.sigmas[name] > 0
-                free[i * CAMERA + LENS : (i + 1) * CAMERA] = True
-        free[len(self.names) * CAMERA :] = True
-        if gauge == "board":
-            at = len(self.names) * CAMERA + self.poses.index(0) * PLACE
-            free[at : at + PLACE] = False
-        self.free = np.nonzero(free)[0]
-        self.cameras_fixed = cameras_fixed
-
-    def solve(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPlace]
-    ) -> tuple[dict[str, CameraPose], dict[int, BoardPlace]]:
-        """Run Levenberg's method with Huber's weights; the scale is taken anew at each step."""
-        cameras, places = dict(cameras), dict(places)
-        damping = 1e-3
-        for _ in range(MAX_STEPS):
-            residuals = self._residuals(cameras, places)
-            sigma = self._sigma(residuals)
-            cost = self._cost(residuals, cameras, sigma)
-            H, g = self._equations(cameras, places, residuals, sigma)
-            while True:
-                step = np.zeros(len(self.names) * CAMERA + len(self.poses) * PLACE)
-                damped = H + damping * np.diag(np.diag(H))
-                step[self.free] = cho_solve(cho_factor(damped), -g)
-                trial = self._stepped(cameras, places, step)
-                after = self._residuals(*trial)
-                new = self._cost(after, trial[0], sigma)
-                if new <= cost or damping > 1e8:
-                    break
-                damping *= 10.0
-            if new > cost:
-                break
-            cameras, places = trial
-            damping = max(damping / 10.0, 1e-12)
-            if cost - new < STOP * max(cost, 1e-300):
-                break
-        else:
-            raise BundleError(
-                f"bundle adjustment: still moving after {MAX_STEPS} steps; show more poses of the"
-                " board, tilted more"
-            )
-        return cameras, places
-
-    def judged(self, cameras: dict[str, CameraPose], places: dict[int, BoardPlace]) -> Bundle:
-        """Return the solution with standard errors in the gauge."""
-        residuals = self._residuals(cameras, places)
-        sigma = self._sigma(residuals)
-        weights = {key: _huber(r, sigma) for key, r in residuals.items()}
-        square = sum(float((weights[k][:, None] * r**2).sum()) for k, r in residuals.items())
-        count = 2.0 * sum(float(w.sum()) for w in weights.values())
-        unknown = len(self.free) - (PLACE if self.gauge == "cameras" else 0)
-        noise = float(np.sqrt(square / max(count - unknown, 1.0)))
-        H, _ = self._equations(cameras, places, residuals, max(noise, LEAST_SIGMA_PX))
-        covariance = np.zeros((len(self.names) * CAMERA + len(self.poses) * PLACE,) * 2)
-        covariance[np.ix_(self.free, self.free)] = self._inverse(H, cameras)
-        found, centers = {}, {}
-        for i, name in enumerate(self.names):
-            block = covariance[i * CAMERA : (i + 1) * CAMERA, i * CAMERA : (i + 1) * CAMERA]
-            camera = cameras[name]
-            errors = np.sqrt(np.clip(np.diag(block), 0.0, None))
-            matrix = np.zeros((3, 3))
-            matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = errors[:4]
-            found[name] = replace(
-                camera,
-                matrix_stderr=matrix,
-                distortion_stderr=errors[4:9],
-                rotation_stderr_rad=errors[9:12],
-                translation_stderr_mm=errors[12:15],
-            )
-            to_center = np.hstack(_center_derivative(camera))
-            centers[name] = to_center @ block[LENS:, LENS:] @ to_center.T
-        rms, corners = {}, {}
-        for name in self.names:
-            mine = np.concatenate([r for (n, _), r in residuals.items() if n == name])
-            rms[name] = float(np.sqrt((mine**2).sum(axis=1).mean()))
-            corners[name] = len(mine)
-        far = {
-            key: int(np.count_nonzero(np.linalg.norm(r, axis=1) > 5.0 * max(noise, 1e-3)))
-            for key, r in residuals.items()
-        }
-        outliers = {key: n for key, n in far.items() if n}
-        return Bundle(found, places, rms, noise, corners, outliers, centers)
-
-    def _inverse(self, H: Float64Array, cameras: Mapping[str, CameraPose]) -> Float64Array:
-        """Return the covariance; with free frame, that of the frame fixed by the centres."""
-        if self.gauge == "board" or self.cameras_fixed:
-            return np.asarray(np.linalg.inv(H))
-        total = len(self.names) * CAMERA + len(self.poses) * PLACE
-        B = np.zeros((PLACE, total))  # sum of shifts, sum of moments of the centres
-        middle = np.mean([cameras[name].center_mm for name in self.names], axis=0)
-        for i, name in enumerate(self.names):
-            to_center = np.hstack(_center_derivative(cameras[name]))
-            arm = _cross_matrix(cameras[name].center_mm - middle)
-            B[:3, i * CAMERA + LENS : (i + 1) * CAMERA] = to_center
-            B[3:, i * CAMERA + LENS : (i + 1) * CAMERA] = arm @ to_center
-        B = B[:, self.free]
-        n = len(self.free)
-        scale = np.sqrt(np.diag(H))
-        bordered = np.zeros((n + PLACE, n + PLACE))
-        bordered[:n, :n] = H / np.outer(scale, scale)
-        B = B / scale
-        B /= np.linalg.norm(B, axis=1, keepdims=True)
-        bordered[n:, :n], bordered[:n, n:] = B, B.T
-        inverse = np.linalg.inv(bordered)[:n, :n]
-        return np.asarray(inverse / np.outer(scale, scale))
-
-    def _residuals(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPlace]
-    ) -> dict[tuple[str, int], Float64Array]:
-        out = {}
-        for (name, pose), s in self.images.items():
-            r = cameras[name].project(places[pose].to_rig(self.board.points_mm[s.ids])) - s.pixels
-            out[name, pose] = np.nan_to_num(r, nan=1e4)
-        return out
-
-    @staticmethod
-    def _sigma(residuals: Mapping[tuple[str, int], Float64Array]) -> float:
-        """Return the noise by the median of the absolute residuals."""
-        every = np.abs(np.concatenate(list(residuals.values()))).ravel()
-        return max(1.4826 * float(np.median(every)), LEAST_SIGMA_PX)
-
-    def _cost(
-        self,
-        residuals: Mapping[tuple[str, int], Float64Array],
-        cameras: Mapping[str, CameraPose],
-        sigma: float,
-    ) -> float:
-        total = 0.0
-        for r in residuals.values():
-            z = np.linalg.norm(r, axis=1) / sigma
-            total += float(np.where(z <= HUBER, z**2, 2 * HUBER * z - HUBER**2).sum())
-        for name in () if self.cameras_fixed else self.names:
-            total += float((self._lens_pull(name, cameras[name]) ** 2).sum())
-        return total
-
-    def _lens_pull(self, name: str, camera: CameraPose) -> Float64Array:
-        """Return how far a lens is from its prior, in standard deviations; 0 where fixed."""
-        sigmas = self.sigmas[name]
-        gap = _lens(camera) - _lens(self.start[name])
-        return np.divide(gap, sigmas, out=np.zeros(LENS), where=sigmas > 0)
-
-    def _equations(
-        self,
-        cameras: Mapping[str, CameraPose],
-        places: Mapping[int, BoardPlace],
-        residuals: Mapping[tuple[str, int], Float64Array],
-        sigma: float,
-    ) -> tuple[Float64Array, Float64Array]:
-        """Return the normal matrix and the gradient of half the cost, free numbers only."""
-        first = len(self.names) * CAMERA
-        total = first + len(self.poses) * PLACE
-        H, g = np.zeros((total, total)), np.zeros(total)
-        for (name, pose), sighting in self.images.items():
-            of_camera, of_place = _derivatives(
-                cameras[name], places[pose], self.board.points_mm[sighting.ids]
-            )
-            r = residuals[name, pose]
-            w = np.repeat(_huber(r, sigma), 2) / sigma**2
-            i, j = self.names.index(name) * CAMERA, first + self.poses.index(pose) * PLACE
-            A, B, rows = of_camera.reshape(-1, CAMERA), of_place.reshape(-1, PLACE), r.ravel()
-            at, to = slice(i, i + CAMERA), slice(j, j + PLACE)
-            H[to, to] += (B * w[:, None]).T @ B
-            g[to] += B.T @ (w * rows)
-            if not self.cameras_fixed:
-                H[at, at] += (A * w[:, None]).T @ A
-                H[at, to] += (A * w[:, None]).T @ B
-                g[at] += A.T @ (w * rows)
-        for i, name in enumerate(() if self.cameras_fixed else self.names):
-            lens = np.arange(i * CAMERA, i * CAMERA + LENS)
-            sigmas = self.sigmas[name]
-            inverse = np.divide(1.0, sigmas, out=np.zeros(LENS), where=sigmas > 0)
-            H[lens, lens] += inverse**2
-            g[lens] += inverse * self._lens_pull(name, cameras[name])
-        H[first:, :first] = H[:first, first:].T
-        return H[np.ix_(self.free, self.free)], g[self.free]
-
-    def _stepped(
-        self,
-        cameras: Mapping[str, CameraPose],
-        places: Mapping[int, BoardPlace],
-        step: Float64Array,
-    ) -> tuple[dict[str, CameraPose], dict[int, BoardPlace]]:
-        new_cameras, new_places = dict(cameras), dict(places)
-        for i, name in enumerate(() if self.cameras_fixed else self.names):
-            d = step[i * CAMERA : (i + 1) * CAMERA]
-            camera = cameras[name]
-            matrix = camera.matrix.copy()
-            matrix[0, 0] += d[0]
-            matrix[1, 1] += d[1]
-            matrix[:2, 2] += d[2:4]
-            matrix[0, 0], matrix[1, 1] = max(matrix[0, 0], 1.0), max(matrix[1, 1], 1.0)
-            new_cameras[name] = replace(
-                camera,
-                matrix=matrix,
-                distortion=camera.distortion + d[4:9],
-                rotation=_turned(camera.rotation, d[9:12]),
-                translation_mm=camera.translation_mm + d[12:15],
-            )
-        first = len(self.names) * CAMERA
-        for j, pose in enumerate(self.poses):
-            d = step[first + j * PLACE : first + (j + 1) * PLACE]
-            new_places[pose] = BoardPlace(
-                _turned(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
-            )
-        return new_cameras, new_places
-
-
-def _derivatives(
-    camera: CameraPose, place: BoardPlace, points_mm: Float64Array
-) -> tuple[Float64Array, Float64Array]:
-    """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d place, shape (n, 2, 6)."""
-    on_board = points_mm @ place.rotation.T
-    turned = (on_board + place.translation_mm) @ camera.rotation.T
-    local = turned + camera.translation_mm
-    x, y, z = local.T
-    a, b = x / z, y / z
-    k1, k2, p1, p2, k3 = camera.distortion
-    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    r2 = a * a + b * b
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)  # d radial / d r2
-    focal = np.array([fx, fy])
-    # d distorted / d (a, b)
-    across = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
-    D = np.empty((len(a), 2, 2))
-    D[:, 0, 0] = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
-    D[:, 0, 1] = D[:, 1, 0] = across
-    D[:, 1, 1] = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
-    P = np.zeros((len(a), 2, 3))  # d (a, b) / d local
-    P[:, 0, 0] = P[:, 1, 1] = 1 / z
-    P[:, 0, 2], P[:, 1, 2] = -a / z, -b / z
-    to_pixel = (focal[:, None] * D) @ P
-    of_camera = np.zeros((len(a), 2, CAMERA))
-    bent = distort(np.stack([a, b], axis=-1), camera.distortion)
-    of_camera[:, 0, 0], of_camera[:, 1, 1] = bent.T
-    of_camera[:, 0, 2] = of_camera[:, 1, 3] = 1.0
-    radii = np.stack([r2, r2**2, r2**3], axis=-1)
-    terms = np.zeros((len(a), 2, 5))
-    for column, k in ((0, 0), (1, 1), (4, 2)):
-        terms[:, 0, column], terms[:, 1, column] = a * radii[:, k], b * radii[:, k]
-    terms[:, 0, 2], terms[:, 1, 2] = 2 * a * b, r2 + 2 * b * b
-    terms[:, 0, 3], terms[:, 1, 3] = r2 + 2 * a * a, 2 * a * b
-    of_camera[:, :, 4:9] = focal[:, None] * terms
-    of_camera[:, :, 9:12] = -to_pixel @ _cross_matrix(turned)
-    of_camera[:, :, 12:15] = to_pixel
-    from_rig = to_pixel @ camera.rotation
-    return of_camera, np.concatenate([-from_rig @ _cross_matrix(on_board), from_rig], axis=-1)
-
-
-def _center_derivative(camera: CameraPose) -> tuple[Float64Array, Float64Array]:
-    """Return how a camera's centre follows its turn and its shift."""
-    back = -camera.rotation.T
-    # C = -R' t and R becomes exp([w]) R: dC = -R' [t] w - R' dt
-    return back @ _cross_matrix(camera.translation_mm), back
-
-
-def _cross_matrix(v: Float64Array) -> Float64Array:
-    """Return the matrices of the cross product with v, shape (..., 3, 3)."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return np.asarray(out - np.swapaxes(out, -1, -2))
-
-
-def _turned(rotation: Float64Array, turn: Float64Array) -> Float64Array:
-    """Return a rotation after a small turn, orthonormal again."""
-    product = Rotation.from_rotvec(turn).as_matrix() @ rotation
-    u, _, v = np.linalg.svd(product)
-    return np.asarray(u @ v)
-
-
-def _lens(camera: CameraPose) -> Float64Array:
-    K = camera.matrix
-    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.distortion])
-
-
-def _huber(residual: Float64Array, sigma: float) -> Float64Array:
-    z = np.linalg.norm(residual, axis=1) / sigma
-    return np.asarray(np.where(z > HUBER, HUBER / np.maximum(z, HUBER), 1.0))
-
-
-def _between(a: BoardPlace, b: BoardPlace) -> tuple[Float64Array, Float64Array]:
-    """Return the rigid motion that takes place a to place b."""
-    rotation = b.rotation @ a.rotation.T
-    return rotation, b.translation_mm - rotation @ a.translation_mm
-
-
-def _moved_place(place: BoardPlace, rotation: Float64Array, shift: Float64Array) -> BoardPlace:
-    return BoardPlace(rotation @ place.rotation, rotation @ place.translation_mm + shift)
 
 
 def _moved_camera(camera: CameraPose, rotation: Float64Array, shift: Float64Array) -> CameraPose:

@@ -28,9 +28,9 @@ __all__ = [
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
-UNDISTORT_STEPS = 50
-UNDISTORT_LIMIT = 10.0  # a step beyond it diverges
-UNDISTORT_TOLERANCE = 1e-12  # of normalized coordinates; a pixel is about 1e-4
+MAX_UNDISTORT_STEPS = 50
+MAX_UNDISTORT_STEP = 10.0  # a step beyond it diverges
+UNDISTORT_TOL = 1e-12  # of normalized coordinates; a pixel is about 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,13 +185,13 @@ class CameraPose:
         seen = (px - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
         xy = seen.copy()
         if self.distortion.any() and xy.size:
-            for _ in range(UNDISTORT_STEPS):
+            for _ in range(MAX_UNDISTORT_STEPS):
                 step = seen - distort(xy, self.distortion)
                 xy = xy + step
                 size = float(np.nanmax(np.abs(step)))
-                if not UNDISTORT_TOLERANCE < size < UNDISTORT_LIMIT:
+                if not UNDISTORT_TOL < size < MAX_UNDISTORT_STEP:
                     break
-            if not size <= UNDISTORT_TOLERANCE:
+            if not size <= UNDISTORT_TOL:
                 raise ValueError(
                     f"pixels: got some where the distortion {self.distortion.tolist()} of camera"
                     f" {self.serial!r} has no inverse, expected pixels within the image"

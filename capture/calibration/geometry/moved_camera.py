@@ -10,23 +10,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capture.calibration.geometry.board import Board
-from capture.calibration.geometry.bundle import (
-    BoardPlace,
-    BundleError,
-    Sightings,
-    gaps_px,
-    place_board,
-)
+from capture.calibration.geometry.board_pose import BoardPose, gaps_px
+from capture.calibration.geometry.bundle import place_board
+from capture.calibration.geometry.bundle_equations import BundleError, Sightings
 from capture.calibration.geometry.intrinsics import CameraPose
 
-__all__ = ["Moved", "find_moved"]
+__all__ = ["MovedCamera", "find_moved"]
 
 
-RMS_OF_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2) ** 0.5
+RMS_PER_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2) ** 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class MovedCamera:
     """A camera that no longer stands where the previous calibration puts it.
 
     Attributes
@@ -60,7 +56,7 @@ def find_moved(
     *,
     ratio: float = 4.0,
     least_px: float = 0.3,
-) -> tuple[Moved, ...]:
+) -> tuple[MovedCamera, ...]:
     """Find cameras that moved since the previous calibration, by their residuals.
 
     For each camera the boards are placed by all others, as they were calibrated before. A camera
@@ -95,7 +91,7 @@ def find_moved(
             f"cameras: got sightings of {', '.join(names) or 'none'}, expected of at least 3 to say"
             " which one moved"
         )
-    moved: list[Moved] = []
+    moved: list[MovedCamera] = []
     left = list(names)
     while len(left) > max(2, len(names) // 2):
         trials = {name: _agreement(sightings, board, previous, left, without=name) for name in left}
@@ -108,7 +104,7 @@ def find_moved(
         now = _resection(images, board, previous[culprit], places)
         turn = Rotation.from_matrix(now.rotation @ previous[culprit].rotation.T).magnitude()
         shift = float(np.linalg.norm(now.center_mm - previous[culprit].center_mm))
-        moved.append(Moved(culprit, previous[culprit].serial, own_px, shift, float(turn)))
+        moved.append(MovedCamera(culprit, previous[culprit].serial, own_px, shift, float(turn)))
         left.remove(culprit)
     return tuple(sorted(moved, key=lambda m: -m.rms_px))
 
@@ -120,7 +116,7 @@ def _agreement(
     names: list[str],
     *,
     without: str,
-) -> tuple[float, float, dict[int, BoardPlace]]:
+) -> tuple[float, float, dict[int, BoardPose]]:
     """Return the residual of all cameras but one, that one's own, and the boards' places."""
     rest = {k: s for k, s in sightings.items() if k[0] in names and k[0] != without}
     count = {pose: sum(p == pose for _, p in rest) for _, pose in rest}
@@ -135,14 +131,14 @@ def _agreement(
         return np.inf, np.nan, places
     # by the median: a camera that moved moves all its corners, a bad corner is one of many
     return (
-        RMS_OF_MEDIAN * float(np.median(together)),
-        RMS_OF_MEDIAN * float(np.median(alone)) if alone.size else np.nan,
+        RMS_PER_MEDIAN * float(np.median(together)),
+        RMS_PER_MEDIAN * float(np.median(alone)) if alone.size else np.nan,
         places,
     )
 
 
 def _resection(
-    images: Sightings, board: Board, camera: CameraPose, places: Mapping[int, BoardPlace]
+    images: Sightings, board: Board, camera: CameraPose, places: Mapping[int, BoardPose]
 ) -> CameraPose:
     """Return a camera's new place from boards whose places are known; the lens is kept."""
     points = np.concatenate(

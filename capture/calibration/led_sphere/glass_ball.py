@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.lights.mirror_sphere import reflect, reflection_pixels, reflection_points
+from capture.calibration.led_sphere.mirrored_lights import DERIVATIVE_STEP_MM, mirror_lights
+from capture.calibration.lights.reflection import reflect, reflection_pixels
 from capture.calibration.record import CalibrationError
 
 __all__ = [
@@ -25,26 +26,23 @@ __all__ = [
     "BallError",
     "BallFit",
     "LightDirections",
-    "Mirrored",
     "find_spots",
     "light_directions",
     "locate_ball",
-    "mirrored",
 ]
 
 
-NOISE_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
-SMOOTH_MM = 0.012
-APART_MM = 0.06  # two spots closer than this are one
-MOST_SPOTS = 600
-REACH_MM = 4.0  # how far the ball may lie from the rig's origin
-VOTE_MM = 0.06
-GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm apart or more
-LEAST_SPOTS = 12
-LEAST_SHARE = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
-HUBER = 2.5
-STEPS = 12
-DERIVATIVE_MM = 0.01
+SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
+SPOT_BLUR_MM = 0.012
+MIN_SPOT_SEPARATION_MM = 0.06  # two spots closer than this are one
+MAX_SPOTS = 600
+MAX_BALL_OFFSET_MM = 4.0  # how far the ball may lie from the rig's origin
+VOTE_CELL_MM = 0.06
+SPOT_GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm apart or more
+MIN_SPOTS = 12
+MIN_LIGHT_FRACTION = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
+HUBER_SIGMAS = 2.5
+N_BALL_STEPS = 12
 MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
 
 
@@ -81,35 +79,6 @@ class Ball:
             raise ValueError(f"Ball.covariance_mm2: got shape {covariance.shape}, expected (4, 4)")
         object.__setattr__(self, "center_mm", center)
         object.__setattr__(self, "covariance_mm2", covariance)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mirrored:
-    """How a ball shows lights to a camera.
-
-    Attributes
-    ----------
-    pixels : ndarray of float64, shape (L, 2)
-        Column and row, px; NaN where the ball does not show the light.
-    to_light, to_camera, normal : ndarray of float64, shape (L, 3)
-        Unit vectors at the mirroring point of the ball.
-    px_per_mm : ndarray of float64, shape (L, 2, 2)
-        How the spot moves with the light, along two directions across the line to it.
-    across : ndarray of float64, shape (L, 2, 3)
-        These directions, unit vectors.
-    """
-
-    pixels: Float64Array
-    to_light: Float64Array
-    to_camera: Float64Array
-    normal: Float64Array
-    px_per_mm: Float64Array
-    across: Float64Array
-
-    @property
-    def magnification_px2(self) -> Float64Array:
-        """Area of the image of 1 mm^2 of a light that faces the ball, px^2, shape (L,)."""
-        return np.abs(np.linalg.det(self.px_per_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,53 +150,17 @@ def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -
     >>> find_spots(spot, pixel_mm=0.006, noise=1e-3).tolist()
     [[30.0, 20.0]]
     """
-    smooth = gaussian_filter(np.asarray(image, np.float32), max(SMOOTH_MM / pixel_mm, 0.5))
+    smooth = gaussian_filter(np.asarray(image, np.float32), max(SPOT_BLUR_MM / pixel_mm, 0.5))
     usual = float(np.median(smooth))
     if noise is None:
         sigma = 1.4826 * float(np.median(np.abs(smooth - usual)))
     else:
-        sigma = noise / (2 * np.sqrt(np.pi) * max(SMOOTH_MM / pixel_mm, 0.5))
-    apart = 2 * round(APART_MM / pixel_mm / 2) + 1
+        sigma = noise / (2 * np.sqrt(np.pi) * max(SPOT_BLUR_MM / pixel_mm, 0.5))
+    apart = 2 * round(MIN_SPOT_SEPARATION_MM / pixel_mm / 2) + 1
     top = smooth == maximum_filter(smooth, max(apart, 3))
-    rows, columns = np.nonzero(top & (smooth - usual > max(NOISE_SIGMAS * sigma, 1e-12)))
-    order = np.argsort(-smooth[rows, columns], kind="stable")[:MOST_SPOTS]
+    rows, columns = np.nonzero(top & (smooth - usual > max(SPOT_DETECTION_SIGMAS * sigma, 1e-12)))
+    order = np.argsort(-smooth[rows, columns], kind="stable")[:MAX_SPOTS]
     return np.stack([columns, rows], axis=1)[order].astype(np.float64)
-
-
-def mirrored(
-    camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
-) -> Mirrored:
-    """Return where and how a ball mirrors lights into a camera.
-
-    Parameters
-    ----------
-    camera : CameraPose
-    center_mm, radius_mm
-        The ball.
-    lights_mm : ndarray of float64, shape (L, 3)
-        Places of the lights, outside the ball.
-    """
-    lights = np.asarray(lights_mm, np.float64)
-    eyes = np.broadcast_to(camera.center_mm, lights.shape)
-    centers = np.broadcast_to(np.asarray(center_mm, np.float64), lights.shape)
-    point, seen = reflection_points(eyes, centers, radius_mm, lights)
-    to_light, to_camera = _unit(lights - point), _unit(eyes - point)
-    first = np.cross(to_light, _least_axis(to_light))
-    first = _unit(first)
-    across = np.stack([first, np.cross(to_light, first)], axis=1)
-    columns = []
-    for j in range(2):
-        step = DERIVATIVE_MM * across[:, j]
-        ends = [reflection_pixels(camera, center_mm, radius_mm, lights + s * step) for s in (1, -1)]
-        columns.append((ends[0] - ends[1]) / (2 * DERIVATIVE_MM))
-    return Mirrored(
-        np.where(seen[:, None], camera.project(point), np.nan),
-        to_light,
-        to_camera,
-        (point - centers) / radius_mm,
-        np.stack(columns, axis=-1),
-        across,
-    )
 
 
 def locate_ball(
@@ -288,12 +221,12 @@ def locate_ball(
             " lies in the middle of the field, and the exposure"
         )
     shift, votes = _vote(found, nominal[shows], pixel_mm)
-    if votes < LEAST_SPOTS:
+    if votes < MIN_SPOTS:
         raise BallError(
             f"ball: {len(found)} spots, at most {votes} of which fit the lights' pattern at one"
-            f" place of the ball, expected {LEAST_SPOTS} or more; check the target, its radius"
-            f" ({radius_mm:g} mm), the exposure, and that the ball lies within {REACH_MM:g} mm of"
-            " the middle"
+            f" place of the ball, expected {MIN_SPOTS} or more; check the target, its radius"
+            f" ({radius_mm:g} mm), the exposure, and that the ball lies within"
+            f" {MAX_BALL_OFFSET_MM:g} mm of the middle"
         )
     right, down = camera.rotation[0], camera.rotation[1]
     start = about + pixel_mm * (shift[0] * right + shift[1] * down)
@@ -305,7 +238,7 @@ def locate_ball(
         np.append(start, radius_mm),
         pixel_mm,
         expected=np.append(about, radius_mm),
-        prior=np.array([REACH_MM, REACH_MM, depth_stderr_mm, radius_stderr_mm]),
+        prior=np.array([MAX_BALL_OFFSET_MM, MAX_BALL_OFFSET_MM, depth_stderr_mm, radius_stderr_mm]),
         margin_px=margin_mm / pixel_mm,
         noise_px=noise_px,
     )
@@ -361,12 +294,12 @@ def _require_field(
     nominal: Float64Array, camera: CameraPose, pixel_mm: float, radius_mm: float
 ) -> None:
     inside = _inside(nominal, camera, 0.0)
-    if inside.sum() < max(LEAST_SHARE * len(nominal), 1):
+    if inside.sum() < max(MIN_LIGHT_FRACTION * len(nominal), 1):
         width, height = (side * pixel_mm for side in camera.image_size)
         raise BallError(
             f"ball: the field of {width:.1f} mm x {height:.1f} mm can show only"
             f" {int(inside.sum())} of {len(nominal)} lights in a ball of radius {radius_mm:g} mm,"
-            f" expected {LEAST_SHARE:.0%} or more; photograph it with the whole sensor"
+            f" expected {MIN_LIGHT_FRACTION:.0%} or more; photograph it with the whole sensor"
         )
 
 
@@ -374,9 +307,9 @@ def _vote(found: Float64Array, nominal: Float64Array, pixel_mm: float) -> tuple[
     """Return the shift of the pattern, px, that most spots agree to, and how many do."""
     expected = nominal[np.isfinite(nominal).all(axis=1)]
     offset = (found[:, None] - expected[None]).reshape(-1, 2)
-    reach = REACH_MM / pixel_mm
+    reach = MAX_BALL_OFFSET_MM / pixel_mm
     offset = offset[(np.abs(offset) < reach).all(axis=1)]
-    cells = int(np.ceil(2 * REACH_MM / VOTE_MM))
+    cells = int(np.ceil(2 * MAX_BALL_OFFSET_MM / VOTE_CELL_MM))
     table, *_ = np.histogram2d(
         offset[:, 1], offset[:, 0], bins=cells, range=[[-reach, reach], [-reach, reach]]
     )
@@ -407,25 +340,25 @@ def _refine(
 ) -> BallFit:
     """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
     tree = cKDTree(found)
-    scatter_mm, gate_px = 2.0, GATE_MM / pixel_mm
+    scatter_mm, gate_px = 2.0, SPOT_GATE_MM / pixel_mm
     spot = np.full(len(lights), -1)
     covariance = np.diag(prior**2)
-    for step in range(STEPS):
-        seen = mirrored(camera, place[:3], float(place[3]), lights)
+    for step in range(N_BALL_STEPS):
+        seen = mirror_lights(camera, place[:3], float(place[3]), lights)
         spot = _match(tree, found, np.where(shows[:, None], seen.pixels, np.nan), gate_px)
         used = np.flatnonzero(spot >= 0)
-        if len(used) < LEAST_SPOTS:
+        if len(used) < MIN_SPOTS:
             raise BallError(
-                f"ball: only {len(used)} spots fit the lights' pattern, expected {LEAST_SPOTS} or"
+                f"ball: only {len(used)} spots fit the lights' pattern, expected {MIN_SPOTS} or"
                 " more; check the target, its radius and the exposure"
             )
         slopes = []
-        for h in DERIVATIVE_MM * np.eye(4):
+        for h in DERIVATIVE_STEP_MM * np.eye(4):
             ends = [
                 reflection_pixels(camera, at[:3], float(at[3]), lights[used])
                 for at in (place + h, place - h)
             ]
-            slopes.append((ends[0] - ends[1]) / (2 * DERIVATIVE_MM))
+            slopes.append((ends[0] - ends[1]) / (2 * DERIVATIVE_STEP_MM))
         slope = np.stack(slopes, axis=-1)
         miss = found[spot[used]] - seen.pixels[used]
         moved = seen.px_per_mm[used]
@@ -433,7 +366,7 @@ def _refine(
         spread = scatter_mm**2 * (moved @ moved.transpose(0, 2, 1)) + noise
         weight = np.linalg.inv(spread)
         distance2 = np.einsum("ki,kij,kj->k", miss, weight, miss)
-        robust = np.minimum(1.0, HUBER / np.sqrt(np.maximum(distance2, 1e-12)))
+        robust = np.minimum(1.0, HUBER_SIGMAS / np.sqrt(np.maximum(distance2, 1e-12)))
         weight *= robust[:, None, None]
         normal = np.einsum("kia,kij,kjb->ab", slope, weight, slope) + np.diag(prior**-2)
         right = np.einsum("kia,kij,kj->a", slope, weight, miss) + (expected - place) / prior**2
@@ -444,15 +377,15 @@ def _refine(
         wide = float(np.median(distance2)) / MEDIAN_CHI2_2
         scatter_mm = float(np.clip(scatter_mm * np.sqrt(wide), 0.02, 20.0))
         if step >= 2:
-            gate_px = np.clip(6 * scatter_mm * np.abs(moved).max(), 6.0, GATE_MM / pixel_mm)
+            gate_px = np.clip(6 * scatter_mm * np.abs(moved).max(), 6.0, SPOT_GATE_MM / pixel_mm)
         if step >= 4 and float(change @ normal @ change) < 1e-6:
             break
     in_field = _inside(seen.pixels, camera, margin_px)
-    if in_field[shows].sum() < LEAST_SHARE * shows.sum():
+    if in_field[shows].sum() < MIN_LIGHT_FRACTION * shows.sum():
         raise BallError(
             f"ball: {place[0]:+.2f} mm, {place[1]:+.2f} mm from the middle, only"
             f" {int(in_field[shows].sum())} of {int(shows.sum())} spots lie in the field, expected"
-            f" {LEAST_SHARE:.0%} or more; centre it"
+            f" {MIN_LIGHT_FRACTION:.0%} or more; centre it"
         )
     stray = np.setdiff1d(np.arange(len(found)), spot)
     return BallFit(Ball(place[:3], float(place[3]), covariance), spot, in_field, stray, scatter_mm)
@@ -478,12 +411,3 @@ def _inside(pixels: Float64Array, camera: CameraPose, margin: float) -> BoolArra
     x, y = pixels[:, 0], pixels[:, 1]
     with np.errstate(invalid="ignore"):
         return (x > margin) & (y > margin) & (x < width - 1 - margin) & (y < height - 1 - margin)
-
-
-def _unit(vectors: Float64Array) -> Float64Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _least_axis(vectors: Float64Array) -> Float64Array:
-    """Return the coordinate axis that each vector is least along."""
-    return np.eye(3)[np.argmin(np.abs(vectors), axis=-1)]

@@ -193,7 +193,7 @@ class SphereFilms:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         n = len(self.names)
-        arrays = (*_LEAKS, *(f"{name}_stderr" for name in _LEAKS[:2]))
+        arrays = (*_LEAKAGE_FIELDS, *(f"{name}_stderr" for name in _LEAKAGE_FIELDS[:2]))
         _freeze(self, n, (*arrays, "axis_error_stderr_rad"), (n,), np.float64)
         _freeze(self, n, ("valid",), (n,), np.bool_)
         if (self.leakage < 0).any() or not self.eta > 1:
@@ -242,7 +242,7 @@ class SphereFilms:
             If the calibration is of another rig or camera, or lacks one of the rig's lights.
         """
         table = _Columns(calibration, rig, "polarization")
-        leakage, glass, axis = (table.both(name) for name in _LEAKS)
+        leakage, glass, axis = (table.both(name) for name in _LEAKAGE_FIELDS)
         zero, light, analyser = (
             calibration.quantity(serial, name)
             for name in ("analyser_zero_rad", "light_leak", "analyser_leak")
@@ -260,7 +260,7 @@ class SphereFilms:
         )
 
 
-_LEAKS = ("leakage", "glass_leakage", "axis_error_rad")
+_LEAKAGE_FIELDS = ("leakage", "glass_leakage", "axis_error_rad")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,21 +21,22 @@ from capture.calibration.polarization.polarized_reflection import Reflection
 __all__ = ["FilmFit", "fit_films", "leakage"]
 
 
-WIDEST_ZERO_DEG = 30  # of the analyser, searched
-USUAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
-LEAK_SCATTER = 1.5  # of its logarithm
-USUAL_TURN_RAD = np.radians(1.0)
+MAX_ZERO_DEG = 30  # of the analyser, searched
+TYPICAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
+LOG_LEAK_SCATTER = 1.5  # of its logarithm
+TYPICAL_TURN_RAD = np.radians(1.0)
 TURN_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
-FREEDOM = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
-STEPS = 60
-STOP = 1e-6
-DERIVATIVE = 1e-5
-MODES_REACH = 6.0  # widths of the axes' scatter within which a light may have a second answer
-MODES_FAR_RAD = np.radians(30.0)
-MODES_GRID = 41
-MODES_ROUNDS = 5
-SAME_RAD = np.radians(0.01)
-LEAST_LIGHTS = 6
+DEGREES_OF_FREEDOM = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
+MAX_POLARIZER_STEPS = 60
+POLARIZER_STEP_TOL = 1e-6
+POLARIZER_DERIVATIVE_STEP = 1e-5
+# widths of the axes' scatter within which a light may have a second answer
+MODE_SCATTER_WIDTHS = 6.0
+MAX_MODE_TURN_RAD = np.radians(30.0)
+N_MODE_GRID = 41
+N_MODE_ITERATIONS = 5
+SAME_MODE_RAD = np.radians(0.01)
+MIN_POLARIZED_LIGHTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,10 +125,10 @@ def fit_films(
             " that differ, parallel and crossed"
         )
     seen = np.array([len(np.unique(np.round(np.exp(2j * readings[ok]), 6))) >= 2 for ok in good.T])
-    if seen.sum() < LEAST_LIGHTS:
+    if seen.sum() < MIN_POLARIZED_LIGHTS:
         raise PolarizationError(
             f"films: {int(seen.sum())} lights have two readings that are not saturated, expected"
-            f" {LEAST_LIGHTS} or more; add a shorter exposure"
+            f" {MIN_POLARIZED_LIGHTS} or more; add a shorter exposure"
         )
     weight = np.where(good & seen, 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
     values = np.where(weight > 0, rates, 0.0)
@@ -183,10 +184,10 @@ def _starts(
     # lights' own axes are off: their spots differ from this by some thousandths of their light
     slack = (3e-3 * np.abs(values).max(axis=0)) ** 2
     soft = np.where(weight > 0, weight / (1.0 + weight * slack), 0.0)
-    zeros = np.radians(np.arange(-WIDEST_ZERO_DEG, WIDEST_ZERO_DEG + 1.0, 1.0))
+    zeros = np.radians(np.arange(-MAX_ZERO_DEG, MAX_ZERO_DEG + 1.0, 1.0))
     cost = []
     for zero in zeros:
-        u = reflection.through(readings, 0.0, zero, USUAL_LEAK, USUAL_LEAK)
+        u = reflection.through(readings, 0.0, zero, TYPICAL_LEAK, TYPICAL_LEAK)
         power = np.sum(soft * u**2, axis=0)
         strength = np.sum(soft * u * values, axis=0) / np.where(power > 0, power, 1.0)
         cost.append(float(np.sum(soft * (values - strength * u) ** 2)))
@@ -214,8 +215,8 @@ class _Films:
         self.lit = (weight > 0).any(axis=0)
         count = values.shape[1]
         self.turn = np.zeros(count)
-        self.shared = np.array([zero, np.log(USUAL_LEAK), np.log(USUAL_LEAK)])
-        self.scatter = float(USUAL_TURN_RAD)
+        self.shared = np.array([zero, np.log(TYPICAL_LEAK), np.log(TYPICAL_LEAK)])
+        self.scatter = float(TYPICAL_TURN_RAD)
         self.pull = np.ones(count)  # weight of each light's turn among all, from Student's t
         u = self._through(self.turn, self.shared)
         power = np.sum(weight * u**2, axis=0)
@@ -227,7 +228,7 @@ class _Films:
 
     def _objective(self, strength: Float64Array, turn: Float64Array, shared: Float64Array) -> float:
         miss = self.values - strength * self._through(turn, shared)
-        beyond = (shared[1:] - np.log(USUAL_LEAK)) / LEAK_SCATTER
+        beyond = (shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER
         return float(
             np.sum(self.weight * miss**2)
             + np.sum(self.pull * turn**2) / self.scatter**2
@@ -239,14 +240,16 @@ class _Films:
         """Minus twice the logarithm of the posterior, up to a constant."""
         data = self._objective(self.strength, self.turn, self.shared)
         data -= float(np.sum(self.pull * self.turn**2)) / self.scatter**2
-        tails = np.log1p(self.turn[self.lit] ** 2 / (FREEDOM * self.scatter**2))
-        return data + float((FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter))
+        tails = np.log1p(self.turn[self.lit] ** 2 / (DEGREES_OF_FREEDOM * self.scatter**2))
+        return data + float(
+            (DEGREES_OF_FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
+        )
 
     def _normal(
         self,
     ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array, Float64Array]:
         """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
-        h = DERIVATIVE
+        h = POLARIZER_DERIVATIVE_STEP
         u = self._through(self.turn, self.shared)
         by_turn = self._through(self.turn + h, self.shared)
         by_turn = (by_turn - self._through(self.turn - h, self.shared)) / (2 * h)
@@ -267,15 +270,15 @@ class _Films:
         block[:, 1, 1] += self.pull / self.scatter**2
         one[:, 1] -= self.pull * self.turn / self.scatter**2
         block[~self.lit, 0, 0] = 1.0
-        corner[1:, 1:] += np.eye(2) / LEAK_SCATTER**2
-        other[1:] -= (self.shared[1:] - np.log(USUAL_LEAK)) / LEAK_SCATTER**2
+        corner[1:, 1:] += np.eye(2) / LOG_LEAK_SCATTER**2
+        other[1:] -= (self.shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER**2
         return block, border, corner, one, other
 
     def solve(self) -> _Films:
         """Descend, with Marquardt's damping; between steps fit the scatter of the axes."""
         damping = 1e-3
         now = self._objective(self.strength, self.turn, self.shared)
-        for _ in range(STEPS):
+        for _ in range(MAX_POLARIZER_STEPS):
             block, border, corner, one, other = self._normal()
             while True:
                 local, shared = _solve_arrow(block, border, corner, one, other, damping)
@@ -294,12 +297,14 @@ class _Films:
             damping = max(damping / 10, 1e-9)
             wider = self._scatter(_solve_arrow_covariance(block, border, corner)[0][:, 1, 1])
             self.pull = np.where(
-                self.lit, (FREEDOM + 1) / (FREEDOM + (self.turn / wider) ** 2), 1.0
+                self.lit,
+                (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + (self.turn / wider) ** 2),
+                1.0,
             )
             settled = abs(wider / self.scatter - 1) < 1e-3
             self.scatter = wider
             now = self._objective(self.strength, self.turn, self.shared)
-            if settled and gain < STOP:
+            if settled and gain < POLARIZER_STEP_TOL:
                 break
         return self
 
@@ -322,14 +327,16 @@ class _Films:
         power = np.sum(self.weight * u**2, axis=0)
         strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
         miss = np.sum(self.weight * (self.values - strength * u) ** 2, axis=0)
-        tail = (FREEDOM + 1) * np.log1p(turn**2 / (FREEDOM * self.scatter**2))
+        tail = (DEGREES_OF_FREEDOM + 1) * np.log1p(turn**2 / (DEGREES_OF_FREEDOM * self.scatter**2))
         return miss + tail, strength
 
     def _modes(self) -> tuple[Float64Array, Float64Array]:
         """Return the two best answers for each light's turn and their costs, shapes (2, L)."""
-        even = np.linspace(-1.0, 1.0, MODES_GRID)
+        even = np.linspace(-1.0, 1.0, N_MODE_GRID)
         # closely where most axes are, coarsely where one far off may be
-        grid = np.unique(np.append(MODES_REACH * self.scatter * even, MODES_FAR_RAD * even))
+        grid = np.unique(
+            np.append(MODE_SCATTER_WIDTHS * self.scatter * even, MAX_MODE_TURN_RAD * even)
+        )
         steps = np.maximum(np.diff(grid, prepend=grid[0]), np.diff(grid, append=grid[-1]))
         cost = np.array([self._light_cost(np.full_like(self.turn, g))[0] for g in grid])
         padded = np.pad(cost, ((1, 1), (0, 0)), constant_values=np.inf)
@@ -338,7 +345,7 @@ class _Films:
         found = []
         for turn, width in zip(grid[order], steps[order], strict=True):
             at = turn
-            for _ in range(MODES_ROUNDS):
+            for _ in range(N_MODE_ITERATIONS):
                 near = at + width * np.linspace(-1, 1, 9)[:, None]
                 costs = np.array([self._light_cost(t)[0] for t in near])
                 best = np.argmin(costs, axis=0)
@@ -349,7 +356,7 @@ class _Films:
         first = np.argsort(costs, axis=0)
         modes, costs = (np.take_along_axis(part, first, axis=0) for part in (modes, costs))
         # one valley only, or both descents into the same
-        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < SAME_RAD)
+        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < SAME_MODE_RAD)
         costs[1, single] = np.inf
         return modes, costs
 
@@ -363,7 +370,11 @@ class _Films:
         # how much the scattered axes tell: slope and spread of their pull (a sandwich), since
         # weights that follow the residuals would count their own scatter as knowledge
         z = self.turn[self.lit] / self.scatter
-        slope = ((FREEDOM + 1) * (FREEDOM - z**2) / (FREEDOM + z**2) ** 2).sum()
+        slope = (
+            (DEGREES_OF_FREEDOM + 1)
+            * (DEGREES_OF_FREEDOM - z**2)
+            / (DEGREES_OF_FREEDOM + z**2) ** 2
+        ).sum()
         spread = ((self.pull[self.lit] * z) ** 2).sum()
         known = np.clip(slope**2 / max(spread, 1e-9) / len(z), 0.2, 1.0)
         self.pull = np.full_like(self.pull, known)

@@ -14,9 +14,9 @@ from capture.calibration.record import CalibrationError
 __all__ = ["ChromeBallError", "directions_from_chrome_ball", "highlight_center"]
 
 
-BRIGHT_SHARE = 0.9  # of the brightest pixel: what belongs to a highlight
-LEAST_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
-LEAST_BALL_PX = 100
+HIGHLIGHT_LEVEL = 0.9  # of the brightest pixel: what belongs to a highlight
+MIN_HIGHLIGHT_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
+MIN_BALL_PIXELS = 100
 
 
 class ChromeBallError(CalibrationError):
@@ -61,10 +61,10 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     inside = inside.max(axis=-1) if inside.ndim == 3 else inside
     inside = inside if inside.dtype == bool else inside > 0.5 * inside.max(initial=0)
     count = int(np.count_nonzero(inside))
-    if inside.ndim != 2 or count < LEAST_BALL_PX:
+    if inside.ndim != 2 or count < MIN_BALL_PIXELS:
         raise ChromeBallError(
             f"mask: got {count} pixels of a ball in shape {inside.shape}, expected (H, W) and at"
-            f" least {LEAST_BALL_PX}"
+            f" least {MIN_BALL_PIXELS}"
         )
     rows, columns = np.nonzero(inside)
     middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
@@ -104,9 +104,9 @@ def highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:
     values = np.where(inside & np.isfinite(gray), gray, 0.0)
     brightest = float(values.max(initial=0.0))
     usual = float(np.median(values[inside])) if inside.any() else 0.0
-    if not brightest > max(LEAST_CONTRAST * usual, 0.0):
+    if not brightest > max(MIN_HIGHLIGHT_CONTRAST * usual, 0.0):
         return None
-    spots, count = label(values >= BRIGHT_SHARE * brightest)
+    spots, count = label(values >= HIGHLIGHT_LEVEL * brightest)
     sizes = np.bincount(spots.ravel(), minlength=count + 1)
     sizes[0] = 0
     spot = spots == int(np.argmax(sizes))

@@ -25,22 +25,25 @@ from capture.calibration.record import CalibrationError
 __all__ = ["LightFit", "LightFitError", "check_order", "fit_lights"]
 
 
-LIGHT, CAMERA, POSE = 6, 5, 2  # numbers of a light (intensities, exponent, tilt), camera, pose
-LEAST_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
-STEPS = 6
+N_LIGHT, N_RESPONSE, N_TILT = (
+    6,
+    5,
+    2,
+)  # numbers of a light (intensities, exponent, tilt), camera, pose
+MIN_INCIDENCE_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
+N_LIGHT_FIT_STEPS = 6
 TILT_PRIOR_RAD = 0.05  # how far an LED may point past the rig's origin
 EXPONENT_PRIOR = 1.0
 NORMAL_PRIOR_RAD = 2e-3  # of the plate's normal as its markers show it
 GAIN_PRIOR = 0.2  # relative, of a camera's response
 VIGNETTING_PRIOR = 0.4
 FRAME_STDERR = 3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
-PART_STDERR = (
-    3e-3  # relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
-)
-DEAD_SHARE = 0.02  # of the usual brightness: a light below is dead
+# relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
+PART_STDERR = 3e-3
+DEAD_LIGHT_BRIGHTNESS = 0.02  # of the usual brightness: a light below is dead
 DEAD_SIGMAS = 5.0
-SHADING_LIMIT = 3e-3  # part of a light's energy over all frames that its own shading may leave
-SHADING_RATIO = 5.0  # how much better another light's shading must fit
+MAX_SHADING_MISFIT = 3e-3  # part of a light's energy over all frames that its own shading may leave
+MIN_SHADING_MISFIT_RATIO = 5.0  # how much better another light's shading must fit
 
 
 class LightFitError(CalibrationError):
@@ -126,14 +129,14 @@ def check_order(
     dead = tuple(
         name
         for name, (share, sigmas) in level.items()
-        if share < DEAD_SHARE * usual and (sigmas < DEAD_SIGMAS or best[name][0] > 0.5)
+        if share < DEAD_LIGHT_BRIGHTNESS * usual and (sigmas < DEAD_SIGMAS or best[name][0] > 0.5)
     )
     answers = {
         name: table.names[other]
         for name, (own_left, other, other_left) in best.items()
         if name not in dead
         and table.names[other] != name
-        and own_left > max(SHADING_LIMIT, SHADING_RATIO * other_left)
+        and own_left > max(MAX_SHADING_MISFIT, MIN_SHADING_MISFIT_RATIO * other_left)
     }
     # a light that shines elsewhere leaves its own place dark, too: it is not dead
     dark_but_elsewhere = {n for n in dead if best[n][2] < 0.05 and level[n][1] > DEAD_SIGMAS}
@@ -223,7 +226,7 @@ def _frame(
     distance = np.linalg.norm(to_light, axis=1)
     cosine = to_light @ row.normal / distance
     signal = row.signal / row.on_s
-    good = (cosine > LEAST_COSINE) & (row.signal > 20 * np.sqrt(row.variance)).all(axis=1)
+    good = (cosine > MIN_INCIDENCE_COSINE) & (row.signal > 20 * np.sqrt(row.variance)).all(axis=1)
     if np.count_nonzero(good) < 4:
         return None
     size = np.array(cameras[row.view].image_size, float)
@@ -251,49 +254,49 @@ def _solve(
     """Return all numbers, their covariance and the rms residual."""
     lights = len(table.names)
     poses = 1 + max(f.pose for f in frames)
-    last = LIGHT * lights + CAMERA * len(views)
-    relief = last + POSE * poses
+    last = N_LIGHT * lights + N_RESPONSE * len(views)
+    relief = last + N_TILT * poses
     parts = 1 + max(int(f.part.max()) for f in frames)
-    total = relief + POSE * parts
+    total = relief + N_TILT * parts
     numbers = np.zeros(total)
-    numbers[3 : LIGHT * lights : LIGHT] = table.exponent
+    numbers[3 : N_LIGHT * lights : N_LIGHT] = table.exponent
     side, across = _sides(table.axis)
     prior = np.zeros(total)
     for offset, sigma in ((3, EXPONENT_PRIOR), (4, TILT_PRIOR_RAD), (5, TILT_PRIOR_RAD)):
-        prior[offset : LIGHT * lights : LIGHT] = 1 / sigma**2
+        prior[offset : N_LIGHT * lights : N_LIGHT] = 1 / sigma**2
     prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
     prior[relief:] = 1 / slope_rad**2
-    prior[LIGHT * lights : last] = np.tile(
+    prior[N_LIGHT * lights : last] = np.tile(
         [1 / GAIN_PRIOR**2] * 3 + [1 / VIGNETTING_PRIOR**2] * 2, len(views)
     )
     middle = np.zeros(total)
-    middle[3 : LIGHT * lights : LIGHT] = table.exponent
+    middle[3 : N_LIGHT * lights : N_LIGHT] = table.exponent
     used = np.zeros(total, bool)
     gauge = np.zeros((3, total))
     for c in range(len(views)):
-        first = LIGHT * lights + CAMERA * c
+        first = N_LIGHT * lights + N_RESPONSE * c
         gauge[np.arange(3), first + np.arange(3)] = 1.0
     # start each intensity at the mean of its frames: the lobe is near 1
     for k in range(lights):
         mine = [f.log_signal - f.known[:, None] for f in frames if f.light == k]
         if mine:
-            numbers[LIGHT * k : LIGHT * k + 3] = np.concatenate(mine).mean(axis=0)
+            numbers[N_LIGHT * k : N_LIGHT * k + 3] = np.concatenate(mine).mean(axis=0)
     covariance, square, count = np.eye(total), 0.0, 1
-    for _ in range(STEPS):
+    for _ in range(N_LIGHT_FIT_STEPS):
         H, g = np.diag(prior) + 1e6 * gauge.T @ gauge, prior * (numbers - middle)
         g += 1e6 * gauge.T @ (gauge @ numbers)
         square, count = 0.0, 0
         for f in frames:
-            at = slice(LIGHT * f.light, LIGHT * (f.light + 1))
-            c = LIGHT * lights + CAMERA * views.index(f.view)
-            to = slice(c, c + CAMERA)
-            by = slice(last + POSE * f.pose, last + POSE * (f.pose + 1))
+            at = slice(N_LIGHT * f.light, N_LIGHT * (f.light + 1))
+            c = N_LIGHT * lights + N_RESPONSE * views.index(f.view)
+            to = slice(c, c + N_RESPONSE)
+            by = slice(last + N_TILT * f.pose, last + N_TILT * (f.pose + 1))
             r, A, B = _rows(f, table, numbers[at], numbers[to], side, across)
             turns = np.repeat(f.turns, 3, axis=0)
-            bumps = np.zeros((len(r), POSE * len(f.part)))
+            bumps = np.zeros((len(r), N_TILT * len(f.part)))
             row = np.arange(len(r))[:, None]
-            bumps[row, POSE * (row // 3) + [0, 1]] = turns
-            bump_at = (relief + POSE * f.part[:, None] + [0, 1]).ravel()
+            bumps[row, N_TILT * (row // 3) + [0, 1]] = turns
+            bump_at = (relief + N_TILT * f.part[:, None] + [0, 1]).ravel()
             r = r + turns @ numbers[by] + bumps @ numbers[bump_at]
             J = np.concatenate([A, B, turns, bumps], axis=1)
             w = 1 / f.relative.ravel()
@@ -336,16 +339,16 @@ def _rows(
     vignetting = np.clip(vignetting, 0.05, None)
     common = f.known + lobe + np.log(vignetting)
     model = common[:, None] + light[:3] + camera[:3]
-    A = np.zeros((n, 3, LIGHT))
+    A = np.zeros((n, 3, N_LIGHT))
     A[:, np.arange(3), np.arange(3)] = 1.0
     A[:, :, 3] = np.log(cosine)[:, None]
     A[:, :, 4] = (light[3] * (f.direction @ by_side) / cosine)[:, None]
     A[:, :, 5] = (light[3] * (f.direction @ by_across) / cosine)[:, None]
-    B = np.zeros((n, 3, CAMERA))
+    B = np.zeros((n, 3, N_RESPONSE))
     B[:, np.arange(3), np.arange(3)] = 1.0
     B[:, :, 3] = (f.r2 / vignetting)[:, None]
     B[:, :, 4] = (f.r2**2 / vignetting)[:, None]
-    return (model - f.log_signal).ravel(), A.reshape(-1, LIGHT), B.reshape(-1, CAMERA)
+    return (model - f.log_signal).ravel(), A.reshape(-1, N_LIGHT), B.reshape(-1, N_RESPONSE)
 
 
 def _tilted(
@@ -391,9 +394,9 @@ def _result(
     answers: dict[str, str],
 ) -> LightFit:
     lights = len(table.names)
-    rows = numbers[: LIGHT * lights].reshape(lights, LIGHT)
+    rows = numbers[: N_LIGHT * lights].reshape(lights, N_LIGHT)
     errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
-    light_errors = errors[: LIGHT * lights].reshape(lights, LIGHT)
+    light_errors = errors[: N_LIGHT * lights].reshape(lights, N_LIGHT)
     seen = np.zeros(lights, bool)
     seen[[f.light for f in frames]] = True
     unseen = tuple(
@@ -411,8 +414,8 @@ def _result(
     intensity = np.where(seen[:, None], np.exp(rows[:, :3]), 0.0)
     responses = {}
     for c, view in enumerate(sorted(cameras)):
-        first = LIGHT * lights + CAMERA * c
-        mine, error = numbers[first : first + CAMERA], errors[first : first + CAMERA]
+        first = N_LIGHT * lights + N_RESPONSE * c
+        mine, error = numbers[first : first + N_RESPONSE], errors[first : first + N_RESPONSE]
         if any(f.view == view for f in frames):
             gain = np.exp(mine[:3])
             responses[cameras[view].serial] = CameraResponse(

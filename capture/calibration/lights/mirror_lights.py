@@ -18,29 +18,25 @@ from threadpoolctl import threadpool_limits
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.lights.mirror_sphere import (
-    SphereError,
-    SpherePlace,
-    contour,
-    reflect,
-    reflection_pixels,
-    reflection_points,
-)
+from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition, contour
+from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 
-__all__ = ["Highlights", "LightPlaces", "SphereWindow", "find_highlights", "locate_lights"]
+__all__ = ["Highlights", "LightPositions", "SphereWindow", "find_highlights", "locate_lights"]
 
 
-RIM_PX = 1.5  # highlights closer to the outline are left alone
-NOISE_SIGMAS = 8.0  # above the median in the sphere
-LEAST_PEAK = 0.02  # of the brightest pixel in the sphere: fainter spots are reflections of spots
-GATE_MM = 60.0  # how far a light may be from a reflected ray to be the one that made it
-HUBER = 2.5
-LEAST_CAMERAS = 2
-LEAST_HIGHLIGHTS = 3
-FLOOR_PX = 0.03  # of a highlight's middle, whatever its size: noise, the surface's polish
-MAX_STEPS = 25
-STOP = 1e-3  # square of the last step over its standard errors, all numbers together
-DERIVATIVE_MM = 0.01
+MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are left alone
+HIGHLIGHT_NOISE_SIGMAS = 8.0  # above the median in the sphere
+# of the brightest pixel in the sphere: fainter spots are reflections of spots
+MIN_HIGHLIGHT_PEAK = 0.02
+LIGHT_GATE_MM = 60.0  # how far a light may be from a reflected ray to be the one that made it
+HUBER_SIGMAS = 2.5
+MIN_HIGHLIGHT_CAMERAS = 2
+MIN_HIGHLIGHTS = 3
+# of a highlight's middle, whatever its size: noise, the surface's polish
+MIN_HIGHLIGHT_STDERR_PX = 0.03
+MAX_MIRROR_STEPS = 25
+MIRROR_STEP_TOL = 1e-3  # square of the last step over its standard errors, all numbers together
+DERIVATIVE_STEP_MM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +56,7 @@ class SphereWindow:
     inside: BoolArray
 
     @classmethod
-    def of(cls, camera: CameraPose, place: SpherePlace) -> SphereWindow:
+    def of(cls, camera: CameraPose, place: SpherePosition) -> SphereWindow:
         """Return the window of a sphere in a camera."""
         outline = contour(camera, place.center_mm, place.radius_mm, 90)
         size = np.array(camera.image_size)
@@ -76,7 +72,7 @@ class SphereWindow:
         offset = place.center_mm - camera.center_mm
         distance = float(np.linalg.norm(offset))
         angle = np.arccos(np.clip(rays @ offset / distance, -1, 1))
-        limit = np.arcsin(place.radius_mm / distance) - RIM_PX / camera.matrix[0, 0]
+        limit = np.arcsin(place.radius_mm / distance) - MIN_RIM_DISTANCE_PX / camera.matrix[0, 0]
         rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
         return cls(rows, columns, angle < limit)
 
@@ -107,7 +103,7 @@ class Highlights:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LightPlaces:
+class LightPositions:
     """Where the lights are.
 
     Attributes
@@ -170,7 +166,7 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array,
     quiet = values[np.abs(values - usual) <= np.quantile(np.abs(values - usual), 0.98)]
     sigma = max(1.4826 * float(np.median(np.abs(values - usual))), float(quiet.std()))
     above = np.where(window.inside, part - usual, 0.0)
-    limit = max(NOISE_SIGMAS * sigma, LEAST_PEAK * float(above.max()), 1e-12)
+    limit = max(HIGHLIGHT_NOISE_SIGMAS * sigma, MIN_HIGHLIGHT_PEAK * float(above.max()), 1e-12)
     spots, count = label(above > limit, structure=np.ones((3, 3)))
     pixels, flux = [], []
     for k in range(1, count + 1):
@@ -189,13 +185,13 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array,
 def locate_lights(
     seen: Sequence[Highlights],
     cameras: Mapping[str, CameraPose],
-    spheres: Mapping[int, SpherePlace],
+    spheres: Mapping[int, SpherePosition],
     nominal: Mapping[str, Float64Array],
     *,
     light_radius_mm: float = 10.0,
     nominal_stderr_mm: float | None = None,
-    gate_mm: float = GATE_MM,
-) -> LightPlaces:
+    gate_mm: float = LIGHT_GATE_MM,
+) -> LightPositions:
     """Place lights by their highlights.
 
     Parameters
@@ -204,7 +200,7 @@ def locate_lights(
         Of all cameras, spheres and groups of lights.
     cameras : mapping of str to CameraPose
         Calibrated, by view name.
-    spheres : mapping of int to SpherePlace
+    spheres : mapping of int to SpherePosition
     nominal : mapping of str to array_like, shape (3,)
         Where each light should be, mm; it tells highlights apart and starts the fit.
     light_radius_mm : float
@@ -217,7 +213,7 @@ def locate_lights(
 
     Returns
     -------
-    LightPlaces
+    LightPositions
 
     Raises
     ------
@@ -240,11 +236,11 @@ def locate_lights(
         count[light] += 1
         views[light].add(view)
     by = np.array([len(v) for v in views], np.int64)
-    valid = (count >= LEAST_HIGHLIGHTS) & (by >= LEAST_CAMERAS)
+    valid = (count >= MIN_HIGHLIGHTS) & (by >= MIN_HIGHLIGHT_CAMERAS)
     used = [m for m in matched if valid[m[0]]]
     if not used:
         raise SphereError(
-            f"highlights: no light was seen by {LEAST_CAMERAS} cameras in {LEAST_HIGHLIGHTS}"
+            f"highlights: no light was seen by {MIN_HIGHLIGHT_CAMERAS} cameras in {MIN_HIGHLIGHTS}"
             " images; show the sphere at more places, to more cameras"
         )
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
@@ -252,7 +248,7 @@ def locate_lights(
             used, cameras, spheres, start, valid, light_radius_mm, nominal_stderr_mm
         )
     position[~valid] = np.array([np.asarray(nominal[name], float) for name in names])[~valid]
-    return LightPlaces(
+    return LightPositions(
         names,
         position,
         np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None)),
@@ -273,7 +269,7 @@ Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
 def _match(
     seen: Sequence[Highlights],
     cameras: Mapping[str, CameraPose],
-    spheres: Mapping[int, SpherePlace],
+    spheres: Mapping[int, SpherePosition],
     names: tuple[str, ...],
     start: Float64Array,
     gate_mm: float,
@@ -320,12 +316,12 @@ def _match(
     unseen = tuple(
         names[k]
         for k in range(len(names))
-        if expected[k] >= LEAST_HIGHLIGHTS and not found[k] and names[k] not in answers
+        if expected[k] >= MIN_HIGHLIGHTS and not found[k] and names[k] not in answers
     )
     return matched, answers, unseen
 
 
-def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: Float64Array) -> BoolArray:
+def _clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Array) -> BoolArray:
     """Return which pixels lie in the inner nine tenths of a sphere and in the image."""
     inside = np.zeros(len(pixels), bool)
     good = np.isfinite(pixels).all(axis=1)
@@ -340,7 +336,7 @@ def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: Float64Array)
 
 
 def _miss_mm(
-    camera: CameraPose, sphere: SpherePlace, pixels: Float64Array, lights_mm: Float64Array
+    camera: CameraPose, sphere: SpherePosition, pixels: Float64Array, lights_mm: Float64Array
 ) -> Float64Array:
     """Return how far each light is from each reflected ray, mm, shape (spots, lights)."""
     point, direction, hit = reflect(camera, pixels, sphere.center_mm, sphere.radius_mm)
@@ -353,7 +349,7 @@ def _miss_mm(
 def _adjust(
     matched: Sequence[Matched],
     cameras: Mapping[str, CameraPose],
-    spheres: Mapping[int, SpherePlace],
+    spheres: Mapping[int, SpherePosition],
     start: Float64Array,
     valid: BoolArray,
     light_radius_mm: float,
@@ -375,17 +371,17 @@ def _adjust(
     radius = next(iter(spheres.values())).radius_mm
     to = 3 * np.array([place_of[int(light)] // 3 for light in light_of])
     H, r, robust, count = np.eye(total), np.zeros((1, 2)), np.ones(1), 1.0
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_MIRROR_STEPS):
         r, J = _highlight_rows(
             cameras, views, centers[sphere_of], radius, position[light_of], pixels
         )
         # a spot narrower than a pixel hides where in the pixel it is
         width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
-        usual = np.sqrt(FLOOR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
+        usual = np.sqrt(MIN_HIGHLIGHT_STDERR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
         z = r / usual
         sigma = max(1.4826 * float(np.median(np.abs(z))), 1e-6)
         size = np.linalg.norm(z, axis=1) / sigma
-        robust = np.where(size > HUBER, HUBER / np.maximum(size, HUBER), 1.0)
+        robust = np.where(size > HUBER_SIGMAS, HUBER_SIGMAS / np.maximum(size, HUBER_SIGMAS), 1.0)
         count = 2 * robust.sum() - total
         scale = np.sqrt((robust[:, None] * z**2).sum() / max(float(count), 1.0))
         w = robust[:, None] / (scale * usual) ** 2
@@ -406,7 +402,7 @@ def _adjust(
         step = -np.linalg.solve(H, g)
         position[lights] += step[:base].reshape(-1, 3)
         centers += step[base:].reshape(-1, 3)
-        if step @ H @ step < STOP:
+        if step @ H @ step < MIRROR_STEP_TOL:
             break
     inverse = np.linalg.inv(H)
     covariance = np.zeros((len(start), 3, 3))
@@ -428,7 +424,7 @@ def _highlight_rows(
 
     A light that the sphere cannot show any more (beyond its rim) has residual and derivative 0.
     """
-    steps = DERIVATIVE_MM * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])[:, None]
+    steps = DERIVATIVE_STEP_MM * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])[:, None]
     names = sorted(set(views))
     eyes = np.array([cameras[name].center_mm for name in names])[np.searchsorted(names, views)]
     lights, centers = lights_mm + steps[..., :3], centers_mm + steps[..., 3:]
@@ -444,7 +440,7 @@ def _highlight_rows(
         mine = views == name
         found[:, mine] = cameras[name].project(point[:, mine])
     residual = found[0] - pixels
-    J = np.moveaxis((found[1:7] - found[7:]) / (2 * DERIVATIVE_MM), 0, -1)
+    J = np.moveaxis((found[1:7] - found[7:]) / (2 * DERIVATIVE_STEP_MM), 0, -1)
     lost = ~(seen.all(axis=0) & np.isfinite(found).all(axis=(0, 2)))
     residual[lost], J[lost] = 0.0, 0.0
     return residual, J

@@ -19,33 +19,24 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
 
-__all__ = [
-    "SphereError",
-    "SpherePlace",
-    "contour",
-    "find_outline",
-    "locate_sphere",
-    "reflect",
-    "reflection_pixels",
-    "reflection_points",
-]
+__all__ = ["SphereError", "SpherePosition", "contour", "find_outline", "locate_sphere"]
 
 
-ANGLES = 180  # places on the outline where an edge is sought
-REACH = 0.12  # how far from the outline, of its radius, in the first search
-LEAST_REACH_PX = 3.0
+N_OUTLINE_ANGLES = 180  # places on the outline where an edge is sought
+EDGE_SEARCH_RADII = 0.12  # how far from the outline, of its radius, in the first search
+MIN_EDGE_SEARCH_PX = 3.0
 EDGE_STEP_PX = 0.25
 FINE_STEP_PX = 0.125
-FINE_REACH_PX = 1.5
+FINE_SEARCH_PX = 1.5
 FINE_WINDOW_PX = 9.0
 PIXEL_BLUR_PX = 0.5  # a pixel's square and the interpolation between pixels, as a Gaussian
-LEAST_EDGES = 30
-HUBER = 2.5
-GLARE = 1.15  # root of the brightest over the usual background along a line across the edge
-VOTES_STEP_PX = 2.0  # cells of the search for the sphere
-RADIUS_SIGMAS = 5.0
-STOP_RAD = 1e-12
-RADIUS_LIMIT = 0.002  # relative difference of the radius below which nothing is said
+MIN_OUTLINE_EDGES = 30
+HUBER_SIGMAS = 2.5
+# root of the brightest over the usual background along a line across the edge
+MAX_GLARE_RATIO = 1.15
+VOTE_CELL_PX = 2.0  # cells of the search for the sphere
+MAX_RADIUS_SIGMAS = 5.0
+MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius below which nothing is said
 
 
 class SphereError(CalibrationError):
@@ -53,7 +44,7 @@ class SphereError(CalibrationError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SpherePlace:
+class SpherePosition:
     """Where a sphere is.
 
     Attributes
@@ -107,16 +98,16 @@ def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> Float6
     direction = camera.rays(middle)
     range_mm = radius_mm / np.sin(np.arctan(radius_px / focal))
     center = camera.center_mm + range_mm * direction
-    reach = max(REACH * radius_px, LEAST_REACH_PX)
+    reach = max(EDGE_SEARCH_RADII * radius_px, MIN_EDGE_SEARCH_PX)
     for _ in range(3):
         edges = _edges(gray, camera, center, radius_mm, reach)
-        if len(edges) < LEAST_EDGES:
+        if len(edges) < MIN_OUTLINE_EDGES:
             return None
         center, sigma, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
-        reach = max(LEAST_REACH_PX, min(reach / 2, 8.0 * sigma))
+        reach = max(MIN_EDGE_SEARCH_PX, min(reach / 2, 8.0 * sigma))
     for _ in range(2):
         edges = _fine_edges(np.asarray(image, np.float64), camera, center, radius_mm)
-        if len(edges) < LEAST_EDGES:
+        if len(edges) < MIN_OUTLINE_EDGES:
             return None
         center, _, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
     return edges
@@ -128,7 +119,7 @@ def locate_sphere(
     radius_mm: float,
     *,
     check_radius: bool = True,
-) -> SpherePlace:
+) -> SpherePosition:
     """Locate one sphere from its outlines in one or several cameras.
 
     Parameters
@@ -143,7 +134,7 @@ def locate_sphere(
 
     Returns
     -------
-    SpherePlace
+    SpherePosition
 
     Raises
     ------
@@ -163,7 +154,9 @@ def locate_sphere(
         free_radius = float(free[3])
         free_stderr = float(free_sigma * np.sqrt(np.linalg.inv(free_H)[3, 3]))
         gap = abs(free_radius - radius_mm)
-        if check_radius and gap > max(RADIUS_SIGMAS * free_stderr, RADIUS_LIMIT * radius_mm):
+        if check_radius and gap > max(
+            MAX_RADIUS_SIGMAS * free_stderr, MAX_RADIUS_MISFIT * radius_mm
+        ):
             raise SphereError(
                 f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras say"
                 f" {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or calibrate the"
@@ -172,7 +165,7 @@ def locate_sphere(
     residual = np.concatenate(
         [_outline_px(cameras[n], edges, center, radius_mm) for n, edges in outlines.items()]
     )
-    return SpherePlace(
+    return SpherePosition(
         center[:3],
         radius_mm,
         np.asarray(sigma**2 * np.linalg.inv(H)),
@@ -203,108 +196,6 @@ def contour(
     return camera.project(touch + radius_mm * np.sqrt(1 - sine**2) * ring)
 
 
-def reflect(
-    camera: CameraPose, pixels: Float64Array, center_mm: Float64Array, radius_mm: float
-) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return where rays of pixels meet a sphere and where they go from there.
-
-    Parameters
-    ----------
-    camera : CameraPose
-    pixels : ndarray, shape (n, 2)
-    center_mm, radius_mm
-        The sphere.
-
-    Returns
-    -------
-    point_mm, direction : ndarray of float64, shape (n, 3)
-        Rig frame; the directions are unit vectors away from the sphere. NaN where not `hit`.
-    hit : ndarray of bool, shape (n,)
-    """
-    rays = camera.rays(pixels)
-    offset = camera.center_mm - center_mm
-    along = rays @ offset
-    square = along**2 - (offset @ offset - radius_mm**2)
-    hit = square > 0
-    t = np.where(hit, -along - np.sqrt(np.where(hit, square, 0.0)), np.nan)
-    point = camera.center_mm + t[:, None] * rays
-    normal = (point - center_mm) / radius_mm
-    return point, rays - 2 * np.sum(rays * normal, axis=1, keepdims=True) * normal, hit
-
-
-def reflection_points(
-    eyes_mm: Float64Array, centers_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
-) -> tuple[Float64Array, BoolArray]:
-    """Return where spheres show lights to eyes.
-
-    Parameters
-    ----------
-    eyes_mm, centers_mm, lights_mm : ndarray, shape (n, 3)
-        Centres of projection, of the spheres, and points outside the spheres.
-    radius_mm : float
-        Of the spheres.
-
-    Returns
-    -------
-    point_mm : ndarray of float64, shape (n, 3)
-    seen : ndarray of bool, shape (n,)
-        False where the point is turned away from the eye or the light.
-
-    Notes
-    -----
-    Alhazen's problem, solved by Newton's method, safeguarded by bisection, for the angle between
-    the normal and the direction to the eye.
-    """
-    r = radius_mm
-    to_eye, to_light = eyes_mm - centers_mm, lights_mm - centers_mm
-    D = np.linalg.norm(to_eye, axis=-1)
-    e = to_eye / D[:, None]
-    x = np.sum(to_light * e, axis=-1)
-    across = to_light - x[:, None] * e
-    y = np.linalg.norm(across, axis=-1)
-    across /= np.where(y > 0, y, 1.0)[:, None]
-    square = x**2 + y**2
-    low, high = np.zeros_like(D), np.arctan2(y, x)
-    angle = 0.5 * high
-    for _ in range(60):
-        # reflection: the angle at the normal to the eye equals that to the light
-        s, c = np.sin(angle), np.cos(angle)
-        eye_n, eye_t = D * c - r, D * s
-        light_n, light_t = x * c + y * s - r, y * c - x * s
-        miss = np.arctan2(eye_t, eye_n) - np.arctan2(light_t, light_n)
-        low, high = np.where(miss < 0, angle, low), np.where(miss < 0, high, angle)
-        slope = D * (D - r * c) / (eye_n**2 + eye_t**2)
-        slope += (square - r * (light_n + r)) / (light_n**2 + light_t**2)
-        newton = angle - miss / slope
-        new = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-        done = np.abs(new - angle).max(initial=0.0) < STOP_RAD
-        angle = new
-        if done:
-            break
-    normal = np.cos(angle)[:, None] * e + np.sin(angle)[:, None] * across
-    seen = (D * np.cos(angle) > r) & (np.sum(normal * to_light, axis=-1) > r)
-    return centers_mm + r * normal, seen
-
-
-def reflection_pixels(
-    camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
-) -> Float64Array:
-    """Return where a sphere shows lights to a camera, shape (n, 2); NaN where it does not.
-
-    Parameters
-    ----------
-    camera : CameraPose
-    center_mm, radius_mm
-        The sphere.
-    lights_mm : ndarray, shape (n, 3)
-        Points outside the sphere.
-    """
-    eyes = np.broadcast_to(camera.center_mm, lights_mm.shape)
-    centers = np.broadcast_to(center_mm, lights_mm.shape)
-    point, seen = reflection_points(eyes, centers, radius_mm, lights_mm)
-    return np.where(seen[:, None], camera.project(point), np.nan)
-
-
 def _vote(gray: Float64Array, radii_px: list[float]) -> tuple[Float64Array, float] | None:
     """Return middle and radius of the dark disc that most edges point away from."""
     smooth = gaussian_filter(gray, 1.5)
@@ -315,18 +206,18 @@ def _vote(gray: Float64Array, radii_px: list[float]) -> tuple[Float64Array, floa
     if not rows.size:
         return None
     ux, uy = gx[rows, columns] / size[rows, columns], gy[rows, columns] / size[rows, columns]
-    shape = tuple(int(n / VOTES_STEP_PX) + 1 for n in gray.shape)
+    shape = tuple(int(n / VOTE_CELL_PX) + 1 for n in gray.shape)
     best: tuple[float, Float64Array, float] | None = None
     for radius in radii_px:
-        x = ((columns - radius * ux) / VOTES_STEP_PX).astype(int)
-        y = ((rows - radius * uy) / VOTES_STEP_PX).astype(int)
+        x = ((columns - radius * ux) / VOTE_CELL_PX).astype(int)
+        y = ((rows - radius * uy) / VOTE_CELL_PX).astype(int)
         good = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
         votes = np.bincount(y[good] * shape[1] + x[good], minlength=shape[0] * shape[1])
         field = gaussian_filter(votes.reshape(shape).astype(float), max(0.03 * radius, 1.0))
         peak = int(np.argmax(field))
         if best is None or field.flat[peak] > best[0]:
             row, column = divmod(peak, shape[1])
-            middle = (np.array([column, row]) + 0.5) * VOTES_STEP_PX
+            middle = (np.array([column, row]) + 0.5) * VOTE_CELL_PX
             best = float(field.flat[peak]), middle, radius
     return (best[1], best[2]) if best is not None else None
 
@@ -355,7 +246,7 @@ def _edges(
     # edges much weaker than most are none, and lights near the rim or behind it make false ones
     strong = peak > 0.3 * np.median(peak[fine]) if fine.any() else fine
     background = np.median(lines[:, steps > 0])
-    dark = lines.max(axis=1) < GLARE * background
+    dark = lines.max(axis=1) < MAX_GLARE_RATIO * background
     return np.asarray(found[fine & inside & strong & dark])
 
 
@@ -376,7 +267,7 @@ def _fine_edges(
     steps = np.arange(-half, half + FINE_STEP_PX / 2, FINE_STEP_PX)
     places = outline[:, None] + steps[None, :, None] * outward[:, None]
     lines = map_coordinates(image, [places[..., 1], places[..., 0]], order=1, mode="nearest")
-    shifts = np.arange(-FINE_REACH_PX, FINE_REACH_PX + FINE_STEP_PX / 2, FINE_STEP_PX)
+    shifts = np.arange(-FINE_SEARCH_PX, FINE_SEARCH_PX + FINE_STEP_PX / 2, FINE_STEP_PX)
     power = np.stack(
         [np.sum((lines @ _edge_basis(steps, at)) ** 2, axis=1) for at in shifts], axis=1
     )
@@ -391,7 +282,7 @@ def _fine_edges(
     found = outline + offset[:, None] * outward
     outside, within = lines[:, steps > 1.5].mean(axis=1), lines[:, steps < -1.5].mean(axis=1)
     background = np.median(outside)
-    dark = lines.max(axis=1) < GLARE**2 * background
+    dark = lines.max(axis=1) < MAX_GLARE_RATIO**2 * background
     fine &= dark & (within < outside) & _in_image(found, image.shape, half)
     return np.asarray(found[fine])
 
@@ -418,7 +309,7 @@ def _outline(
     camera: CameraPose, center: Float64Array, radius_mm: float
 ) -> tuple[Float64Array, Float64Array]:
     """Return points of the expected outline, and unit vectors out of it."""
-    outline = contour(camera, center[:3], radius_mm, ANGLES)
+    outline = contour(camera, center[:3], radius_mm, N_OUTLINE_ANGLES)
     outward = outline - outline.mean(axis=0)
     return outline, outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
@@ -473,7 +364,7 @@ def _fit(
     for _ in range(30):
         r = residuals(sphere)
         sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
-        w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+        w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
         J = np.empty((len(r), len(sphere)))
         for k in range(len(sphere)):
             step = np.zeros(len(sphere))
@@ -485,6 +376,6 @@ def _fit(
         if np.linalg.norm(change) < 1e-7:
             break
     r = residuals(sphere)
-    w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+    w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
     noise = float(np.sqrt((w * r**2).sum() / max(w.sum() - len(sphere), 1.0)))
     return sphere, noise, H

@@ -12,15 +12,15 @@ from scipy.ndimage import binary_erosion
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.geometry.board import Sighting, find_markers
-from capture.calibration.geometry.bundle import BoardPlace
+from capture.calibration.geometry.board_pose import BoardPose
 
 __all__ = ["PlateSamples", "PlateWindow", "WhitePlate"]
 
 
-CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
-LEAST_PIXELS = 12  # of a part in an image
-LEAST_FILL = 0.5  # share of a part's pixels that must be usable
-EDGE_MM = 3.0  # of the bare white that is left alone, beside the markers
+PLATE_CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
+MIN_CELL_PIXELS = 12  # of a part in an image
+MIN_CELL_FILL = 0.5  # share of a part's pixels that must be usable
+MARKER_MARGIN_MM = 3.0  # of the bare white that is left alone, beside the markers
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class WhitePlate:
     @cached_property
     def bare_mm(self) -> tuple[Float64Array, Float64Array]:
         """Top left and bottom right corner of the bare white."""
-        inset = self.margin_mm + self.marker_mm + EDGE_MM
+        inset = self.margin_mm + self.marker_mm + MARKER_MARGIN_MM
         return np.array([inset, inset]), np.array(self.size_mm) - inset
 
     def find(self, image: NDArray) -> Sighting | None:
@@ -148,7 +148,7 @@ class PlateWindow:
     rotation: Float64Array
 
     @classmethod
-    def of(cls, camera: CameraPose, place: BoardPlace, plate: WhitePlate) -> PlateWindow | None:
+    def of(cls, camera: CameraPose, place: BoardPose, plate: WhitePlate) -> PlateWindow | None:
         """Return the window of a plate in a camera; None where it is not seen from its front."""
         normal = -place.rotation[:, 2]
         low, high = plate.bare_mm
@@ -168,13 +168,13 @@ class PlateWindow:
         eye = (camera.center_mm - place.translation_mm) @ place.rotation
         hit = eye[:2] - eye[2] * rays[..., :2] / rays[..., 2:]
         share = (hit - low) / (high - low)
-        cell = np.floor(share * CELLS).astype(np.int64)
+        cell = np.floor(share * PLATE_CELLS).astype(np.int64)
         inside = (share >= 0).all(axis=-1) & (share < 1).all(axis=-1)
         # a pixel is made of its neighbours, too: none of them may show a marker
         inside = binary_erosion(inside, iterations=2)
-        part = np.where(inside, cell[..., 1] * CELLS[0] + cell[..., 0], -1)
+        part = np.where(inside, cell[..., 1] * PLATE_CELLS[0] + cell[..., 0], -1)
         number = part[inside]
-        count = np.bincount(number, minlength=CELLS[0] * CELLS[1])
+        count = np.bincount(number, minlength=PLATE_CELLS[0] * PLATE_CELLS[1])
         safe = np.maximum(count, 1)
         means = [
             np.bincount(number, weights=values[inside], minlength=len(count)) / safe
@@ -221,7 +221,7 @@ class PlateWindow:
         values, spread = rgb[box][good], variance[box][good]
         mean = np.stack([np.bincount(number, weights=v, minlength=n) for v in values.T], axis=1)
         noise = np.stack([np.bincount(number, weights=v, minlength=n) for v in spread.T], axis=1)
-        kept = (count >= LEAST_PIXELS) & (count >= LEAST_FILL * self.count)
+        kept = (count >= MIN_CELL_PIXELS) & (count >= MIN_CELL_FILL * self.count)
         return PlateSamples(
             view,
             light,

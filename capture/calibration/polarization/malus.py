@@ -27,8 +27,8 @@ __all__ = [
 ]
 
 
-CONFIDENCE = 0.95
-LEAST_MODULATION_SIGMAS = 5.0
+CONFIDENCE_LEVEL = 0.95
+MIN_MODULATION_SIGMAS = 5.0
 MAX_JITTER = 0.3  # relative; a light less steady than this is out of order
 
 
@@ -332,7 +332,7 @@ def _fit_curve(
     m = float(np.hypot(b, c))
     along = np.array([0.0, b, c]) / max(m, np.finfo(float).tiny)
     m_error = float(np.sqrt(along @ covariance @ along))
-    if a <= 0 or m <= LEAST_MODULATION_SIGMAS * m_error:
+    if a <= 0 or m <= MIN_MODULATION_SIGMAS * m_error:
         raise PolarizationError(
             f"Malus series: the intensity does not follow the analyser (modulation {m:.3g} +-"
             f" {m_error:.2g} of a mean {a:.3g}); use a specular target (a metal or glass"
@@ -342,7 +342,7 @@ def _fit_curve(
     leak_slope = 2.0 * (m * np.array([1.0, 0.0, 0.0]) - a * along) / (a + m) ** 2
     leak = (a - m) / (a + m)
     leak_error = float(np.sqrt(leak_slope @ covariance @ leak_slope))
-    reach = float(student.ppf(0.5 + CONFIDENCE / 2, max(dof, 1))) * leak_error
+    reach = float(student.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(dof, 1))) * leak_error
     return (
         (0.5 * np.arctan2(c, b) + np.pi / 2) % np.pi - np.pi / 2,
         float(np.sqrt(across @ covariance @ across)),

@@ -11,7 +11,7 @@ from capture.calibration.sensor.transfer_curve import plane
 __all__ = ["Darks", "pool", "reduce_darks"]
 
 
-HOT_SIGMAS = 6.0
+HOT_PIXEL_SIGMAS = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def reduce_darks(
         residual = stack - level[:, None, None]
         average = residual.mean(axis=0)
         scale = 1.4826 * float(np.median(np.abs(average - np.median(average))))
-        ok = np.abs(average - np.median(average)) <= max(HOT_SIGMAS * scale, 1.0)
+        ok = np.abs(average - np.median(average)) <= max(HOT_PIXEL_SIGMAS * scale, 1.0)
         black.append(float(stack[:, ok].mean()))
         good.append(ok)
         squares += float(((residual - average) ** 2)[:, ok].sum())

@@ -10,7 +10,7 @@ from capture.raw import RawFrame
 
 __all__ = ["channel_levels", "neutral_mosaic"]
 
-_COLORS = "RGB"
+_COLOR_LETTERS = "RGB"
 
 
 def channel_levels(frame: RawFrame) -> Float64Array:
@@ -23,7 +23,7 @@ def channel_levels(frame: RawFrame) -> Float64Array:
         part = frame.cfa[cell // 2 :: 2, cell % 2 :: 2]
         level = (float(np.median(part)) - frame.black[cell]) / (frame.white - frame.black[cell])
         levels.setdefault(color, []).append(level)
-    return np.array([float(np.mean(levels[color])) for color in _COLORS])
+    return np.array([float(np.mean(levels[color])) for color in _COLOR_LETTERS])
 
 
 def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> Float32Array:
@@ -60,7 +60,7 @@ def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> Float32Array:
     out = np.empty(frame.cfa.shape, np.float32)
     for cell, name in enumerate(_pattern(frame)):
         at = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
-        scale = 1.0 / ((frame.white - frame.black[cell]) * rgb[_COLORS.index(name)])
+        scale = 1.0 / ((frame.white - frame.black[cell]) * rgb[_COLOR_LETTERS.index(name)])
         values = frame.cfa[at].astype(np.float32)
         out[at] = (values - np.float32(frame.black[cell])) * np.float32(scale)
     return out

@@ -30,7 +30,7 @@ __all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_trans
 
 
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
-FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
+N_FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +329,7 @@ def _fixed_pattern(
         ]
         spreads.append(pixel_response(sums[0], sums[1], block=block))
         total = np.where(good, sums[0] + sums[1], 0.0)
-        side = max(min(total.shape) // FLAT_BLOCKS, 1)
+        side = max(min(total.shape) // N_FLAT_BLOCKS, 1)
         count = block_sums(good.astype(np.float64), side)
         r, c = np.nonzero(count >= side * side / 2)
         values.append(block_sums(total, side)[r, c] / count[r, c])

@@ -26,10 +26,12 @@ __all__ = [
 ]
 
 
-LOW_SIGNAL_SHARE = 0.4  # of the white level: below it nothing saturates in a usable sensor
-COMPRESSED = 0.5  # variance over its prediction below which a block counts as saturated
-CLIP_SIGMAS = 6.0  # distance to saturation, in standard deviations, that a usable block keeps
-SPREAD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
+LOW_SIGNAL_LEVEL = 0.4  # of the white level: below it nothing saturates in a usable sensor
+# variance over its prediction below which a block counts as saturated
+SATURATED_VARIANCE_RATIO = 0.5
+# distance to saturation, in standard deviations, that a usable block keeps
+SATURATION_CLIP_SIGMAS = 6.0
+PIXEL_RESPONSE_SPREAD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
 
 
 class PhotonTransferError(CalibrationError):
@@ -283,18 +285,22 @@ def fit_curve(
             np.append(dof[chosen], dark_dof),
         )
 
-    line, covariance, chi2 = fit((x < LOW_SIGNAL_SHARE * range_dn) & ~clipped)
+    line, covariance, chi2 = fit((x < LOW_SIGNAL_LEVEL * range_dn) & ~clipped)
     if line[1] <= 0 or line[1] < 3.0 * np.sqrt(covariance[1, 1]):
         raise PhotonTransferError(
             f"photon transfer: the variance does not grow with the signal (slope {line[1]:.3g} DN);"
             " the frames were processed, or the darks and flats are not of this camera"
         )
     predicted = line[0] + line[1] * x
-    collapsed = (y < COMPRESSED * predicted) & (x > LOW_SIGNAL_SHARE * range_dn) & ~clipped
+    collapsed = (
+        (y < SATURATED_VARIANCE_RATIO * predicted) & (x > LOW_SIGNAL_LEVEL * range_dn) & ~clipped
+    )
     saturation, by = range_dn, "white level" if clipped.any() else "not reached"
     if collapsed.sum() >= 3:
         saturation, by = float(np.median(x[collapsed])), "full well"
-    room = CLIP_SIGMAS * np.sqrt(np.maximum(predicted, 0.0) + (SPREAD * x) ** 2)
+    room = SATURATION_CLIP_SIGMAS * np.sqrt(
+        np.maximum(predicted, 0.0) + (PIXEL_RESPONSE_SPREAD * x) ** 2
+    )
     line, covariance, chi2 = fit((x + room < saturation) & ~clipped)
     return CurveFit(
         offset_dn2=float(line[0]),

@@ -33,9 +33,9 @@ from capture.devices import wire
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger
 
 __all__ = [
+    "CAMERA_WIRE_VERSION",
     "MAX_BLOB_BYTES",
     "MAX_HEADER_BYTES",
-    "VERSION",
     "BadMessage",
     "blob_size",
     "check_blob",
@@ -47,7 +47,7 @@ __all__ = [
     "info_to_json",
 ]
 
-VERSION = 1
+CAMERA_WIRE_VERSION = 1
 MAX_HEADER_BYTES = 65_536
 MAX_BLOB_BYTES = 2**30
 

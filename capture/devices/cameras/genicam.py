@@ -35,7 +35,7 @@ from capture.devices.cameras.genicam_producer import (
 )
 from capture.devices.cameras.genicam_readout import prepare
 
-BUFFER_BYTES = 2**32
+MAX_BUFFER_BYTES = 2**32
 """Most memory for the frames of a sequence, which are fetched when it is over."""
 MIN_BUFFERS = 3
 STAMP_TOLERANCE_S = 1e-3
@@ -166,11 +166,12 @@ class GenicamCamera:
             features.set("TriggerSource", self._readout.line)
             features.set_if_there("TriggerActivation", "RisingEdge")
         size = int(features.read("PayloadSize"))
-        if (count + 1) * size > BUFFER_BYTES and count + 1 > MIN_BUFFERS:
+        if (count + 1) * size > MAX_BUFFER_BYTES and count + 1 > MIN_BUFFERS:
             raise CameraError(
                 f"{self._url}: {count} frames of {size / 1e6:.1f} MB that wait for the end of a "
-                f"sequence: got {count * size / 1e9:.1f} GB, expected {BUFFER_BYTES / 1e9:.1f} GB "
-                "at most; use a packed format or a smaller part of the sensor"
+                f"sequence: got {count * size / 1e9:.1f} GB, expected "
+                f"{MAX_BUFFER_BYTES / 1e9:.1f} GB at most; use a packed format or a smaller part "
+                "of the sensor"
             )
         with self._library.translated(f"{self._url}: arming"):
             least = max(self._acquirer.min_num_buffers, MIN_BUFFERS)

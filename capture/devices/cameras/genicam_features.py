@@ -8,9 +8,9 @@ from capture.devices.camera import CameraError
 from capture.devices.cameras.genicam_producer import Library
 
 # access modes of GenApi
-_NOT_THERE = (0, 1)
-_READABLE = (3, 4)
-_WRITABLE = (2, 4)
+_ABSENT_ACCESS_MODES = (0, 1)
+_READABLE_ACCESS_MODES = (3, 4)
+_WRITABLE_ACCESS_MODES = (2, 4)
 
 
 class Features:
@@ -33,11 +33,11 @@ class Features:
 
     def has(self, *names: str) -> bool:
         """Return whether the camera has all of these features now."""
-        return all(self._access(name) not in _NOT_THERE for name in names)
+        return all(self._access(name) not in _ABSENT_ACCESS_MODES for name in names)
 
     def writable(self, name: str) -> bool:
         """Return whether the feature can be set now."""
-        return self._access(name) in _WRITABLE
+        return self._access(name) in _WRITABLE_ACCESS_MODES
 
     def read(self, name: str, *instead: str) -> Any:
         """Return the value of the first of these features that the camera has.
@@ -48,7 +48,7 @@ class Features:
             When it has none of them.
         """
         for candidate in (name, *instead):
-            if self._access(candidate) in _READABLE:
+            if self._access(candidate) in _READABLE_ACCESS_MODES:
                 with self._library.translated(f"{self._where}: {candidate}"):
                     return getattr(self._nodes, candidate).value
         raise CameraError(
@@ -66,7 +66,7 @@ class Features:
             return []
         with self._library.translated(f"{self._where}: {name}"):
             entries = getattr(self._nodes, name).entries
-            return [e.symbolic for e in entries if e.get_access_mode() not in _NOT_THERE]
+            return [e.symbolic for e in entries if e.get_access_mode() not in _ABSENT_ACCESS_MODES]
 
     def number_of(self, name: str) -> int:
         """Return the number behind an enumeration's present value."""

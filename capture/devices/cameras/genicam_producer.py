@@ -19,11 +19,11 @@ from typing import Any
 from capture.devices.camera import CameraBusy, CameraError, CameraUrlError
 from capture.devices.port import LinkLost
 
-SEARCH_PATH = "GENICAM_GENTL64_PATH"
+PRODUCER_PATH_VARIABLE = "GENICAM_GENTL64_PATH"
 """Variable that lists the folders of producers (GenTL 1.6, section 3.3)."""
 
 # what a camera answers to a wrong request; anything else means that it does not answer
-_REFUSALS = (
+_REFUSAL_ERRORS = (
     "AccessException",
     "OutOfRangeException",
     "InvalidArgumentException",
@@ -34,7 +34,7 @@ _REFUSALS = (
     "NotImplementedException",
     "NotAvailableException",
 )
-_BUSY = ("AccessDeniedException", "ResourceInUseException", "BusyException")
+_BUSY_ERRORS = ("AccessDeniedException", "ResourceInUseException", "BusyException")
 
 # the library logs what it then raises, with a traceback; the error says it once
 _quiet = logging.getLogger("capture.genicam_library")
@@ -62,9 +62,9 @@ class Library:
         except self.errors as error:
             kind = type(error).__name__
             text = f"{doing}: {' '.join(str(error).split()) or kind}"
-            if kind in _BUSY:
+            if kind in _BUSY_ERRORS:
                 raise CameraBusy(f"{text}; close the other program that has the camera") from error
-            if kind in _REFUSALS:
+            if kind in _REFUSAL_ERRORS:
                 raise CameraError(text) from error
             raise LinkLost(
                 f"{text}; the camera does not answer: look at its cable and power, then open it "
@@ -105,7 +105,7 @@ def producer_files(url: str, given: str) -> tuple[Path, ...]:
     CameraUrlError
         When there is none.
     """
-    places = [given] if given else os.environ.get(SEARCH_PATH, "").split(os.pathsep)
+    places = [given] if given else os.environ.get(PRODUCER_PATH_VARIABLE, "").split(os.pathsep)
     folders = [Path(place) for place in places if place]
     files: dict[Path, None] = {}
     for folder in folders:
@@ -113,10 +113,15 @@ def producer_files(url: str, given: str) -> tuple[Path, ...]:
             if file.is_file():
                 files[file.resolve()] = None
     if not files:
-        where = f"in {', '.join(map(str, folders))}" if folders else f"as {SEARCH_PATH} is not set"
+        where = (
+            f"in {', '.join(map(str, folders))}"
+            if folders
+            else f"as {PRODUCER_PATH_VARIABLE} is not set"
+        )
         raise CameraUrlError(
             f"{url}: found no GenTL producer (*.cti) {where}; install the camera maker's software, "
-            f"then set {SEARCH_PATH} to the folder of its .cti file or add ?producer=FILE.cti"
+            f"then set {PRODUCER_PATH_VARIABLE} to the folder of its .cti file or add "
+            "?producer=FILE.cti"
         )
     return tuple(files)
 

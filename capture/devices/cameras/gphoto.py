@@ -25,9 +25,9 @@ from capture.devices.camera import (
     Trigger,
 )
 
-DRAIN_MS = 50
+EVENT_DRAIN_MS = 50
 """How long old events are waited for when the camera is armed, ms."""
-EVENT_MS = 500
+EVENT_TIMEOUT_MS = 500
 """Longest wait for one event, ms."""
 
 
@@ -145,7 +145,7 @@ class GphotoCamera:
         if count < 1:
             raise CameraError(f"count: got {count}, expected 1 or more")
         with self._translated():
-            while self._event(DRAIN_MS) is not None:
+            while self._event(EVENT_DRAIN_MS) is not None:
                 pass
         self._trigger = trigger
         self._seq = 0
@@ -203,7 +203,7 @@ class GphotoCamera:
                         f"gphoto2:{self._serial}: no new file came; is the box's trigger line "
                         "plugged into the camera?"
                     )
-                event = self._event(min(left_ms, EVENT_MS))
+                event = self._event(min(left_ms, EVENT_TIMEOUT_MS))
                 if event is not None and event[0] == self._library.GP_EVENT_FILE_ADDED:
                     return self._download(event[1])
 

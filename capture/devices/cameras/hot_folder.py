@@ -23,10 +23,10 @@ from capture.devices.camera import (
     Trigger,
 )
 
-POLL_S = 0.1
-SETTLED_S = 0.5
+FOLDER_POLL_S = 0.1
+FILE_SETTLE_S = 0.5
 """A file whose size has not changed for so long is taken to be whole."""
-SUFFIXES = frozenset(
+RAW_SUFFIXES = frozenset(
     ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw .kdc .dcr .iiq .3fr .rwl".split()
 )
 
@@ -150,14 +150,14 @@ class HotFolder:
                 known = sizes.get(path)
                 if known is None or known[0] != size:
                     sizes[path] = (size, now)
-                elif size and now - known[1] >= SETTLED_S:
+                elif size and now - known[1] >= FILE_SETTLE_S:
                     return self._take(path)
             if now >= deadline:
                 raise FrameTimeout(
                     f"hotfolder:{self._path}: no new raw file in {timeout_s:g} s; is the "
                     "tethering program writing there?"
                 )
-            self._sleep(POLL_S)
+            self._sleep(FOLDER_POLL_S)
 
     def abort(self) -> None:
         """Ignore what is in the folder."""
@@ -168,7 +168,7 @@ class HotFolder:
         """Nothing to let go of."""
 
     def _files(self) -> list[Path]:
-        return [p for p in self._path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+        return [p for p in self._path.iterdir() if p.suffix.lower() in RAW_SUFFIXES and p.is_file()]
 
     def _take(self, path: Path) -> Frame:
         self._seen.add(path)

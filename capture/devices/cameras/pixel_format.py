@@ -15,9 +15,9 @@ import numpy as np
 
 from capture.arrays import UInt8Array, UInt16Array
 
-_NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG))(8|10|12|14|16)(p|Packed|)")
-_PACKED = {"p": (10, 12, 14), "Packed": (10, 12)}
-_PATTERNS = {
+_FORMAT_NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG))(8|10|12|14|16)(p|Packed|)")
+_PACKED_BITS = {"p": (10, 12, 14), "Packed": (10, 12)}
+_CFA_PATTERNS = {
     "BayerRG": "RGGB",
     "BayerGR": "GRBG",
     "BayerGB": "GBRG",
@@ -155,13 +155,13 @@ def parse(name: str) -> PixelFormat | None:
     >>> parse("RGB8") is None
     True
     """
-    match = _NAME.fullmatch(name)
+    match = _FORMAT_NAME.fullmatch(name)
     if match is None:
         return None
     kind, bits, packing = match[1], int(match[2]), match[3]
-    if packing and bits not in _PACKED[packing]:
+    if packing and bits not in _PACKED_BITS[packing]:
         return None
-    return PixelFormat(name, _PATTERNS[kind], bits, packing)
+    return PixelFormat(name, _CFA_PATTERNS[kind], bits, packing)
 
 
 def deepest(names: list[str]) -> PixelFormat | None:

@@ -31,7 +31,7 @@ ANSWER_TIMEOUT_S = 5.0
 """How long an answer may take beyond what was asked for, s."""
 DEVELOP_TIMEOUT_S = 300.0
 """How long a frame may take from its arrival until its pixels are sent, s."""
-_KINDS = {"FrameTimeout": FrameTimeout, "CameraBusy": CameraBusy}
+_ERROR_CLASSES = {"FrameTimeout": FrameTimeout, "CameraBusy": CameraBusy}
 
 
 def open_camera(rest: str) -> Camera:
@@ -73,7 +73,7 @@ class RemoteCamera:
         except OSError as exc:
             raise LinkLost(f"cannot open {self._url}: {exc}; is it being served?") from exc
         try:
-            answer = self._ask("open", version=camera_wire.VERSION, view=view)
+            answer = self._ask("open", version=camera_wire.CAMERA_WIRE_VERSION, view=view)
             with self._understood():
                 self._info = camera_wire.info_from_json(answer["info"])
         except BaseException:
@@ -155,7 +155,7 @@ class RemoteCamera:
             self._drop()
             raise LinkLost(f"{self._url}: the link was lost in {what!r} ({exc})") from exc
         if answer.get("ok") is not True:
-            kind = _KINDS.get(str(answer.get("error")), CameraError)
+            kind = _ERROR_CLASSES.get(str(answer.get("error")), CameraError)
             raise kind(f"{self._url}: {answer.get('text', 'refused without a reason')}")
         return answer
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.plan.multiplexed import phase_grid
+from capture.plan.phases import phase_grid
 from capture.session import FrameRecord, Session
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from capture.calibration.fiber.darks import CameraNoise
-from capture.calibration.fiber.gains import FibreCalibration, FibreReflectance
+from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberReflectance
 from capture.calibration.fiber.readings import sum_spots
 from capture.calibration.sensor import SensorCalibration
 from capture.rig import Probe
@@ -65,7 +65,7 @@ class Profile:
     """What the fibres took at one placement."""
 
     measurement: Measurement
-    reflectance: FibreReflectance
+    reflectance: FiberReflectance
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,18 +175,18 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     ]
 
 
-def _fibres(evidence: Evidence) -> FibreCalibration | None:
+def _fibres(evidence: Evidence) -> FiberCalibration | None:
     rig = evidence.session.rig
     serial = rig.views[0].serial
     found = evidence.load("fibre", [serial], "nothing of the fibres")
     if found is None:
         evidence.assumed.remove("nothing of the fibres")
         return None
-    return FibreCalibration.from_calibration(found, rig, serial)
+    return FiberCalibration.from_calibration(found, rig, serial)
 
 
 def _profiles(
-    evidence: Evidence, fibres: FibreCalibration | None, sensor: Any
+    evidence: Evidence, fibres: FiberCalibration | None, sensor: Any
 ) -> Mapping[str, Any]:
     if fibres is None:
         raise EvidenceError("the fibres are not calibrated")

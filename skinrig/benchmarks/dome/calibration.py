@@ -100,7 +100,7 @@ def lights(*, toy: bool) -> StageBenchmark:
     dome = build(rig, seed=SEED)
     scene = target_scene("mirror", rig, seed=SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
-    spheres: dict[int, mirror_sphere.SpherePlace] = {}
+    spheres: dict[int, mirror_sphere.SpherePosition] = {}
     seen: list[mirror_lights.Highlights] = []
     most = 4
     for number in range(most):
@@ -115,8 +115,8 @@ def lights(*, toy: bool) -> StageBenchmark:
 
         def call(
             rows: Sequence[mirror_lights.Highlights] = rows,
-            some: dict[int, mirror_sphere.SpherePlace] = some,
-        ) -> mirror_lights.LightPlaces:
+            some: dict[int, mirror_sphere.SpherePosition] = some,
+        ) -> mirror_lights.LightPositions:
             return mirror_lights.locate_lights(rows, cameras, some, nominal)
 
         result = call()
@@ -142,7 +142,7 @@ def _add_sphere(
     rig: Rig,
     cameras: dict[str, CameraPose],
     number: int,
-    spheres: dict[int, mirror_sphere.SpherePlace],
+    spheres: dict[int, mirror_sphere.SpherePosition],
     seen: list[mirror_lights.Highlights],
 ) -> None:
     """Add one place of the sphere and its highlights."""

@@ -7,7 +7,7 @@ from functools import partial
 
 from capture.plan.eye_light import eye_light
 from capture.plan.flicker import FlickerReport, flicker_of_rows
-from capture.plan.light_order import ORDERS, best_order
+from capture.plan.light_order import LIGHT_ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
@@ -24,7 +24,7 @@ def light_order(*, toy: bool) -> StageBenchmark:
     rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if toy else rig
     limits = rig.leds or LedLimits()
     points, found = [], {}
-    orders: dict[str, Callable[[Rig], list[int]]] = dict(ORDERS)
+    orders: dict[str, Callable[[Rig], list[int]]] = dict(LIGHT_ORDERS)
     orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
     for name, order in orders.items():
         timing, shown = measure(partial(order, rig), repeats=1), order(rig)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 
-from capture.plan.multiplexed import multiplexed_plan, phases
+from capture.plan.multiplexed import multiplexed_plan
+from capture.plan.phases import phases
 from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN

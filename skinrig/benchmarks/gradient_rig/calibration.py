@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from capture.calibration.fiber.spot_photometry import Shot, shot
-from capture.calibration.led_sphere.survey import SphereSurvey, survey_sphere
+from capture.calibration.led_sphere.findings import SphereSurvey
+from capture.calibration.led_sphere.survey import survey_sphere
 from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import Rig, load_rig

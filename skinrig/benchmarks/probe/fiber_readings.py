@@ -9,8 +9,8 @@ import numpy as np
 
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
 from capture.calibration.fiber.merge import color_masks
-from capture.calibration.fiber.readings import FibreReadings, read_fibres
-from capture.calibration.fiber.spots import FibreSpots
+from capture.calibration.fiber.readings import FiberReadings, read_fibers
+from capture.calibration.fiber.spots import FiberSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
 from skinrig.arrays import Float64Array, UInt16Array
@@ -36,7 +36,7 @@ class _Bench:
     frames: list[Frames]
     """Of each draw, all exposures."""
     times: Float64Array
-    spots: FibreSpots
+    spots: FiberSpots
     darks: DarkModel
     noise: CameraNoise
     rate: Float64Array
@@ -55,7 +55,7 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
     for count in (1, 3, 8, 23) if toy else COUNTS:
         chosen = _spread(len(bench.times), count)
 
-        def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FibreReadings:
+        def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FiberReadings:
             return _read(bench, chosen, draw)
 
         results = [call(draw=draw) for draw in range(len(bench.frames))]
@@ -133,7 +133,7 @@ def _bench(*, draws: int) -> _Bench:
         rate[mask] = (np.tensordot(light[:, c], images, 1) * response)[mask]
     names = tuple(fibre.name for fibre in rig.probe.fibres) if rig.probe else ()
     count = np.full(len(names), 1.0)
-    spots = FibreSpots(
+    spots = FiberSpots(
         names,
         build.spot_px,
         np.zeros((len(names), 2)),
@@ -165,9 +165,9 @@ def _bench(*, draws: int) -> _Bench:
     return _Bench(frames, times, spots, model, noise, rate, truth)
 
 
-def _read(bench: _Bench, chosen: Sequence[int], draw: int) -> FibreReadings:
+def _read(bench: _Bench, chosen: Sequence[int], draw: int) -> FiberReadings:
     frames = [bench.frames[draw][k] for k in chosen]
-    return read_fibres(
+    return read_fibers(
         frames, bench.times[list(chosen)], spots=bench.spots, darks=bench.darks, noise=bench.noise
     )
 

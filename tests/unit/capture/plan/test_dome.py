@@ -11,15 +11,15 @@ from capture.plan.dome import as_table, dome_calibration_plan, dome_plan, tracki
 from capture.plan.dose import BLUE_LIMIT_J_M2_SR, dose_report
 from capture.plan.eye_light import EYES_MM, eye_light, radiant_intensity
 from capture.plan.flicker import (
-    SAMPLE_S,
+    EYE_SAMPLE_S,
+    average_over_flicker_fusion,
     band_rms,
     count_flashes,
     eye_signal,
     flicker_of_rows,
     flicker_report,
-    fused,
 )
-from capture.plan.light_order import ORDERS, best_order, compare_orders
+from capture.plan.light_order import LIGHT_ORDERS, best_order, compare_orders
 from capture.plan.rows import LedRow, led_rows, lights_of, passes
 from capture.rig import LedLimits, Light, RigError, load_rig
 
@@ -91,7 +91,7 @@ def test_steady_light_does_not_flicker():
 
 def test_light_faster_than_fusion_is_not_counted_as_flashes():
     signal = np.tile([0.0, 2.0], 4000)  # 500 Hz
-    seen = fused(signal)
+    seen = average_over_flicker_fusion(signal)
     assert np.ptp(seen[100:-100]) < 0.2 * 2.0
     assert count_flashes(seen[100:-100], least=0.2 * 2.0) == 0.0
     assert band_rms(signal) < 1e-6
@@ -106,8 +106,8 @@ def test_the_light_at_the_eyes_integrates_to_what_the_rows_give():
     ]
     signal = eye_signal(rows, weights, overlap_s=0.0)
     given = sum(row.level * row.dwell_s * weights[row.leds[0]] for row in rows)
-    assert signal.sum() * SAMPLE_S == pytest.approx(given, rel=1e-9)
-    longer = eye_signal(rows, weights, overlap_s=1e-3).sum() * SAMPLE_S
+    assert signal.sum() * EYE_SAMPLE_S == pytest.approx(given, rel=1e-9)
+    longer = eye_signal(rows, weights, overlap_s=1e-3).sum() * EYE_SAMPLE_S
     extra = sum(row.level * 1e-3 * weights[row.leds[0]] for row in rows[1:])
     assert longer - given == pytest.approx(extra, rel=1e-6)
 
@@ -116,7 +116,7 @@ def test_dark_gaps_and_bad_orders_flicker_and_the_chosen_order_does_not():
     dwell_s = 1.0 / 12.0
     found = compare_orders(DOME, dwell_s=dwell_s)
     gaps = []
-    for light in ORDERS["spiral"](DOME):
+    for light in LIGHT_ORDERS["spiral"](DOME):
         gaps += [LedRow((light,), 1.0, 0.7 * dwell_s), LedRow((), 0.0, 0.3 * dwell_s)]
     with_gaps = flicker_of_rows(gaps, eye_light(DOME))
     assert with_gaps.rms > 2.0 * found["spiral"].rms
@@ -125,13 +125,13 @@ def test_dark_gaps_and_bad_orders_flicker_and_the_chosen_order_does_not():
     assert best.rms < 0.06 < found["nearest"].rms
     assert best.flashes_per_s <= 0.5
     assert not found["name"].within(DOME.leds)
-    assert best_order(DOME, dwell_s=dwell_s) == ORDERS["rise and fall"](DOME)
+    assert best_order(DOME, dwell_s=dwell_s) == LIGHT_ORDERS["rise and fall"](DOME)
 
 
-@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("name", LIGHT_ORDERS)
 def test_an_order_shows_every_light_once(name):
     for rig in (DOME, DOME.subset(lights=["L003", "L070"]), DOME.subset(lights=["L003"])):
-        assert sorted(ORDERS[name](rig)) == list(range(len(rig.lights)))
+        assert sorted(LIGHT_ORDERS[name](rig)) == list(range(len(rig.lights)))
 
 
 def test_going_slower_by_itself_does_not_cure_a_bad_order():

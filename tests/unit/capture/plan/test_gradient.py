@@ -21,7 +21,7 @@ from capture.plan.gradient import (
     states,
 )
 from capture.plan.rows import led_rows, passes, pattern_shares
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")
@@ -96,7 +96,7 @@ def test_a_state_is_eight_patterns_parallel_and_the_same_crossed():
             assert index["pattern"] == settings["pattern"]
             assert index["polarizer"] == settings["polarizer"]
             assert state_name(index["angle"], index["caliper"]) == name
-    assert sorted(SCAN_ORDER) == sorted(PATTERNS)
+    assert sorted(SCAN_ORDER) == sorted(LIGHT_PATTERNS)
     assert plan.step("a045-m2-par-x").index["caliper"] == -2
     assert plan.step("a045-p3-cro--z").settings["pattern"] == "-z"
 
@@ -137,7 +137,9 @@ def test_the_duty_is_that_of_light_summed_in_small_steps_of_time(led):
 def test_light_flickers_less_from_bright_to_dark_than_by_name():
     plan = gradient_plan(RIG, angles=[0], steps=(0, 0), darks=0)
     halves = [plan.steps[:8], plan.steps[8:]]
-    by_name = [sorted(half, key=lambda s: PATTERNS.index(s.settings["pattern"])) for half in halves]
+    by_name = [
+        sorted(half, key=lambda s: LIGHT_PATTERNS.index(s.settings["pattern"])) for half in halves
+    ]
     other = Plan(plan.rig, tuple(step for half in by_name for step in half), plan.limits)
     assert flicker_report(plan, RIG).flashes_per_s < flicker_report(other, RIG).flashes_per_s
     assert flicker_report(plan, RIG).flashes_per_s < RIG.leds.max_flashes_per_s

@@ -13,12 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from capture.plan import Plan, PlanError, flash_plan
-from capture.plan.multiplexed import (
-    ReadOutError,
-    course_plan,
+from capture.plan.multiplexed import ReadOutError, course_plan, image_s, multiplexed_plan
+from capture.plan.phases import (
     equivalent_period_s,
-    image_s,
-    multiplexed_plan,
     period_for,
     phase_grid,
     phases,

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from capture.plan import Plan, PlanError, Step
-from capture.plan.fiber_light import fibre_light
+from capture.plan.fiber_light import fiber_light
 from capture.plan.probe import (
-    MASK_LONGEST_S,
+    MAX_MASK_EXPOSURE_S,
     all_series,
     exposure_series_s,
     probe_calibration_plan,
     probe_plan,
 )
-from capture.plan.suction import SLACK_S, placement_of, room_s, spans
+from capture.plan.suction import WIRE_SLACK_S, placement_of, room_s, spans
 from capture.rig import load_rig
 
 RIG = load_rig("probe")
@@ -82,10 +82,10 @@ def test_no_suction_of_a_plan_is_longer_than_skin_bears_and_none_is_cut_early():
         found = spans(seconds, PROBE)
         assert [k for span in found for k in span] == list(range(len(seconds)))
         for span in found:
-            used_s = sum(seconds[k] + SLACK_S for k in span)
+            used_s = sum(seconds[k] + WIRE_SLACK_S for k in span)
             assert used_s <= room_s(PROBE) or len(span) == 1
         for one, other in itertools.pairwise(found):
-            both_s = sum(seconds[k] + SLACK_S for k in one) + seconds[other[0]] + SLACK_S
+            both_s = sum(seconds[k] + WIRE_SLACK_S for k in one) + seconds[other[0]] + WIRE_SLACK_S
             assert both_s > room_s(PROBE)
 
 
@@ -115,7 +115,7 @@ def test_a_calibration_has_the_whole_series_and_each_fibre_uncovered_alone():
     assert sorted(by_fibre) == list(range(28))
     for seconds in by_fibre.values():
         np.testing.assert_allclose(np.diff(np.log2(seconds)), 2.0)
-        assert MASK_LONGEST_S / 4 < seconds[-1] <= MASK_LONGEST_S
+        assert MAX_MASK_EXPOSURE_S / 4 < seconds[-1] <= MAX_MASK_EXPOSURE_S
         assert set(seconds) <= set(exposure_series_s())
     # one placement serves the series and all covers
     assert {placement_of(s) for s in (*kinds["phantom"], *kinds["mask"])} == {
@@ -132,17 +132,17 @@ def test_a_plan_goes_through_json_unchanged():
 
 def test_light_is_power_times_open_time_and_a_smaller_cone_is_worse_for_an_eye():
     plan = probe_plan(RIG, sites=["cheek", "chin"], darks=3)
-    light = fibre_light(plan, RIG)
+    light = fiber_light(plan, RIG)
     given_ws = 2 * sum(exposure_series_s()) * RIG.lights[0].power_w
     assert light.led_ws == pytest.approx(given_ws)
     assert light.placement_ws == pytest.approx(given_ws / 2)
     narrow = dataclasses.replace(
         RIG, probe=dataclasses.replace(PROBE, source_numerical_aperture=0.11)
     )
-    assert fibre_light(plan, narrow).stare_s == pytest.approx(light.stare_s / 4)
+    assert fiber_light(plan, narrow).stare_s == pytest.approx(light.stare_s / 4)
     dim = probe_plan(RIG, sites=["cheek", "chin"], darks=3, level=0.5)
-    assert fibre_light(dim, RIG).led_ws == pytest.approx(given_ws / 2)
-    assert fibre_light(dim, RIG).stare_s == pytest.approx(2 * light.stare_s)
+    assert fiber_light(dim, RIG).led_ws == pytest.approx(given_ws / 2)
+    assert fiber_light(dim, RIG).stare_s == pytest.approx(2 * light.stare_s)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from capture.plan import Plan
 from capture.plan.gradient import gradient_plan
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from skinrig.cli import main
 from skinrig.planning import gradient, plans
@@ -50,7 +50,7 @@ def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, caps
     document = json.loads(capsys.readouterr().out)
     plan = Plan.from_json(file.read_text())
     assert document["reached"]
-    assert {step.index["pattern"] for step in plan.steps} < set(PATTERNS)
+    assert {step.index["pattern"] for step in plan.steps} < set(LIGHT_PATTERNS)
     assert any("complement" in why or "told without" in why for _, why in document["left_out"])
     # what was tried before, and is quicker, did not reach it
     *before, last = document["path"]

@@ -16,7 +16,7 @@ from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import DeviceError, LinkLost, Port
 from capture.plan import Plan, Step
 from capture.plan.gradient import gradient_calibration_plan, gradient_plan, state_of, states
-from capture.plan.steps import PATTERNS
+from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
 from rigsim.world.faults import Faults
@@ -37,7 +37,7 @@ class Witness:
         image = np.full((16, 16), 64, np.uint16)
         image[0, 0] += len(pops)
         for pop in pops:
-            image[1, 0] = 1 + PATTERNS.index(pop.pattern)
+            image[1, 0] = 1 + LIGHT_PATTERNS.index(pop.pattern)
             image[1, 1] = round(pop.analyser_deg)
             image[1, 2] = round(1000 * pop.level)
             image[1, 3] = round(1e5 * (pop.t_off_s - pop.t_on_s))
@@ -140,7 +140,7 @@ def check_frames(session):
         lit = settings["pattern"] != "dark"
         assert cfa[0, 0] == 64 + lit, record.step_id
         if lit:
-            assert cfa[1, 0] == 1 + PATTERNS.index(settings["pattern"]), record.step_id
+            assert cfa[1, 0] == 1 + LIGHT_PATTERNS.index(settings["pattern"]), record.step_id
             assert cfa[1, 1] == reading_deg(record.step), record.step_id
             assert cfa[1, 2] == round(1000 * settings["level"])
             assert cfa[1, 3] == round(1e5 * settings["exposure_s"])
@@ -159,7 +159,7 @@ def check_frames(session):
 
 
 def test_every_frame_shows_its_pattern_and_its_state(make):
-    bench = make(short(steps=(-1, 1), patterns=PATTERNS))
+    bench = make(short(steps=(-1, 1), patterns=LIGHT_PATTERNS))
     done = bench.run()
     assert (done.frames, done.retakes, done.stale) == (len(bench.plan.steps), 0, 0)
     assert check_frames(bench.session) == dict.fromkeys([name for name, _ in states(bench.plan)], 1)
@@ -218,7 +218,7 @@ def test_a_whole_plan_ends_where_skin_buckles_and_comes_off_at_every_angle(make)
 
 
 def test_a_capture_takes_the_time_that_its_plan_says_and_that_of_finding_home(make):
-    bench = make(short(patterns=PATTERNS))
+    bench = make(short(patterns=LIGHT_PATTERNS))
     homing = []
     honest = bench.caliper.home
 
@@ -235,7 +235,7 @@ def test_a_capture_takes_the_time_that_its_plan_says_and_that_of_finding_home(ma
 
 
 def test_a_scan_goes_by_in_the_time_that_the_plan_gives_it(make):
-    bench = make(short(steps=(0, 0), patterns=PATTERNS))
+    bench = make(short(steps=(0, 0), patterns=LIGHT_PATTERNS))
     bench.run()
     times = [r.line.t_box_s for r in bench.session.frames("gradient")]
     assert times[-1] - times[0] == pytest.approx(15 * 0.031 + 0.15, abs=0.005)
@@ -400,7 +400,7 @@ def test_a_new_taping_is_counted_and_its_neutral_pictured(make):
     about = bench.session.attachment_line("neutral-a000-2.dng").about
     assert (about["attachment"], about["state"]) == (2, "a000_n0")
     frame = raw.decode(bench.session.attachment("neutral-a000-2.dng"))
-    assert frame.cfa[1, 0] == 1 + PATTERNS.index("full")
+    assert frame.cfa[1, 0] == 1 + LIGHT_PATTERNS.index("full")
     assert (frame.cfa[2, 1], frame.cfa[2, 2], frame.cfa[2, 3]) == (1000, 1000, 1)
 
 

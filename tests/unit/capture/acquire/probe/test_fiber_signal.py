@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture.acquire.probe.fiber_signal import FibreSignal, said_of
+from capture.acquire.probe.fiber_signal import FiberSignal, describe_fibers
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
 
@@ -39,7 +39,7 @@ def frame(rates, exposure_s, rng, *, dark_e=0.0, hot=0):
 
 
 def looked(rates, rng, count=EVERY, **more):
-    signal = FibreSignal(PROBE, VIEW)
+    signal = FiberSignal(PROBE, VIEW)
     for exposure_s in SERIES_S[:count]:
         signal.look(frame(rates, exposure_s, rng, **more), exposure_s)
     return signal
@@ -73,7 +73,7 @@ def test_what_all_exposures_left_would_not_show_is_given_up_and_named(rng):
     verdict = looked(rates, rng).verdict([1e-3])
     assert verdict.enough
     assert set(verdict.hopeless) == {(26, c) for c in range(3)} | {(27, c) for c in range(3)}
-    assert said_of(verdict.hopeless, PROBE) == (
+    assert describe_fibers(verdict.hopeless, PROBE) == (
         "red of F27, F28; green of F27, F28; blue of F27, F28"
     )
 

@@ -9,14 +9,15 @@ from scipy.stats import chi2
 
 from capture.calibration import store
 from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk
-from capture.calibration.fiber.gains import FibreCalibration, FibreError, calibrate_fibres
+from capture.calibration.fiber.gains import calibrate_fibers
 from capture.calibration.fiber.phantom import (
     CertificateError,
     ExpectedReflectance,
     read_certificate,
 )
-from capture.calibration.fiber.readings import FibreReadings
-from capture.calibration.fiber.spots import FibreSpots
+from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberError
+from capture.calibration.fiber.readings import FiberReadings
+from capture.calibration.fiber.spots import FiberSpots
 from capture.calibration.record import CalibrationMismatch
 from capture.rig import load_rig
 
@@ -40,7 +41,7 @@ def spots(found=None):
     place = np.array([fibre.spot_px for fibre in RIG.probe.fibres])
     row = np.full(28, 13.0)
     found = np.ones(28, bool) if found is None else found
-    return FibreSpots(NAMES, place, np.full((28, 2), 0.02), row, 0.01 * row, 0.1 * row, found, 17.0)
+    return FiberSpots(NAMES, place, np.full((28, 2), 0.02), row, 0.01 * row, 0.1 * row, found, 17.0)
 
 
 def mixing(rng, neighbor=1e-3, far=2e-5):
@@ -69,7 +70,7 @@ class Probe:
         signal = mean + np.sqrt(variance) * self.rng.normal(size=mean.shape)
         full = np.zeros((28, 3), bool)
         full[list(saturated)] = True
-        return FibreReadings(
+        return FiberReadings(
             NAMES,
             np.where(full, 0, signal),
             np.where(full, 0, variance),
@@ -84,7 +85,7 @@ class Probe:
 
     def calibrate(self, *, expected=None, level=1.0, masks=None, **about):
         expected = expected or ExpectedReflectance(PHANTOM, np.zeros((28, 3)))
-        return calibrate_fibres(
+        return calibrate_fibers(
             self.read(PHANTOM, level=level, **about),
             self.masks() if masks is None else masks,
             spots=spots(),
@@ -238,10 +239,10 @@ def test_what_the_certificate_leaves_open_moves_all_fibres_together(rng):
 
 def test_readings_of_no_light_cannot_calibrate(rng):
     probe = Probe(rng, dead=range(28), stray=0.0)
-    with pytest.raises(FibreError, match="no fibre gives light"):
+    with pytest.raises(FiberError, match="no fibre gives light"):
         probe.calibrate()
     bright = Probe(rng)
-    with pytest.raises(FibreError, match="saturated in every exposure; take shorter"):
+    with pytest.raises(FiberError, match="saturated in every exposure; take shorter"):
         bright.calibrate(saturated=range(28))
 
 
@@ -249,7 +250,7 @@ def test_readings_of_another_probe_are_refused(rng):
     probe = Probe(rng)
     calibration = probe.calibrate()
     readings = probe.read(SKIN)
-    other = FibreReadings(
+    other = FiberReadings(
         tuple(reversed(NAMES)),
         readings.signal,
         readings.variance,
@@ -258,9 +259,9 @@ def test_readings_of_another_probe_are_refused(rng):
         readings.around,
         (1.0,),
     )
-    with pytest.raises(FibreError, match="expected those of the calibration"):
+    with pytest.raises(FiberError, match="expected those of the calibration"):
         calibration.reflectance(other)
-    with pytest.raises(FibreError, match="level: got 0"):
+    with pytest.raises(FiberError, match="level: got 0"):
         calibration.reflectance(readings, level=0.0)
 
 
@@ -272,14 +273,14 @@ def test_a_calibration_survives_its_file(rng, tmp_path):
         serial="SP-0001", rig="probe", source="simulated", created=date(2026, 11, 21)
     )
     store.save(record, tmp_path)
-    back = FibreCalibration.load(tmp_path, RIG, on=date(2026, 11, 22))
+    back = FiberCalibration.load(tmp_path, RIG, on=date(2026, 11, 22))
     readings = probe.read(SKIN)
     one, two = made.reflectance(readings), back.reflectance(readings)
     for name in ("reflectance_per_mm2", "variance", "common_per_mm2", "valid"):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name), rtol=1e-12)
     assert back.names == made.names
     with pytest.raises(CalibrationMismatch, match="expected 'fibre' of 'flash'"):
-        FibreCalibration.from_calibration(record, load_rig("flash"), "SP-0001")
+        FiberCalibration.from_calibration(record, load_rig("flash"), "SP-0001")
 
 
 CERTIFICATE = {

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from capture import hdr
 from capture.calibration.fiber.darks import DarkError, measure_darks
 from capture.calibration.fiber.merge import merge_series
-from capture.calibration.fiber.readings import read_fibres, sum_spots
-from capture.calibration.fiber.spots import FibreSpots
+from capture.calibration.fiber.readings import read_fibers, sum_spots
+from capture.calibration.fiber.spots import FiberSpots
 from capture.hdr import BracketError
 
 FALSE_ALARM = 1e-5
@@ -18,7 +18,7 @@ FALSE_ALARM = 1e-5
 
 def spots_of(camera, aperture_px=17.0):
     row = np.full(28, 13.0)
-    return FibreSpots(
+    return FiberSpots(
         camera.names,
         camera.places,
         np.full((28, 2), 0.02),
@@ -31,7 +31,7 @@ def spots_of(camera, aperture_px=17.0):
 
 
 def read(camera, frames, times, darks, **about):
-    return read_fibres(
+    return read_fibers(
         frames, times, spots=spots_of(camera), darks=darks, noise=camera.noise, **about
     )
 
@@ -236,7 +236,7 @@ def test_a_camera_without_colors_is_read_as_one(fibre_camera, brackets_s):
     gray = dataclasses.replace(camera.noise, pattern="MONO")
     light = np.full((28, 3), 50.0)
     frames = camera.series(light, brackets_s)
-    readings = read_fibres(
+    readings = read_fibers(
         frames, brackets_s, spots=spots_of(camera), darks=camera.darks(), noise=gray
     )
     truth = camera.own_light(light, spots_of(camera)).sum(axis=1, keepdims=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.calibration.fiber.merge import merge_series
-from capture.calibration.fiber.spots import SpotError, find_fibre_spots
+from capture.calibration.fiber.spots import SpotError, find_fiber_spots
 
 SHORT_S = (0.01, 1.0, 30.0)
 
@@ -16,7 +16,7 @@ def merged(camera, light, times=SHORT_S):
 
 
 def find(camera, light, **about):
-    return find_fibre_spots(
+    return find_fiber_spots(
         merged(camera, light), camera.nominal, names=camera.names, pattern="RGGB", **about
     )
 

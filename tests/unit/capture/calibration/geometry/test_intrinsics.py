@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from capture.calibration import geometry, store
-from capture.calibration.geometry import board, bundle, moved_camera
+from capture.calibration.geometry import board, bundle, bundle_equations, moved_camera
 from capture.calibration.geometry.board import Board, BoardError, Sighting, calibrate_intrinsics
+from capture.calibration.geometry.board_pose import BoardPose
+from capture.calibration.geometry.bundle_equations import LensPrior
 from capture.calibration.geometry.intrinsics import CameraPose
 from capture.rig import load_rig
 
@@ -22,12 +24,12 @@ def bent(camera, distortion=LENS):
 
 def boards_in_view(rng, count):
     """Places of the board around the origin; the first in the jig."""
-    places = {0: bundle.BoardPlace.in_jig(BOARD)}
+    places = {0: BoardPose.in_jig(BOARD)}
     for pose in range(1, count):
         turn = cv2.Rodrigues(rng.uniform(-0.7, 0.7, 3))[0]
         rotation = turn @ places[0].rotation
         middle = np.array([*np.array(BOARD.size_mm) / 2, 0.0])
-        places[pose] = bundle.BoardPlace(rotation, rng.uniform(-15, 15, 3) - rotation @ middle)
+        places[pose] = BoardPose(rotation, rng.uniform(-15, 15, 3) - rotation @ middle)
     return places
 
 
@@ -143,13 +145,13 @@ def test_the_derivatives_of_the_bundle_are_those_of_the_projection(rng):
     camera = bent(CameraPose.nominal(DOME.views[2]))
     place = boards_in_view(rng, 2)[1]
     points = BOARD.points_mm[::5]
-    of_camera, of_place = bundle._derivatives(camera, place, points)
+    of_camera, of_place = bundle_equations._derivatives(camera, place, points)
     start = geometry.nominal_cameras(DOME.subset(views=["C02"]))
-    problem = bundle._Problem(
+    problem = bundle_equations.BundleProblem(
         {("C02", 1): Sighting(np.arange(24), np.zeros((24, 2)))},
         BOARD,
         start,
-        bundle.LensPrior(),
+        LensPrior(),
         "cameras",
     )
     for k, derivative in [(k, of_camera[..., k]) for k in range(15)] + [
@@ -220,7 +222,7 @@ def test_distortion_left_out_shows_in_the_reprojection(rng):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07", "C08"]))
     true = {name: bent(camera, np.array([-0.3, 0, 0, 0, 0])) for name, camera in nominal.items()}
     seen = sightings_of(true, boards_in_view(rng, 8), rng, 0.05)
-    blind = bundle.LensPrior(k1=0.0, k2=0.0, tangential=0.0)
+    blind = LensPrior(k1=0.0, k2=0.0, tangential=0.0)
     without = bundle.adjust(seen, BOARD, nominal, prior=blind)
     found = bundle.adjust(seen, BOARD, nominal)
     assert max(found.rms_px.values()) < 0.1

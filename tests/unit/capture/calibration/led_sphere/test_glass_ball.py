@@ -12,8 +12,8 @@ from capture.calibration.led_sphere.glass_ball import (
     find_spots,
     light_directions,
     locate_ball,
-    mirrored,
 )
+from capture.calibration.led_sphere.mirrored_lights import mirror_lights
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")
@@ -26,7 +26,7 @@ ALARM = 1e-3
 
 
 def seen(center_mm, places, radius_mm=6.0, camera=CAMERA):
-    return mirrored(camera, np.asarray(center_mm, float), radius_mm, places).pixels
+    return mirror_lights(camera, np.asarray(center_mm, float), radius_mm, places).pixels
 
 
 def sphere(rng, scatter_mm=1.5):
@@ -154,7 +154,7 @@ def test_spots_are_found_to_a_pixel(rng):
 
 def test_the_magnification_is_that_of_a_convex_mirror_on_its_axis():
     light = np.array([[0.0, 0.0, 600.0]])
-    shown = mirrored(CAMERA, BEHIND, 6.0, light)
+    shown = mirror_lights(CAMERA, BEHIND, 6.0, light)
     # thin mirror of focal length R / 2: the image of a light s away stands f s / (s + f) behind
     behind = 3.0 * 597.0 / 600.0
     size = behind / 597.0  # mm of image for a mm of light

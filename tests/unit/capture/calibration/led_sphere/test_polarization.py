@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration.geometry.intrinsics import CameraPose
-from capture.calibration.led_sphere.glass_ball import mirrored
+from capture.calibration.led_sphere.mirrored_lights import mirror_lights
 from capture.calibration.led_sphere.polarization import fit_films, leakage
 from capture.calibration.polarization.malus import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection
@@ -26,7 +26,7 @@ def reflection(eta, to_light, to_camera):
     )
 
 
-SHOWN = mirrored(CAMERA, np.array([0.0, 0.0, -3.0]), 6.0, PLACE)
+SHOWN = mirror_lights(CAMERA, np.array([0.0, 0.0, -3.0]), 6.0, PLACE)
 GLASS = reflection(1.52, SHOWN.to_light, SHOWN.to_camera)
 SKIN = reflection(
     1.4, PLACE / np.linalg.norm(PLACE, axis=1, keepdims=True), np.tile([0.0, 0.0, 1.0], (132, 1))

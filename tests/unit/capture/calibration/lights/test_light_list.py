@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from capture.calibration.geometry.intrinsics import CameraPose, nominal_cameras
-from capture.calibration.lights import light_fit, mirror_lights, mirror_sphere
+from capture.calibration.lights import light_fit, mirror_lights, mirror_sphere, reflection
 from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 from capture.calibration.lights.light_list import CameraResponse, LightTable
-from capture.calibration.lights.mirror_sphere import SphereError, SpherePlace
+from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.rig import load_rig
 
@@ -73,10 +73,10 @@ def test_reflections_obey_the_law_of_reflection(rng):
     center = np.array([20.0, -10.0, 5.0])
     lights = rng.standard_normal((60, 3))
     lights *= 700 / np.linalg.norm(lights, axis=1, keepdims=True)
-    pixels = mirror_sphere.reflection_pixels(camera, center, RADIUS_MM, lights)
+    pixels = reflection.reflection_pixels(camera, center, RADIUS_MM, lights)
     seen = np.isfinite(pixels).all(axis=1)
     assert seen.sum() > 40
-    point, direction, hit = mirror_sphere.reflect(camera, pixels[seen], center, RADIUS_MM)
+    point, direction, hit = reflection.reflect(camera, pixels[seen], center, RADIUS_MM)
     assert hit.all()
     np.testing.assert_allclose(np.linalg.norm(point - center, axis=1), RADIUS_MM, rtol=1e-9)
     expected = lights[seen] - point
@@ -125,7 +125,7 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
     true = {name: place + rng.normal(0, 2.5, 3) for name, place in lights.items()}
     spheres, seen = {}, []
     for number, center in enumerate([[-85.0, 45, 30], [85.0, -45, -30], [0.0, 0, 20]]):
-        spheres[number] = SpherePlace(
+        spheres[number] = SpherePosition(
             np.array(center) + rng.normal(0, 0.01, 3),
             RADIUS_MM,
             1e-4 * np.eye(3),
@@ -135,7 +135,7 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
             views,
         )
         for view in views:
-            pixels = mirror_sphere.reflection_pixels(
+            pixels = reflection.reflection_pixels(
                 CAMERAS[view], np.array(center), RADIUS_MM, np.array(list(true.values()))
             )
             good = np.isfinite(pixels).all(axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.calibration.geometry.intrinsics import CameraPose
-from capture.calibration.led_sphere.glass_ball import mirrored
+from capture.calibration.led_sphere.mirrored_lights import mirror_lights
 from capture.calibration.polarization import polarized_reflection
 from capture.calibration.polarization.malus import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection, fresnel_amplitudes
@@ -21,7 +21,7 @@ BALL = np.array([0.3, -0.2, -2.8])
 
 def by_ball(eta=1.52, lights=RIG.lights):
     place = np.array([light.position_mm for light in lights])
-    shown = mirrored(CAMERA, BALL, 6.0, place)
+    shown = mirror_lights(CAMERA, BALL, 6.0, place)
     return Reflection.of(
         lights,
         CAMERA,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from capture.calibration.fiber.gains import FibreReflectance
+from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
 from model import photon_table
@@ -34,7 +34,7 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
     slope = common * (RADIUS - RADIUS.mean())[:, None] * np.ones(3)
     return probe_stages.Profile(
         Measurement(Placement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
-        FibreReflectance(
+        FiberReflectance(
             tuple(fibre.name for fibre in PROBE.fibres),
             RADIUS,
             value,

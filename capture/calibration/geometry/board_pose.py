@@ -1,0 +1,59 @@
+"""Poses of a flat target: where it stood, and how far its corners are from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from capture.arrays import Float64Array
+from capture.calibration.geometry.board import Board, Sighting
+from capture.calibration.geometry.intrinsics import CameraPose
+
+__all__ = ["BoardPose", "Target", "gaps_px"]
+
+
+class Target(Protocol):
+    """A flat target with known points."""
+
+    @property
+    def points_mm(self) -> Float64Array:
+        """Points in the target's own axes, shape (N, 3), z = 0."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardPose:
+    """Where a board stood: ``x_rig = rotation x_board + translation_mm``."""
+
+    rotation: Float64Array
+    translation_mm: Float64Array
+
+    def to_rig(self, points_mm: Float64Array) -> Float64Array:
+        """Return points of the board in the rig frame."""
+        return points_mm @ self.rotation.T + self.translation_mm
+
+    @classmethod
+    def in_jig(cls, board: Board) -> BoardPose:
+        """Return the jig's place: the board's middle in the rig's origin, its front towards +z."""
+        width, height = board.size_mm
+        rotation = np.diag([1.0, -1.0, -1.0])
+        return cls(rotation, -rotation @ np.array([width / 2, height / 2, 0.0]))
+
+
+def gaps_px(
+    camera: CameraPose, place: BoardPose, board: Target, sighting: Sighting
+) -> Float64Array:
+    """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
+    found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
+    return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
+
+
+def motion_between(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Array]:
+    """Return the rigid motion that takes place a to place b."""
+    rotation = b.rotation @ a.rotation.T
+    return rotation, b.translation_mm - rotation @ a.translation_mm
+
+
+def move_pose(place: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
+    return BoardPose(rotation @ place.rotation, rotation @ place.translation_mm + shift)

@@ -1,0 +1,115 @@
+"""Reflection in a sphere: where rays go from it, and where it shows a light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.arrays import BoolArray, Float64Array
+from capture.calibration.geometry import CameraPose
+
+__all__ = ["reflect", "reflection_pixels", "reflection_points"]
+
+
+REFLECTION_TOL_RAD = 1e-12
+
+
+def reflect(
+    camera: CameraPose, pixels: Float64Array, center_mm: Float64Array, radius_mm: float
+) -> tuple[Float64Array, Float64Array, BoolArray]:
+    """Return where rays of pixels meet a sphere and where they go from there.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    pixels : ndarray, shape (n, 2)
+    center_mm, radius_mm
+        The sphere.
+
+    Returns
+    -------
+    point_mm, direction : ndarray of float64, shape (n, 3)
+        Rig frame; the directions are unit vectors away from the sphere. NaN where not `hit`.
+    hit : ndarray of bool, shape (n,)
+    """
+    rays = camera.rays(pixels)
+    offset = camera.center_mm - center_mm
+    along = rays @ offset
+    square = along**2 - (offset @ offset - radius_mm**2)
+    hit = square > 0
+    t = np.where(hit, -along - np.sqrt(np.where(hit, square, 0.0)), np.nan)
+    point = camera.center_mm + t[:, None] * rays
+    normal = (point - center_mm) / radius_mm
+    return point, rays - 2 * np.sum(rays * normal, axis=1, keepdims=True) * normal, hit
+
+
+def reflection_points(
+    eyes_mm: Float64Array, centers_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
+) -> tuple[Float64Array, BoolArray]:
+    """Return where spheres show lights to eyes.
+
+    Parameters
+    ----------
+    eyes_mm, centers_mm, lights_mm : ndarray, shape (n, 3)
+        Centres of projection, of the spheres, and points outside the spheres.
+    radius_mm : float
+        Of the spheres.
+
+    Returns
+    -------
+    point_mm : ndarray of float64, shape (n, 3)
+    seen : ndarray of bool, shape (n,)
+        False where the point is turned away from the eye or the light.
+
+    Notes
+    -----
+    Alhazen's problem, solved by Newton's method, safeguarded by bisection, for the angle between
+    the normal and the direction to the eye.
+    """
+    r = radius_mm
+    to_eye, to_light = eyes_mm - centers_mm, lights_mm - centers_mm
+    D = np.linalg.norm(to_eye, axis=-1)
+    e = to_eye / D[:, None]
+    x = np.sum(to_light * e, axis=-1)
+    across = to_light - x[:, None] * e
+    y = np.linalg.norm(across, axis=-1)
+    across /= np.where(y > 0, y, 1.0)[:, None]
+    square = x**2 + y**2
+    low, high = np.zeros_like(D), np.arctan2(y, x)
+    angle = 0.5 * high
+    for _ in range(60):
+        # reflection: the angle at the normal to the eye equals that to the light
+        s, c = np.sin(angle), np.cos(angle)
+        eye_n, eye_t = D * c - r, D * s
+        light_n, light_t = x * c + y * s - r, y * c - x * s
+        miss = np.arctan2(eye_t, eye_n) - np.arctan2(light_t, light_n)
+        low, high = np.where(miss < 0, angle, low), np.where(miss < 0, high, angle)
+        slope = D * (D - r * c) / (eye_n**2 + eye_t**2)
+        slope += (square - r * (light_n + r)) / (light_n**2 + light_t**2)
+        newton = angle - miss / slope
+        new = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        done = np.abs(new - angle).max(initial=0.0) < REFLECTION_TOL_RAD
+        angle = new
+        if done:
+            break
+    normal = np.cos(angle)[:, None] * e + np.sin(angle)[:, None] * across
+    seen = (D * np.cos(angle) > r) & (np.sum(normal * to_light, axis=-1) > r)
+    return centers_mm + r * normal, seen
+
+
+def reflection_pixels(
+    camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
+) -> Float64Array:
+    """Return where a sphere shows lights to a camera, shape (n, 2); NaN where it does not.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    center_mm, radius_mm
+        The sphere.
+    lights_mm : ndarray, shape (n, 3)
+        Points outside the sphere.
+    """
+    eyes = np.broadcast_to(camera.center_mm, lights_mm.shape)
+    centers = np.broadcast_to(center_mm, lights_mm.shape)
+    point, seen = reflection_points(eyes, centers, radius_mm, lights_mm)
+    return np.where(seen[:, None], camera.project(point), np.nan)

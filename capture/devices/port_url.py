@@ -1,0 +1,46 @@
+"""Serial ports by URL: handlers, names, and what to do where one does not open."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import importlib.metadata
+
+import serial
+
+from capture.devices.errors import PortBusy
+
+__all__ = ["serial_ports"]
+
+
+URL_HANDLERS = "capture.urlhandlers"
+
+
+def serial_ports() -> list[str]:
+    """Return the names of this machine's serial ports, sorted."""
+    from serial.tools import list_ports
+
+    return sorted(str(port.device) for port in list_ports.comports())
+
+
+def load_url_handler(url: str) -> None:
+    """Make the entry point that serves the scheme of `url` known to pyserial."""
+    scheme, separator, _ = url.partition("://")
+    if not separator:
+        return
+    for entry_point in importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme.lower()):
+        # pyserial swallows an ImportError of its handlers; here it shows
+        importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
+        if entry_point.value not in serial.protocol_handler_packages:
+            serial.protocol_handler_packages.append(entry_point.value)
+
+
+def opening_advice(url: str, kind: type[Exception], number: int | None) -> str:
+    """Return what to do about a port that does not open."""
+    if kind is PortBusy:
+        return "another program holds it"
+    if number == errno.EACCES:
+        return "no right to it: on Debian join the group dialout and log in again"
+    if "://" in url:
+        return "does a server listen there?"
+    return "is it plugged in?"

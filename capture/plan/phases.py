@@ -1,0 +1,276 @@
+"""The phases of a cycle that a train of shots meets.
+
+Periods are taken as the decimals they are written with, and counted as fractions: which phases a
+sequence meets is a question of common measures, which rounded numbers do not have.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+
+from capture.documents import Fault, shown
+from capture.plan.steps import Plan, PlanError, Step, require
+
+__all__ = [
+    "PhaseGrid",
+    "Phases",
+    "Seconds",
+    "equivalent_period_s",
+    "exact",
+    "period_for",
+    "phase_grid",
+    "phases",
+    "reorder",
+    "timed_steps",
+]
+
+
+Seconds = int | float | str | Decimal | Fraction
+"""A time; numbers count as the decimals that they are printed as."""
+
+
+MIN_PHASES = 8
+"""With fewer, four in each half of the cycle, nothing can be said of what lies between."""
+
+
+_MAX_PERIOD_DENOMINATOR = 10**6
+"""Largest denominator of a period in s; finer ones are rounded to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseGrid:
+    """Which phases of a cycle a train of shots can meet."""
+
+    cycle_s: Fraction
+    """Time after which the subject does the same again, s."""
+    shot_period_s: Fraction
+    """Time from shot to shot, s."""
+    distinct: int
+    """Number of phases; from there on they repeat."""
+    interval_s: Fraction
+    """Time between neighbouring phases, all of them met, s: the effective sampling interval."""
+
+    @property
+    def aliased(self) -> bool:
+        """Whether so few phases are met that what lies between the states cannot be seen."""
+        return self.distinct < MIN_PHASES
+
+
+def exact(value: Seconds) -> Fraction:
+    """Return a time as the fraction that its decimal notation means.
+
+    Examples
+    --------
+    >>> exact(5.25), exact("0.1") + exact(0.2)
+    (Fraction(21, 4), Fraction(3, 10))
+
+    Raises
+    ------
+    PlanError
+        For what is no finite number.
+    """
+    try:
+        number = Fraction(value if isinstance(value, Fraction) else str(value))
+    except (ValueError, ZeroDivisionError) as exc:
+        fault = Fault("seconds", shown(value), "a finite number")
+        raise PlanError("cannot plan", faults=[fault]) from exc
+    return number.limit_denominator(_MAX_PERIOD_DENOMINATOR)
+
+
+def phase_grid(prompt_period_s: Seconds, shot_period_s: Seconds) -> PhaseGrid:
+    """Return the phases that shots meet of a subject who changes with every prompt.
+
+    Parameters
+    ----------
+    prompt_period_s
+        Time from prompt to prompt, s, > 0; the cycle is twice as long.
+    shot_period_s
+        Time from shot to shot, s, > 0.
+
+    Examples
+    --------
+    >>> [phase_grid(5, period).distinct for period in (5.5, 10.25, 5, 10)]
+    [20, 40, 2, 1]
+    >>> float(phase_grid(5, 10.25).interval_s)
+    0.25
+    """
+    prompt, shot = exact(prompt_period_s), exact(shot_period_s)
+    require(prompt > 0, "prompt_period_s", prompt_period_s, "seconds > 0")
+    require(shot > 0, "shot_period_s", shot_period_s, "seconds > 0")
+    cycle = 2 * prompt
+    interval = _common_measure(cycle, shot)
+    return PhaseGrid(cycle, shot, int(cycle / interval), interval)
+
+
+def equivalent_period_s(
+    prompt_period_s: Seconds, shot_period_s: Seconds, read_out_s: Seconds
+) -> Fraction:
+    """Return the shortest period a camera can keep that meets the same phases as another one, s.
+
+    Half cycles are added until the camera can follow: a whole number of them lets the phases meet
+    in another order at most; an odd one may change their number, and is passed over where it does.
+
+    Parameters
+    ----------
+    prompt_period_s, shot_period_s
+        See :func:`phase_grid`.
+    read_out_s
+        Shortest time from shot to shot, s.
+
+    Examples
+    --------
+    >>> float(equivalent_period_s(5, 5.25, 5.5)), float(equivalent_period_s(5, 2.5, 5.5))
+    (10.25, 7.5)
+    """
+    grid, shortest = phase_grid(prompt_period_s, shot_period_s), exact(read_out_s)
+    half = grid.cycle_s / 2
+    halves = max(0, math.ceil((shortest - grid.shot_period_s) / half))
+    for more in (halves, halves + 1):
+        period = grid.shot_period_s + more * half
+        if phase_grid(prompt_period_s, period).distinct == grid.distinct:
+            return period
+    raise AssertionError("a whole cycle more meets the same phases")  # pragma: no cover
+
+
+def period_for(prompt_period_s: Seconds, interval_s: Seconds, read_out_s: Seconds) -> Fraction:
+    """Return the shortest period a camera can keep that samples a cycle every ``interval_s``, s.
+
+    Examples
+    --------
+    >>> float(period_for(5, 0.5, 5.5)), float(period_for(5, "0.25", 5.5))
+    (5.5, 5.75)
+
+    Raises
+    ------
+    PlanError
+        Where the interval is no whole part of the cycle.
+    """
+    cycle, interval = 2 * exact(prompt_period_s), exact(interval_s)
+    whole = interval > 0 and (cycle / interval).denominator == 1
+    require(whole, "interval_s", interval_s, f"a whole part of the cycle of {float(cycle):g} s")
+    phases = int(cycle / interval)
+    steps = max(1, math.ceil(exact(read_out_s) / interval))
+    while math.gcd(steps, phases) != 1:
+        steps += 1
+    return steps * interval
+
+
+@dataclass(frozen=True, slots=True)
+class Phases:
+    """Which phases of its cycle a sequence covers."""
+
+    cycle_s: float
+    """Time after which the subject does the same again, s."""
+    covered_s: tuple[float, ...]
+    """Distinct phases that are met, s, in order."""
+    repeats: tuple[int, ...]
+    """How often each is met, >= 1."""
+    captures: int
+    """Number of shots."""
+    possible: int
+    """How many phases such a train of shots would meet if it went on."""
+    interval_s: float
+    """Time between neighbours of those, s."""
+    largest_gap_s: float
+    """Longest stretch of the cycle without a shot, s."""
+
+    @property
+    def distinct(self) -> int:
+        """Number of phases that are met."""
+        return len(self.covered_s)
+
+    @property
+    def aliased(self) -> bool:
+        """Whether shot and prompt periods meet too few phases, however long the sequence is."""
+        return self.possible < MIN_PHASES
+
+    def __str__(self) -> str:
+        again = self.captures - self.distinct
+        text = (
+            f"{self.captures} captures meet {self.distinct} distinct phases of the "
+            f"{self.cycle_s:g} s cycle, {again} of them again: sampled every {self.interval_s:g} s,"
+            f" largest gap {self.largest_gap_s:g} s"
+        )
+        if self.aliased:
+            text += (
+                f"; the periods alias: only {self.possible} phases can be met, "
+                "choose a shot period that has less in common with the cycle"
+            )
+        return text
+
+
+def phases(plan: Plan) -> Phases:
+    """Return which phases of its cycle the shots of a multiplexed plan meet.
+
+    Raises
+    ------
+    PlanError
+        For a plan without prompts.
+
+    Examples
+    --------
+    >>> from capture.plan.multiplexed import multiplexed_plan
+    >>> from capture.rig import load_rig
+    >>> print(phases(multiplexed_plan(load_rig("flash"), shot_period_s=10.25)))
+    44 captures meet 40 distinct phases of the 10 s cycle, 4 of them again: sampled every 0.25 s, \
+largest gap 0.25 s
+    """
+    shots = timed_steps(plan)
+    cycle = 2 * exact(plan.limits.get("prompt_period_s", 0.0))
+    require(cycle > 0 and bool(shots), "plan", plan.rig, "a plan of multiplexed_plan")
+    grid = phase_grid(cycle / 2, exact(plan.limits["shot_period_s"]))
+    met: dict[Fraction, int] = {}
+    for step in shots:
+        phase = exact(float(step.settings["start_s"])) % cycle
+        met[phase] = met.get(phase, 0) + 1
+    covered = sorted(met)
+    around = [*covered[1:], covered[0] + cycle]
+    return Phases(
+        cycle_s=float(cycle),
+        covered_s=tuple(float(phase) for phase in covered),
+        repeats=tuple(met[phase] for phase in covered),
+        captures=len(shots),
+        possible=grid.distinct,
+        interval_s=float(grid.interval_s),
+        largest_gap_s=float(max(b - a for a, b in zip(covered, around, strict=True))),
+    )
+
+
+def timed_steps(plan: Plan) -> tuple[Step, ...]:
+    """Return the steps of a plan that are to be taken at a time."""
+    return tuple(step for step in plan.steps if "start_s" in step.settings)
+
+
+def reorder(plan: Plan, *, phases_s: Mapping[str, float] | None = None) -> tuple[Step, ...]:
+    """Return the shots of a multiplexed plan in the order of their phases.
+
+    Parameters
+    ----------
+    plan : Plan
+    phases_s : mapping of str to float, optional
+        Phase, s, at which each step was really taken, by its id; steps that it lacks are left
+        out. Without it, as planned.
+
+    Examples
+    --------
+    >>> from capture.plan.multiplexed import multiplexed_plan
+    >>> from capture.rig import load_rig
+    >>> plan = multiplexed_plan(load_rig("flash"))
+    >>> [(s.index["number"], s.index["phase_s"]) for s in reorder(plan)[:4]]
+    [(0, 0.0), (20, 0.0), (11, 0.5), (2, 1.0)]
+    """
+    shots: Sequence[Step] = timed_steps(plan)
+    if phases_s is not None:
+        known = [step for step in shots if step.id in phases_s]
+        return tuple(sorted(known, key=lambda step: phases_s[step.id]))
+    return tuple(sorted(shots, key=lambda step: float(step.index["phase_s"])))
+
+
+def _common_measure(a: Fraction, b: Fraction) -> Fraction:
+    """Return the greatest time of which both are whole multiples."""
+    numerator = math.gcd(a.numerator * b.denominator, b.numerator * a.denominator)
+    return Fraction(numerator, a.denominator * b.denominator)
