@@ -18,7 +18,7 @@ from rigsim.needs.effect_sizes import (
     most_irradiance,
     spread_over_noise,
 )
-from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, Noise, SceneEffects, SceneNeeds, absent, decide, unmodeled
 from rigsim.needs.flash import (
     BOUNCES,
     FAR_LIGHT,
@@ -49,11 +49,7 @@ def dome_needs(
     white_rgb: FloatArray | None,
     movement: bool,
     motion: HeadMotion | None,
-    subsurface: bool | None,
-    interreflections: bool | None,
-    spectral: bool | None,
-    optics: bool | None,
-    relief_shadows: bool | None,
+    effects: SceneEffects,
     subpixels: int,
 ) -> SceneNeeds:
     """Decide what a scene in the dome builds.
@@ -73,8 +69,8 @@ def dome_needs(
         light, full scales, shape (3,); None: the brightest skin is taken as full.
     movement, motion
         Whether the face moves with its state, and how the head does.
-    subsurface, interreflections, spectral, optics, relief_shadows
-        What is asked for; None lets the sizes decide.
+    effects
+        What is asked for.
     subpixels
         Rays along each side of a pixel.
     """
@@ -85,7 +81,7 @@ def dome_needs(
         ("light from the dome's frame and from other LEDs' lenses", "they are black"),
     ]
     illuminant = rig.lights[0].illuminant
-    focus = lens(view, illuminant, caster, noise, 1.0, subpixels, optics)
+    focus = lens(view, illuminant, caster, noise, 1.0, subpixels, effects.optics)
     if isinstance(subject, Target):
         size = 0.0 if exchange_share(caster) == 0.0 else float("inf")
         because = "the target is flat" if size == 0.0 else "the target has hollows"
@@ -109,7 +105,7 @@ def dome_needs(
     bounces = decide(
         BOUNCES,
         float(unseen.max()),
-        interreflections,
+        effects.interreflections,
         switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )
@@ -120,7 +116,7 @@ def dome_needs(
         decide(
             LATERAL,
             float(spread_over_noise(lost, level, noise).max()),
-            subsurface,
+            effects.lateral,
             switch="subsurface",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
@@ -128,7 +124,7 @@ def dome_needs(
         decide(
             SPECTRAL,
             float(off.max()),
-            spectral,
+            effects.spectral,
             switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built
@@ -136,7 +132,7 @@ def dome_needs(
         ),
         further_bounces(bounces, share * float(brightest.max())),
         focus,
-        wrinkles(subject, noise, 1.0, relief_shadows),
+        wrinkles(subject, noise, 1.0, effects.relief_shadows),
     ]
     made += _movement(subject, movement, motion, view)
     made += absent(

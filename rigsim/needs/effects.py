@@ -9,9 +9,9 @@ without to check that.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -33,6 +33,9 @@ MEANING: Final[dict[str, str]] = {
     "unmodeled": "a real rig has it and it may change pixels: the simulator cannot build it",
 }
 """What each verdict says."""
+
+SWITCH_FIELDS: Final[dict[str, str]] = {"subsurface": "lateral", "shadows": "relief_shadows"}
+"""Fields of `SceneEffects` for the switches that a rig names otherwise."""
 
 
 class NeedsError(ValueError):
@@ -97,6 +100,43 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
+class SceneEffects:
+    """Effects of light that a scene is asked to build: True, False, or None by their sizes.
+
+    A scene ignores the fields that its rig does not have.
+
+    Examples
+    --------
+    >>> SceneEffects.from_switches({"subsurface": False, "optics": True}).lateral
+    False
+    """
+
+    lateral: bool | None = None
+    """Light that spreads sideways inside the skin."""
+    interreflections: bool | None = None
+    """Light that goes from skin to skin."""
+    spectral: bool | None = None
+    """That light reflected wavelength by wavelength."""
+    optics: bool | None = None
+    """Blur and diffraction of the lens."""
+    relief_shadows: bool | None = None
+    """Shadows that the relief casts on itself; of a face, its wrinkles' after it has moved."""
+    spectral_step: int | None = None
+    """Interreflections use every n-th of the table's wavelengths; None: as the needs decide."""
+    last_bounce: float | None = None
+    """Share of the first bounce at which summing ends; None: as the needs decide."""
+
+    @classmethod
+    def from_switches(cls, switches: Mapping[str, Any]) -> SceneEffects:
+        """Return the effects that switches ask for, see `Effect.switch`."""
+        return cls(**{SWITCH_FIELDS.get(name, name): asked for name, asked in switches.items()})
+
+
+EFFECTS_BY_SIZE: Final = SceneEffects()
+"""Every effect that is large enough to change pixels, and no other."""
+
+
+@dataclass(frozen=True, slots=True)
 class Effect:
     """One effect of light on a picture."""
 
@@ -110,7 +150,7 @@ class Effect:
     """Largest change of a pixel over its noise as the scene's rule tells it; None: the rule needs
     no number."""
     switch: str = ""
-    """Argument of the scene that builds it or not, which is how it is checked; empty: none."""
+    """Name for `SceneEffects.from_switches`, which is how it is checked; empty: none."""
 
     def __post_init__(self) -> None:
         """Refuse a verdict that the number contradicts."""
@@ -241,7 +281,7 @@ def decide(
     asked
         True builds it, False leaves it out, None decides by its size.
     switch
-        Argument of the scene.
+        See `Effect.switch`.
     because
         What the size follows from.
 

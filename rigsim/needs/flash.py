@@ -19,7 +19,16 @@ from rigsim.needs.effect_sizes import (
     most_irradiance,
     spread_over_noise,
 )
-from rigsim.needs.effects import ENOUGH, Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.effects import (
+    ENOUGH,
+    Effect,
+    Noise,
+    SceneEffects,
+    SceneNeeds,
+    absent,
+    decide,
+    unmodeled,
+)
 from rigsim.render import Caster
 from rigsim.render.depth_of_field import facing_depths, lens_spread
 from rigsim.subject import Subject
@@ -65,11 +74,7 @@ def flash_needs(
     white_rgb: FloatArray,
     weights_mm2: FloatArray,
     movement: bool,
-    lateral: bool | None,
-    interreflections: bool | None,
-    spectral: bool | None,
-    optics: bool | None,
-    relief_shadows: bool | None,
+    effects: SceneEffects,
     subpixels: int,
     share: float | None = None,
 ) -> SceneNeeds:
@@ -93,8 +98,8 @@ def flash_needs(
         Each light's energy over the sum that such a plate gets, mm^2, shape (L,).
     movement
         Whether the face moves with its state.
-    lateral, interreflections, spectral, optics, relief_shadows
-        What is asked for; None lets the sizes decide.
+    effects
+        What is asked for.
     subpixels
         Rays along each side of a pixel.
     share
@@ -107,7 +112,15 @@ def flash_needs(
         made += _of_target(subject, caster)
         if subject.kind not in ("source", "cap"):
             made.append(
-                lens(view, illuminant, caster, noise, float(white_rgb.max()), subpixels, optics)
+                lens(
+                    view,
+                    illuminant,
+                    caster,
+                    noise,
+                    float(white_rgb.max()),
+                    subpixels,
+                    effects.optics,
+                )
             )
             made += unmodeled(FAR_LIGHT)
         else:
@@ -132,7 +145,7 @@ def flash_needs(
     bounces = decide(
         BOUNCES,
         float(unseen.max()),
-        interreflections,
+        effects.interreflections,
         switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )
@@ -143,7 +156,7 @@ def flash_needs(
         decide(
             LATERAL,
             float(spread_over_noise(lost, level, noise).max()),
-            lateral,
+            effects.lateral,
             switch="lateral",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
@@ -151,7 +164,7 @@ def flash_needs(
         decide(
             SPECTRAL,
             float(off.max()),
-            spectral,
+            effects.spectral,
             switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built
@@ -159,12 +172,12 @@ def flash_needs(
         ),
         _finer(
             bounces,
-            bool(off.max() >= ENOUGH) if spectral is None else spectral,
+            bool(off.max() >= ENOUGH) if effects.spectral is None else effects.spectral,
             spectral_step(subject, state, view, illuminant, bounces),
         ),
         further_bounces(bounces, share * float(brightest.max())),
-        lens(view, illuminant, caster, noise, peak, subpixels, optics),
-        wrinkles(subject, noise, peak, relief_shadows),
+        lens(view, illuminant, caster, noise, peak, subpixels, effects.optics),
+        wrinkles(subject, noise, peak, effects.relief_shadows),
     ]
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 

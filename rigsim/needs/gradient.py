@@ -14,7 +14,7 @@ from rigsim.arrays import Float64Array, FloatArray
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
-from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, Noise, SceneEffects, SceneNeeds, absent, decide, unmodeled
 from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS, bands, polarization
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
@@ -41,10 +41,7 @@ def gradient_needs(
     noise: Noise,
     white: float,
     moving: bool,
-    shadows: bool | None,
-    lateral: bool | None,
-    interreflections: bool | None,
-    optics: bool | None,
+    effects: SceneEffects,
 ) -> SceneNeeds:
     """Decide what a scene in the gradient sphere builds.
 
@@ -61,15 +58,15 @@ def gradient_needs(
         so much that the brightest skin is full.
     moving
         Whether the patch moves.
-    shadows, lateral, interreflections, optics
-        What is asked for; None lets the sizes decide.
+    effects
+        What is asked for.
     """
     view = rig.views[0]
     world = [
         ("ambient light", "the room is dark"),
         ("light from the sphere's frame and between its LEDs", "they are black"),
     ]
-    made = [polarization(rig, view), bands(view), _optics(lens, optics, noise)]
+    made = [polarization(rig, view), bands(view), _optics(lens, effects.optics, noise)]
     limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
     if not isinstance(subject, MicroSkin):
         flat = "a ball bulges" if subject == "ball" else "the target is flat"
@@ -77,7 +74,7 @@ def gradient_needs(
             made.append(decide(name, 0.0, None, switch=switch, because=flat))
         made.append(Effect(LATERAL, "absent", f"{subject} is glass, gray or nothing"))
         return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
-    made += _of_skin(subject, sphere, lens, noise, white, shadows, lateral, interreflections)
+    made += _of_skin(subject, sphere, lens, noise, white, effects)
     if moving:
         made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
         pixel_um = lens.pixel_on_subject_um
@@ -117,9 +114,7 @@ def _of_skin(
     lens: Lens,
     noise: Noise,
     white: float,
-    shadows: bool | None,
-    lateral: bool | None,
-    interreflections: bool | None,
+    effects: SceneEffects,
 ) -> list[Effect]:
     middle = skin.height_um.shape[0] // 2
     half = min(middle, LOOKED_AT // 2)
@@ -141,7 +136,7 @@ def _of_skin(
         boundaries=True,
     )
     sigmas, weights = lateral_kernel(skin)
-    if lateral is not False:  # what comes from other walls spreads as all light does
+    if effects.lateral is not False:  # what comes from other walls spreads as all light does
         hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
     # light that goes along the surface grows with the square of slopes
     share = min(STEEPER**2 * float(np.quantile(hidden, 0.999)), 0.9)
@@ -156,21 +151,21 @@ def _of_skin(
         decide(
             SHADOWS,
             noise.share(1.0) if steepest > lowest else 0.0,
-            shadows,
+            effects.relief_shadows,
             switch="shadows",
             because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
         decide(
             LATERAL,
             noise.share(lost, level),
-            lateral,
+            effects.lateral,
             switch="lateral",
             because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
         decide(
             BOUNCES,
             noise.share(more, level),
-            interreflections,
+            effects.interreflections,
             switch="interreflections",
             because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
         ),

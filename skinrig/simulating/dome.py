@@ -319,7 +319,7 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
     from rigsim.as_built.dome import build
-    from rigsim.needs.effects import longest_on_s
+    from rigsim.needs.effects import SceneEffects, longest_on_s
     from rigsim.population import files as subject_file
     from rigsim.scenes.dome.scene import DomeScene
     from rigsim.scenes.dome.targets import target_scene
@@ -349,7 +349,7 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
         seed=order.seed,
         conditions=conditions,
         on_s=longest_on_s(plan),
-        **_light_of_skin(order),
+        effects=SceneEffects.from_switches(_light_of_skin(order)),
     )
 
 

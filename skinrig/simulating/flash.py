@@ -100,6 +100,7 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
 
 def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
     from rigsim import targets
+    from rigsim.needs.effects import SceneEffects
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.scene import FlashScene
 
@@ -119,7 +120,7 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
             movement=order.movement,
             seed=seed,
             power=power,
-            **order.without("flash"),
+            effects=SceneEffects.from_switches(order.without("flash")),
         )
         for state in order.states
     }

@@ -167,7 +167,7 @@ def make_scene(
         What of the skin is not built, see `skinrig.simulating.leaving_out`.
     """
     from rigsim.as_built.sphere import build_sphere
-    from rigsim.needs.effects import longest_on_s
+    from rigsim.needs.effects import SceneEffects, longest_on_s
     from rigsim.population import files as subject_file
     from rigsim.scenes.gradient.scene import GradientScene
     from rigsim.skin_patch.motion import PatchMotion
@@ -186,7 +186,13 @@ def make_scene(
     skin = subject_file.named(subject).patch(site or SITE, seed=seed, size_mm=size_mm)
     on_s = None if plan is None else longest_on_s(plan)
     return GradientScene(
-        rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s, **(without or {})
+        rig,
+        skin,
+        sphere=sphere,
+        motion=PatchMotion(seed),
+        seed=seed,
+        on_s=on_s,
+        effects=SceneEffects.from_switches(without or {}),
     )
 
 

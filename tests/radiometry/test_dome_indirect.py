@@ -10,6 +10,7 @@ from capture.rig import Rig, load_rig
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from rigsim.light.interreflection import SkinBounce
+from rigsim.needs.effects import SceneEffects
 from rigsim.render import Caster
 from rigsim.scenes.dome import reference as dome_reference
 from rigsim.scenes.dome.reference import MattScene
@@ -36,7 +37,9 @@ def test_light_by_way_of_other_skin_is_mitsubas(rig):
     face = dome_reference.plain_face("palest", size=512)
     view = rig.views[0]
     plain = MattScene(rig, face, subpixels=4)
-    ours = MattScene(rig, face, subpixels=4, interreflections=True)
+    ours = MattScene(
+        rig, face, subpixels=4, effects=SceneEffects(lateral=False, interreflections=True)
+    )
     found = (ours.radiance("C02", [LIGHT]) - plain.radiance("C02", [LIGHT])).sum(axis=(0, 1, 2))
     found = found / plain.intensity(LIGHT) / math.pi
     runs = [
@@ -86,8 +89,8 @@ def face():
 
 @pytest.mark.long
 def test_bounced_light_adds_a_little_and_most_in_hollows(small, face):
-    plain = DomeScene(small, face, interreflections=False, subsurface=False)
-    bounced = DomeScene(small, face, interreflections=True, subsurface=False)
+    plain = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=False))
+    bounced = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=True))
     one, two = plain.radiance("C02", [0])[0], bounced.radiance("C02", [0])[0]
     extra = two - one
     assert extra.min() > -1e-5 * one.max()
@@ -99,8 +102,8 @@ def test_bounced_light_adds_a_little_and_most_in_hollows(small, face):
 
 def test_light_bleeds_into_shadow_redder_than_it_came(small, face):
     """The sum of light changes little, pixels in hard shadow get some, and red more than blue."""
-    plain = DomeScene(small, face, interreflections=False, subsurface=False)
-    soft = DomeScene(small, face, interreflections=False, subsurface=True)
+    plain = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=False))
+    soft = DomeScene(small, face, effects=SceneEffects(lateral=True, interreflections=False))
     one, two = plain.radiance("C02", [1])[0], soft.radiance("C02", [1])[0]
     assert two.sum() == pytest.approx(one.sum(), rel=0.02)
     dark = (one.sum(axis=-1) == 0.0) & (plain.truth()["mask"]) & (two.sum(axis=-1) > 0.0)
@@ -114,8 +117,8 @@ def test_the_plain_kernel_adds_the_same_light_from_inside(small, face):
     from rigsim.render.variant import VariantChoice
 
     plain = VariantChoice("scalar_rgb", "asked for by the test", "")
-    inside = {"interreflections": False, "subsurface": True}
-    one = DomeScene(small, face, **inside).radiance("C02", [0])[0]
-    two = DomeScene(small, face, choice=plain, **inside).radiance("C02", [0])[0]
+    inside = SceneEffects(lateral=True, interreflections=False)
+    one = DomeScene(small, face, effects=inside).radiance("C02", [0])[0]
+    two = DomeScene(small, face, choice=plain, effects=inside).radiance("C02", [0])[0]
     assert one.sum() == pytest.approx(two.sum(), rel=2e-3)
     assert (np.abs(one - two) < 2e-4 * two.max()).mean() > 0.99

@@ -7,6 +7,7 @@ import pytest
 
 from capture.calibration.geometry import CameraPose
 from capture.rig import load_rig
+from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.rendering.geometry import FittedSurface
@@ -20,7 +21,7 @@ LIGHTS = (20, 62)
 def scene():
     rig = load_rig("dome").resized(100).subset(views=["C03", "C07"])
     face = make_subject("III", seed=5, size=256)
-    return DomeScene(rig, face, interreflections=False, subsurface=False)
+    return DomeScene(rig, face, effects=SceneEffects(lateral=False, interreflections=False))
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,9 @@ def test_a_face_that_smiles_is_rendered_with_its_neutral_normals_carried_along(s
     """
     view, light = "C07", LIGHTS[1]
     smiling = scene.subject.posed("happiness")
-    moved = DomeScene(scene.rig, smiling, interreflections=False, subsurface=False)
+    moved = DomeScene(
+        scene.rig, smiling, effects=SceneEffects(lateral=False, interreflections=False)
+    )
     true = moved.radiance(view, [light])[0]
     camera = CameraPose.nominal(scene.rig.view(view))
     carried = FittedSurface.of(model, smiling.mesh, rest=scene.subject.mesh)

@@ -11,7 +11,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import spread
 from rigsim.light.plastic import plastic_scale
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
+from rigsim.needs.effects import SceneEffects
 from rigsim.render import MovedLight, look_at, radiance
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import Subject, make_subject
@@ -63,21 +64,16 @@ def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subjec
     return dataclasses.replace(face, normal=face.atlas.normal)
 
 
+DIRECT_LIGHT: Final = SceneEffects(lateral=False, interreflections=False)
+
+
 class DirectScene(DomeScene):
     """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
 
     def __init__(
-        self,
-        rig: Rig,
-        subject: Subject,
-        *,
-        interreflections: bool = False,
-        subsurface: bool = False,
-        **settings: Any,
+        self, rig: Rig, subject: Subject, *, effects: SceneEffects = DIRECT_LIGHT, **settings: Any
     ) -> None:
-        super().__init__(
-            rig, subject, interreflections=interreflections, subsurface=subsurface, **settings
-        )
+        super().__init__(rig, subject, effects=effects, **settings)
 
 
 class MattScene(DirectScene):

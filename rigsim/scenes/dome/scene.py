@@ -35,7 +35,7 @@ from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.needs import flash as flash_needs
 from rigsim.needs.dome import dome_needs, noise_of
-from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds
 from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
@@ -78,22 +78,12 @@ class DomeScene:
         Sensor of every view; ``None`` takes what each view states.
     seed
         Seeds what differs from pulse to pulse.
-    interreflections
-        Whether light goes from skin to skin. This and the next two: ``None`` decides by how much it
-        changes pixels, see `needs`.
-    subsurface
-        Whether light spreads sideways inside the skin.
-    spectral
-        Whether light that went from skin to skin is reflected wavelength by wavelength.
-    last_bounce
-        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
-    relief_shadows
-        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
+    effects
+        Effects of light that are asked for; the others are decided by how much they change pixels,
+        see `needs`.
     on_s
         Longest on-time at full level of one light in the plan's exposures, s, by which sizes are
         told; ``None``: such that the brightest skin is at full scale.
-    optics
-        Whether lenses blur what is out of focus, and diffract; ``None`` decides as above.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -112,12 +102,7 @@ class DomeScene:
         conditions: Mapping[str, float] | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
-        interreflections: bool | None = None,
-        subsurface: bool | None = None,
-        spectral: bool | None = None,
-        last_bounce: float | None = None,
-        optics: bool | None = None,
-        relief_shadows: bool | None = None,
+        effects: SceneEffects = EFFECTS_BY_SIZE,
         on_s: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -167,11 +152,7 @@ class DomeScene:
             white_rgb=None if on_s is None else on_s * self._white_in_origin(),
             movement=movement,
             motion=motion,
-            subsurface=subsurface,
-            interreflections=interreflections,
-            spectral=spectral,
-            optics=optics,
-            relief_shadows=relief_shadows,
+            effects=effects,
             subpixels=subpixels,
         )
         """What is built, what is not, and why."""
@@ -191,7 +172,7 @@ class DomeScene:
                 subsurface=self.subsurface,
                 interreflections=self.interreflections,
                 spectral=self.interreflections and self.needs.builds(SPECTRAL),
-                enough=summed if last_bounce is None else last_bounce,
+                enough=summed if effects.last_bounce is None else effects.last_bounce,
                 relief=self._relief,
             )
         self._rows = DomeRows(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
-from rigsim.needs.effects import SceneNeeds, unmodeled
+from rigsim.needs.effects import EFFECTS_BY_SIZE, SceneEffects, SceneNeeds, unmodeled
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import POWER_DEVIATION, FlashScene
 from rigsim.sensor import expose
@@ -56,8 +56,8 @@ class FlashCourseScene:
         Seeds what differs from pop to pop.
     movement
         Whether the face moves with the expression, or only its blood changes.
-    lateral
-        Whether light spreads inside the skin; None: where it changes pixels.
+    effects
+        Effects of light that are asked for.
     subpixels
         Rays along each side of a pixel.
     on_flash
@@ -72,7 +72,7 @@ class FlashCourseScene:
         *,
         seed: int = 0,
         movement: bool = True,
-        lateral: bool | None = None,
+        effects: SceneEffects = EFFECTS_BY_SIZE,
         subpixels: int = 2,
         on_flash: Callable[[FlashTime], None] | None = None,
     ) -> None:
@@ -82,7 +82,7 @@ class FlashCourseScene:
         self.seed = seed
         self.movement = movement
         self._on_flash = on_flash
-        self._lateral, self._subpixels = lateral, subpixels
+        self._effects, self._subpixels = effects, subpixels
         self._scenes: dict[tuple[str, float], FlashScene] = {}
         self._images: dict[tuple[object, ...], Float32Array] = {}
 
@@ -96,7 +96,7 @@ class FlashCourseScene:
                 with_blood(self.subject, self.course.state, level),
                 state=shown,
                 seed=self.seed,
-                lateral=self._lateral,
+                effects=self._effects,
                 subpixels=self._subpixels,
             )
         return self._scenes[key]

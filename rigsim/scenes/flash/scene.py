@@ -27,7 +27,7 @@ from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.subsurface_radiance import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.effects import Noise, SceneNeeds, strictest
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds, strictest
 from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import facing_depths, lens_spread
@@ -93,23 +93,11 @@ class FlashScene:
         The polarizing films; ``None`` takes the rig's own, which its serial numbers decide.
     seed
         Seeds what differs from pop to pop.
-    lateral
-        Whether light spreads inside the skin. This and the next two: ``None`` decides by how much
-        it changes pixels, see `needs`.
-    interreflections
-        Whether light goes from skin to skin.
-    spectral
-        Whether that light is reflected wavelength by wavelength.
-    spectral_step
-        At every how many of the table's wavelengths; ``None``: as `needs` says.
-    last_bounce
-        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
-    relief_shadows
-        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
+    effects
+        Effects of light that are asked for; the others are decided by how much they change pixels,
+        see `needs`.
     power
         Highest power of a flash in the plan, above 0 to 1, by which sizes are told.
-    optics
-        Whether the lens blurs what is out of focus, and diffracts; ``None`` decides as above.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -126,13 +114,7 @@ class FlashScene:
         sensor: Sensor | None = None,
         films: Films | None = None,
         seed: int = 0,
-        lateral: bool | None = None,
-        interreflections: bool | None = None,
-        spectral: bool | None = None,
-        spectral_step: int | None = None,
-        last_bounce: float | None = None,
-        optics: bool | None = None,
-        relief_shadows: bool | None = None,
+        effects: SceneEffects = EFFECTS_BY_SIZE,
         power: float = 1.0,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -179,11 +161,7 @@ class FlashScene:
                     white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
                     weights_mm2=self._weights,
                     movement=movement,
-                    lateral=lateral,
-                    interreflections=interreflections,
-                    spectral=spectral,
-                    optics=optics,
-                    relief_shadows=relief_shadows,
+                    effects=effects,
                     subpixels=subpixels,
                     share=self._stage.share(),
                 )
@@ -195,8 +173,8 @@ class FlashScene:
         self.interreflections = self.needs.builds(BOUNCES)
         self.optics = self.needs.builds(LENS)
         summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
-        self._last_bounce = summed if last_bounce is None else last_bounce
-        self._step = spectral_step
+        self._last_bounce = summed if effects.last_bounce is None else effects.last_bounce
+        self._step = effects.spectral_step
 
     @property
     def left_out(self) -> list[tuple[str, str]]:

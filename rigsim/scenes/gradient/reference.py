@@ -24,6 +24,7 @@ from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.lobe_moments import led_moments
 from rigsim.light.plastic import plastic_scale
+from rigsim.needs.effects import SceneEffects
 from rigsim.render import Caster, MovedLight, look_at
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
@@ -82,13 +83,12 @@ def plain_scene(
         dataclasses.replace(rig, lights=lights),
         skin,
         films=NO_FILM,
-        optics=False,
-        lateral=False,
+        effects=SceneEffects(
+            optics=False, lateral=False, relief_shadows=shadows, interreflections=interreflections
+        ),
         subpixels=subpixels,
         sectors=sectors,
         table_size=table_size,
-        shadows=shadows,
-        interreflections=interreflections,
     )
 
 

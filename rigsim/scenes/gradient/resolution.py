@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from capture.rig import load_rig
 from rigsim.arrays import Float64Array
+from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -98,7 +99,9 @@ def wavy_scene(*, optics: bool = True) -> WavyScene:
     skin = make_micro_skin("cheek", size_mm=0.1)  # gives the pigment that spreads light
     even = np.full_like(skin.height_um, ALPHA)
     rig = load_rig("gradient").cropped(FIELD_PX)
-    return WavyScene(rig, dataclasses.replace(skin, alpha=even), optics=optics, subpixels=2)
+    return WavyScene(
+        rig, dataclasses.replace(skin, alpha=even), effects=SceneEffects(optics=optics), subpixels=2
+    )
 
 
 def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float64Array:

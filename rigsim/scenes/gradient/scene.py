@@ -24,7 +24,7 @@ from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Films, films_of
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
 from rigsim.light.lobe_moments import Surface
-from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds
 from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS
 from rigsim.needs.gradient import OPTICS, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
@@ -105,15 +105,9 @@ class GradientScene:
         The camera's sensor; None takes what the rig states.
     seed
         Seeds what differs from exposure to exposure.
-    shadows
-        Whether the relief hides LEDs from itself. This and the next three: None decides by how much
-        it changes pixels, see `needs`.
-    lateral
-        Whether light spreads inside the skin.
-    interreflections
-        Whether light goes from furrow to furrow.
-    optics
-        Whether lens and pixels blur; without, every pixel is the mean of its samples.
+    effects
+        Effects of light that are asked for; the others are decided by how much they change pixels,
+        see `needs`. Without optics every pixel is the mean of its samples.
     on_s
         Longest exposure of the plan, s, by which sizes are told; None: such that the brightest
         skin is at full scale.
@@ -136,10 +130,7 @@ class GradientScene:
         motion: PatchMotion | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
-        shadows: bool | None = None,
-        optics: bool | None = None,
-        lateral: bool | None = None,
-        interreflections: bool | None = None,
+        effects: SceneEffects = EFFECTS_BY_SIZE,
         on_s: float | None = None,
         sectors: int = 32,
         subpixels: int = 1,
@@ -176,10 +167,7 @@ class GradientScene:
             noise=Noise.of(self._sensor),
             white=math.inf if on_s is None else METER_RATE_PER_S * on_s,
             moving=motion is not None,
-            shadows=shadows,
-            lateral=lateral,
-            interreflections=interreflections,
-            optics=optics,
+            effects=effects,
         )
         """What is built, what is not, and why."""
         self.shadows, self.optics = self.needs.builds(SHADOWS), self.needs.builds(OPTICS)

@@ -96,6 +96,7 @@ def simulate(
     from capture.calibration.geometry import CameraPose
     from capture.rig import load_rig
     from rigsim.boxes.dome import LedPulse
+    from rigsim.needs.effects import SceneEffects
     from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
     from rigsim.subject.head_motion import head_motion as drawn
@@ -107,7 +108,9 @@ def simulate(
     motion = drawn(3, drift_mm=drift_mm, drift_deg=drift_mm / 3, twitch=twitch)
     times_s = sorted([*times_s, motion.twitch_start_s + 0.25] if twitch else times_s)
     subject = make_subject(preset, seed=0, size=texels)
-    scene = DomeScene(rig, subject, motion=motion, interreflections=False, subsurface=False)
+    scene = DomeScene(
+        rig, subject, motion=motion, effects=SceneEffects(lateral=False, interreflections=False)
+    )
     frames = []
     for t in times_s:
         pops = [LedPulse(k, 1.0, t, t + EXPOSURE_S) for k in range(len(rig.lights))]

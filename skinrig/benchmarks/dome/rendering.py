@@ -10,6 +10,7 @@ import numpy as np
 
 from capture.calibration.geometry import CameraPose
 from capture.rig import Rig, load_rig
+from rigsim.needs.effects import SceneEffects
 from rigsim.render import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
@@ -42,7 +43,7 @@ def model(*, toy: bool) -> StageBenchmark:
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW])
     face = make_subject("III", seed=5, size=size)
     # as the model has it
-    direct = partial(DomeScene, interreflections=False, subsurface=False)
+    direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
     scene = direct(rig, face)
     true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
     camera = CameraPose.nominal(rig.views[0])
@@ -139,7 +140,7 @@ def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
     """Return the error of a face of a preset's melanin, at 4 rays a pixel."""
     face = make_subject(preset, seed=5, size=size)
     # as the model has it
-    direct = partial(DomeScene, interreflections=False, subsurface=False)
+    direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
     scene = direct(rig, face)
     true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
     on = FittedSurface.of(true_model(scene, VIEW), face.mesh)

@@ -142,7 +142,7 @@ def flash_face(
         lights where they stand.
     """
     from capture.rig import load_rig
-    from rigsim.needs.effects import Noise
+    from rigsim.needs.effects import Noise, SceneEffects
     from rigsim.needs.flash import FINER
     from rigsim.scenes.flash.scene import FlashScene
     from rigsim.subject import make_subject
@@ -155,7 +155,7 @@ def flash_face(
     scene = FlashScene(rig, face)
 
     def render(**settings: Any) -> Pictures:
-        made = FlashScene(rig, face, **settings)
+        made = FlashScene(rig, face, effects=SceneEffects.from_switches(settings))
         return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
 
     scene.radiance()  # compiles, and traces what all scenes of this face share
@@ -196,7 +196,7 @@ def _lit_from(rig: Any, angle_deg: float) -> Any:
 def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare pictures of a face in the dome under some lights, each exposed to full scale."""
     from capture.rig import load_rig
-    from rigsim.needs.effects import Noise
+    from rigsim.needs.effects import Noise, SceneEffects
     from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
     from skinrig.simulating.dome import small_dome
@@ -209,7 +209,10 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
 
     def render(**settings: Any) -> Pictures:
         # what light goes from skin to skin is traced once for all scenes of the face
-        return Pictures(DomeScene(rig, face, **settings).radiance(view) / brightest)
+        return Pictures(
+            DomeScene(rig, face, effects=SceneEffects.from_switches(settings)).radiance(view)
+            / brightest
+        )
 
     yield from compare(
         "dome",
@@ -235,20 +238,22 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
 def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare a face that has moved in the dome with and without shadows of its wrinkles."""
     from capture.rig import load_rig
-    from rigsim.needs.effects import Noise
+    from rigsim.needs.effects import Noise, SceneEffects
     from rigsim.scenes.dome.scene import DomeScene
     from rigsim.subject import make_subject
     from skinrig.simulating.dome import small_dome
 
     rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
     face = make_subject(preset, seed=0, size=FACE_TEXELS)
-    plain: dict[str, Any] = {"state": "surprise", "interreflections": False, "subsurface": False}
-    scene = DomeScene(rig, face, **plain)
+    plain = {"interreflections": False, "subsurface": False}
+    scene = DomeScene(rig, face, state="surprise", effects=SceneEffects.from_switches(plain))
     view = rig.views[0].name
     brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
 
     def render(**settings: Any) -> Pictures:
-        return Pictures(DomeScene(rig, face, **plain, **settings).radiance(view) / brightest)
+        effects = SceneEffects.from_switches(plain | settings)
+        made = DomeScene(rig, face, state="surprise", effects=effects)
+        return Pictures(made.radiance(view) / brightest)
 
     yield from compare(
         "dome",
@@ -323,7 +328,7 @@ def changed(
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
     from capture.rig import load_rig
-    from rigsim.needs.effects import Noise
+    from rigsim.needs.effects import Noise, SceneEffects
     from rigsim.scenes.gradient.reference import NEUTRAL
     from rigsim.scenes.gradient.scene import GradientScene
     from skinrig.simulating.gradient import make_scene
@@ -333,7 +338,9 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL).values())
 
     def render(**settings: Any) -> Pictures:
-        made = GradientScene(rig, base.subject, sphere=base.sphere, **settings)
+        made = GradientScene(
+            rig, base.subject, sphere=base.sphere, effects=SceneEffects.from_switches(settings)
+        )
         found = made.moments(NEUTRAL)
         light = np.stack([part[0] for part in found.values()]) / np.float32(brightest)
         return Pictures(np.asarray(light, np.float32))

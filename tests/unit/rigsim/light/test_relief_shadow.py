@@ -10,6 +10,7 @@ import pytest
 
 from capture.rig import load_rig
 from rigsim.light.relief_shadow import DIRECTIONS, SOFT_RAD, ReliefShadow
+from rigsim.needs.effects import SceneEffects
 from rigsim.needs.flash import WRINKLES
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
@@ -94,14 +95,15 @@ def face():
 def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
     rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
     view = rig.views[0].name
-    plain = {"state": "surprise", "interreflections": False, "subsurface": False}
-    lit = DomeScene(rig, face, relief_shadows=False, choice=EMBREE, **plain).radiance(view)
-    scene = DomeScene(rig, face, choice=EMBREE, **plain)
+    plain = SceneEffects(lateral=False, interreflections=False)
+    flat = dataclasses.replace(plain, relief_shadows=False)
+    lit = DomeScene(rig, face, state="surprise", effects=flat, choice=EMBREE).radiance(view)
+    scene = DomeScene(rig, face, state="surprise", effects=plain, choice=EMBREE)
     shaded = scene.radiance(view)
     assert scene.needs[WRINKLES].verdict == "built"
     assert (shaded <= lit + 1e-6 * lit.max()).all()
     assert (lit - shaded).max() > 0.02 * lit.max()
-    compiled = DomeScene(rig, face, **plain)
+    compiled = DomeScene(rig, face, state="surprise", effects=plain)
     if not choose_variant("rgb").is_vectorized:
         pytest.skip("no LLVM for the compiled kernel")
     other = compiled.radiance(view)
@@ -118,10 +120,8 @@ def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
             rig,
             face,
             state="surprise",
-            relief_shadows=on,
+            effects=SceneEffects(relief_shadows=on, lateral=False, interreflections=False),
             choice=EMBREE,
-            lateral=False,
-            interreflections=False,
         )
         for on in (None, False)
     )

@@ -14,7 +14,7 @@ from rigsim.light.lateral import spread_light
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs import effect_sizes
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.effects import ENOUGH, Effect, NeedsError, Noise, SceneNeeds, decide
+from rigsim.needs.effects import ENOUGH, Effect, NeedsError, Noise, SceneEffects, SceneNeeds, decide
 from rigsim.render.caster import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
@@ -151,13 +151,15 @@ def test_a_noisier_sensor_needs_less(flash, faces):
 
 
 def test_what_is_asked_for_is_done_and_said(flash, faces):
-    asked = FlashScene(flash, faces["II"], lateral=False, interreflections=False)
+    asked = FlashScene(
+        flash, faces["II"], effects=SceneEffects(lateral=False, interreflections=False)
+    )
     for name in (flash_needs.BOUNCES, flash_needs.LATERAL):
         effect = asked.needs[name]
         assert effect.verdict == "asked"
         assert f"{effect.switch}=False asks for it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
-    forced = FlashScene(flash, faces["darkest"], spectral=True)
+    forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
     assert forced.needs[flash_needs.SPECTRAL].verdict == "built"
     assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL].reason
 
@@ -178,7 +180,7 @@ def test_sizes_are_bounds_where_a_light_grazes_a_plate_that_faces_the_camera(fla
     noise = Noise.of(scene.sensor())
 
     def light(**settings):
-        made = FlashScene(rig, face, power=power, **settings)
+        made = FlashScene(rig, face, power=power, effects=SceneEffects(**settings))
         return power * np.stack([made.radiance(name) for name in ("parallel", "crossed")])
 
     told = {effect.switch: effect.over_noise for effect in scene.needs}
@@ -193,7 +195,7 @@ def test_sizes_are_bounds_where_a_light_grazes_a_plate_that_faces_the_camera(fla
 def test_a_highlight_is_brighter_than_dark_skin_and_the_lens_is_judged_by_it(flash, faces):
     """A bound on highlights: above what is found anywhere, though a few times at most."""
     for rig in (flash, grazing(flash, 60.0)):
-        scene = FlashScene(rig, faces["darkest"], lateral=False, optics=False)
+        scene = FlashScene(rig, faces["darkest"], effects=SceneEffects(lateral=False, optics=False))
         shown = scene.radiance("parallel") - scene.radiance("crossed")
         rough = float(scene.subject.roughness[scene.subject.atlas.covered].min())
         places = [light.position_mm for light in rig.lights]
@@ -220,7 +222,7 @@ def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
     changes = []
     for step in STEPS:
         error = step_error(face, "neutral", view.spectral_sensitivity, "D55", step)
-        lack = FlashScene(flash, face, spectral_step=step).radiance()
+        lack = FlashScene(flash, face, effects=SceneEffects(spectral_step=step)).radiance()
         changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
         assert 0.0 < changes[-1] <= bounces * error.max()
     assert changes[0] > 3.0 * changes[-1]  # 50 nm miss what 20 nm see
@@ -267,8 +269,8 @@ def test_gray_tissue_is_traced_once_and_skin_color_by_color():
 def test_color_of_bounced_light_is_redder_than_band_by_band(flash, faces):
     """The mean of a square is larger than the square of the mean, in red most."""
     one = FlashScene(flash, faces["II"]).radiance()
-    plain = FlashScene(flash, faces["II"], spectral=False).radiance()
-    none = FlashScene(flash, faces["II"], interreflections=False).radiance()
+    plain = FlashScene(flash, faces["II"], effects=SceneEffects(spectral=False)).radiance()
+    none = FlashScene(flash, faces["II"], effects=SceneEffects(interreflections=False)).radiance()
     more, bounced = (one - plain).sum(axis=(0, 1)), (plain - none).sum(axis=(0, 1))
     assert (bounced > 0.0).all()
     assert more[0] / bounced[0] > 0.01

@@ -12,7 +12,7 @@ from scipy.special import j1
 from capture.rig import Rig, load_rig
 from rigsim.light.olat import pixel_order
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.effects import Noise
+from rigsim.needs.effects import Noise, SceneEffects
 from rigsim.render.caster import Caster
 from rigsim.render.depth_of_field import (
     LensPicture,
@@ -198,9 +198,10 @@ def test_what_is_blurred_in_front_covers_as_much_as_its_own_circle(rig):
 
 def test_a_scene_blurs_where_its_needs_say_so_and_truth_stays_sharp(rig):
     face = make_subject("II", seed=0, size=64)
-    plain = {"choice": EMBREE, "lateral": False, "interreflections": False}
-    blurred = FlashScene(rig, face, **plain)
-    sharp = FlashScene(rig, face, optics=False, **plain)
+    plain = SceneEffects(lateral=False, interreflections=False)
+    blurred = FlashScene(rig, face, effects=plain, choice=EMBREE)
+    bare = dataclasses.replace(plain, optics=False)
+    sharp = FlashScene(rig, face, effects=bare, choice=EMBREE)
     assert blurred.needs[flash_needs.LENS].verdict == "built"
     assert sharp.needs[flash_needs.LENS].verdict == "asked"
     change = np.abs(blurred.radiance() - sharp.radiance())
@@ -219,7 +220,9 @@ def test_small_holes_and_noisy_sensors_need_no_lens(rig):
     face = make_subject("II", seed=0, size=64)
     view = dataclasses.replace(rig.views[0], f_number=90.0, full_well_e=30.0, read_noise_e=300.0)
     poor = dataclasses.replace(rig, views=(view,))
-    needs = FlashScene(poor, face, choice=EMBREE, lateral=False, interreflections=False).needs
+    needs = FlashScene(
+        poor, face, choice=EMBREE, effects=SceneEffects(lateral=False, interreflections=False)
+    ).needs
     assert needs[flash_needs.LENS].verdict == "negligible"
 
 

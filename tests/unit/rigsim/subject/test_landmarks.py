@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig, load_rig
+from rigsim.needs.effects import SceneEffects
 from rigsim.render.caster import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
@@ -32,7 +33,11 @@ def face() -> Subject:
 def scenes(rig: Rig, face: Subject) -> dict[str, FlashScene]:
     return {
         state: FlashScene(
-            rig, face, state=state, choice=EMBREE, lateral=False, interreflections=False
+            rig,
+            face,
+            state=state,
+            choice=EMBREE,
+            effects=SceneEffects(lateral=False, interreflections=False),
         )
         for state in ("neutral", "smile", "surprise")
     }

@@ -11,6 +11,7 @@ from capture.rig import Rig, load_rig
 from rigsim.as_built.dome import BuiltDome, Tolerances, bend, build
 from rigsim.light import olat
 from rigsim.light.led_light import METER_RATE_PER_S
+from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.exposing import SceneError
@@ -29,7 +30,7 @@ class Pulse:
     t_off_s: float
 
 
-direct = partial(DomeScene, interreflections=False, subsurface=False)
+direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig, load_rig
+from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
@@ -27,9 +28,9 @@ def face() -> Subject:
     return make_subject("II", seed=4, size=160)
 
 
-def scene_of(rig: Rig, face: Subject, state: str, **kwargs) -> FlashScene:
-    plain = {"choice": EMBREE, "lateral": False, "interreflections": False}
-    return FlashScene(rig, face, state=state, **(plain | kwargs))
+def scene_of(rig: Rig, face: Subject, state: str, lateral: bool = False, **kwargs) -> FlashScene:
+    effects = SceneEffects(lateral=lateral, interreflections=False)
+    return FlashScene(rig, face, state=state, effects=effects, **({"choice": EMBREE} | kwargs))
 
 
 @pytest.fixture(scope="module")

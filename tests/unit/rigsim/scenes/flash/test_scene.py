@@ -10,6 +10,7 @@ import pytest
 from capture.calibration.color.chart import find_chart
 from capture.rig import Rig, load_rig
 from rigsim.as_built.polarizers import IDEAL, FilmError, Films, films_of
+from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import FLAT_LEVEL, METER_LEVEL, FlashScene
@@ -42,11 +43,12 @@ def face() -> Subject:
     return make_subject("II", seed=4, size=256)
 
 
-PLAIN = {"choice": EMBREE, "subpixels": 1, "interreflections": False}
+PLAIN = {"choice": EMBREE, "subpixels": 1}
 
 
-def scene_of(rig: Rig, subject, **kwargs) -> FlashScene:
-    return FlashScene(rig, subject, **(PLAIN | kwargs))
+def scene_of(rig: Rig, subject, *, lateral=None, optics=None, **kwargs) -> FlashScene:
+    effects = SceneEffects(lateral=lateral, interreflections=False, optics=optics)
+    return FlashScene(rig, subject, effects=effects, **(PLAIN | kwargs))
 
 
 @pytest.fixture(scope="module")

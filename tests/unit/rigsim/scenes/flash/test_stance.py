@@ -5,6 +5,7 @@ import pytest
 
 from capture.rig import Rig, load_rig
 from rigsim.as_built.polarizers import IDEAL
+from rigsim.needs.effects import SceneEffects
 from rigsim.render.depth_of_field import facing_depths
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
@@ -14,7 +15,12 @@ from rigsim.subject.person import Subject, SubjectError, make_subject
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192
 NEARER_MM = 50.0
-PLAIN = {"choice": EMBREE, "lateral": False, "interreflections": False, "films": IDEAL}
+PLAIN = {"choice": EMBREE, "films": IDEAL}
+
+
+def scene_of(rig: Rig, face: Subject, *, optics: bool) -> FlashScene:
+    effects = SceneEffects(lateral=False, interreflections=False, optics=optics)
+    return FlashScene(rig, face, effects=effects, **PLAIN)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +40,7 @@ def nearer(face: Subject) -> Subject:
 
 @pytest.fixture(scope="module")
 def places(rig: Rig, face: Subject, nearer: Subject) -> tuple[FlashScene, FlashScene]:
-    here, there = (FlashScene(rig, one, optics=False, **PLAIN) for one in (face, nearer))
+    here, there = (scene_of(rig, one, optics=False) for one in (face, nearer))
     return here, there
 
 
@@ -122,7 +128,7 @@ def test_the_lens_blurs_a_face_that_stands_out_of_focus(rig, face):
         depths = np.array(facing_depths(view, moved.mesh)) - facing_depths(view, face.mesh)
         assert depths[1] == pytest.approx(nearer_mm, abs=1e-2)
         sharp, blurred = (
-            FlashScene(rig, moved, optics=optics, **PLAIN).radiance() for optics in (False, True)
+            scene_of(rig, moved, optics=optics).radiance() for optics in (False, True)
         )
         energy = [np.square(np.diff(image, axis=1)).sum() for image in (sharp, blurred)]
         kept.append(energy[1] / energy[0])
