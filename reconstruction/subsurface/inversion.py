@@ -37,7 +37,7 @@ doi:10.1145/383259.383319. Kienle and Patterson 1997, doi:10.1364/JOSAA.14.00024
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,26 +45,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.fresnel import ETA_SKIN
-from reconstruction.arrays import Float64Array, UInt8Array
+from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.subsurface import kernels, nearest
-from reconstruction.subsurface.models import METHODS, Collection, Method, profile_model
-from reconstruction.subsurface.outcome import LEFT_OUT, Outcome, SubsurfaceFit, judged
-from reconstruction.subsurface.profile_batch import ProfileBatch
+from reconstruction.subsurface.models import METHODS, Method, Optics, ProfileModel, profile_model
+from reconstruction.subsurface.outcome import SubsurfaceFit, evaluate_fits
+from reconstruction.subsurface.profile_batch import Fits, LeftOut, ProfileBatch
+from reconstruction.subsurface.profile_fit import fit_profiles
 
-__all__ = [
-    "LEFT_OUT",
-    "Outcome",
-    "SubsurfaceError",
-    "SubsurfaceFit",
-    "fit_dipole",
-    "invert",
-    "nearest_medium",
-]
-
-
-G_SKIN, G_SKIN_ERROR = 0.825, 0.072
-"""Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""
-BATCH = 8192
+PROFILES_PER_BATCH = 8192
 """Profiles fitted at a time, for the size of temporaries."""
 
 
@@ -79,14 +67,10 @@ def invert(
     eta: float = ETA_SKIN,
     variance: ArrayLike | None = None,
     method: Method = "photon_table",
-    collection: Collection = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
     common_error: float = 0.0,
-    g: float = G_SKIN,
-    g_error: float = G_SKIN_ERROR,
     model_error: float | None = None,
     valid: ArrayLike | None = None,
+    **optics: Any,
 ) -> SubsurfaceFit:
     """Fit the coefficients of a homogeneous half-space to radial profiles.
 
@@ -104,18 +88,19 @@ def invert(
         Fibres of infinite, negative or NaN variance are left out. None: the noise is taken from the
         residuals.
     method : {"photon_table", "diffusion", "dipole"}
-    collection : {"all", "fibre"}
-        What was collected; the closed forms take both as exitance.
-    core_mm, source_core_mm : float
-        Core diameters of detection and source fibre, mm, for the table.
     common_error : float
         Relative standard deviation of a scale common to all fibres (of a calibration).
-    g, g_error : float
-        Asymmetry of the phase function and its standard deviation, for the table; 0 fixes it.
     model_error : float, optional
         Relative deviation of each fibre for the model's sake, the method's own by default. Given
         a number, no systematic error of a closed form is added to sigma_tr either.
     valid : array_like of bool, broadcast to the profiles, optional
+    collection : {"all", "fibre"}
+        What was collected, "all" by default; the closed forms take both as exitance.
+    core_mm, source_core_mm : float
+        Core diameters of detection and source fibre, mm, for the table; 0 by default.
+    g, g_error : float
+        Asymmetry of the phase function and its standard deviation, for the table; 0 fixes it. By
+        default those of soft tissue.
 
     Returns
     -------
@@ -134,47 +119,20 @@ def invert(
     >>> float(fit.sigma_a_per_mm.round(6)), float(fit.sigma_s_prime_per_mm.round(6))
     (0.04, 1.5)
     """
-    _check_settings(
-        method,
-        collection,
-        eta,
-        core_mm=core_mm,
-        source_core_mm=source_core_mm,
-        common_error=common_error,
-        g=g,
-        g_error=g_error,
-        model_error=model_error or 0.0,
-    )
-    laid = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
-    y, left_out = laid.y, laid.left_out
-    prior = np.zeros((kernels.PARAMETERS, 2))
-    prior[:2, 1] = math.inf
-    prior[2, 1] = common_error
-    prior[3] = g, g_error if method == "photon_table" else 0.0
-    batch = ProfileBatch.of(y, laid.variance, left_out == 0, prior)
-    domain, bias = np.zeros(y.shape[0], np.bool_), np.zeros(y.shape[0])
-    bounds = np.zeros((kernels.PARAMETERS, 2))
-    for own, members in laid.by_radius():
-        model = profile_model(
-            method,
-            np.ascontiguousarray(own),
-            eta=float(eta),
-            collection=collection,
-            core_mm=float(core_mm),
-            source_core_mm=float(source_core_mm),
-            g=float(g),
-            g_error=float(g_error),
-        )
+    light = Optics(eta, **optics)
+    _check_settings(method, light, common_error=common_error, model_error=model_error or 0.0)
+    layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
+    g_error = light.g_error if method == "photon_table" else 0.0
+    batch = layout.batch(_prior(common_error, light.g, g_error))
+
+    def fit(batch: ProfileBatch, model: ProfileModel) -> Fits:
         if model_error is not None:
-            model = replace(model, error=np.array([float(model_error), 0.0, 0.0]))
-        bounds = model.bounds
-        for begin in range(0, members.size, BATCH):
-            chosen = members[begin : begin + BATCH]
-            batch.fit(model, chosen)
-            domain[chosen] = model.holds(batch.theta[chosen])
-            if model_error is None:
-                bias[chosen] = model.systematic(batch.theta[chosen])
-    return judged(batch, bounds, domain, bias, left_out, laid.shape, method)
+            error = np.array([float(model_error), 0.0, 0.0])
+            model = replace(model, error=error, bias=(0.0, 0.0))
+        return fit_profiles(batch, model)
+
+    fits = layout.fit(batch, method, light, fit, PROFILES_PER_BATCH)
+    return evaluate_fits(batch, fits, layout.shape, method)
 
 
 def nearest_medium(
@@ -183,10 +141,8 @@ def nearest_medium(
     *,
     variance: ArrayLike,
     eta: float = ETA_SKIN,
-    collection: Collection = "fibre",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
     valid: ArrayLike | None = None,
+    **optics: Any,
 ) -> SubsurfaceFit:
     """Find the homogeneous medium whose profile is nearest to that of tissue that is none.
 
@@ -196,9 +152,11 @@ def nearest_medium(
 
     Parameters
     ----------
-    radius_mm, reflectance_per_mm2, eta, variance, collection, core_mm, source_core_mm, valid
+    radius_mm, reflectance_per_mm2, eta, variance, valid, core_mm, source_core_mm
         As of :func:`invert`; reflectance in units of 1/mm^2, as the definition leaves out fibres
         that take too little.
+    collection : {"all", "fibre"}
+        What was collected, "fibre" by default.
 
     Returns
     -------
@@ -218,30 +176,13 @@ def nearest_medium(
     >>> float(fit.scale.round(2)), float(fit.sigma_s_prime_per_mm.round(1))
     (0.5, 2.0)
     """
-    _check_settings("photon_table", collection, eta, core_mm=core_mm, source_core_mm=source_core_mm)
-    laid = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
-    prior = np.zeros((kernels.PARAMETERS, 2))
-    prior[:2, 1] = math.inf
-    prior[2, 1], prior[3, 0] = nearest.DIMMING, nearest.G
-    batch = ProfileBatch.of(laid.y, laid.variance, laid.left_out == 0, prior)
-    batch.erring = False
-    domain, bounds = np.zeros(laid.y.shape[0], np.bool_), np.zeros((kernels.PARAMETERS, 2))
-    for own, members in laid.by_radius():
-        model = profile_model(
-            "photon_table",
-            np.ascontiguousarray(own),
-            eta=float(eta),
-            collection=collection,
-            core_mm=float(core_mm),
-            source_core_mm=float(source_core_mm),
-            g=nearest.G,
-            g_error=0.0,
-        )
-        bounds = model.bounds
-        nearest.fit_nearest(batch, model, members)
-        domain[members] = model.holds(batch.theta[members])
-    nothing = np.zeros(laid.y.shape[0])
-    return judged(batch, bounds, domain, nothing, laid.left_out, laid.shape, "photon_table")
+    settings = {"collection": "fibre"} | optics
+    light = Optics(eta, **settings, g=nearest.ASYMMETRY, g_error=0.0)
+    _check_settings("photon_table", light)
+    layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
+    batch = layout.batch(_prior(nearest.LOG_FACTOR_SIGMA, nearest.ASYMMETRY, 0.0))
+    fits = layout.fit(batch, "photon_table", light, nearest.fit_nearest)
+    return evaluate_fits(batch, fits, layout.shape, "photon_table", by_definition=True)
 
 
 def fit_dipole(
@@ -287,12 +228,43 @@ class _Layout:
     shape: tuple[int, ...]
     """Leading axes of the profiles as given."""
 
-    def by_radius(self) -> Iterator[tuple[Float64Array, NDArray[np.intp]]]:
+    def batch(self, prior: Float64Array) -> ProfileBatch:
+        """Return the profiles as fits take them."""
+        return ProfileBatch.lay_out(self.y, self.variance, self.left_out, prior)
+
+    def fit(
+        self,
+        batch: ProfileBatch,
+        method: Method,
+        optics: Optics,
+        fit: Callable[[ProfileBatch, ProfileModel], Fits],
+        most: int | None = None,
+    ) -> Fits:
+        """Fit all profiles, those of equal radii by one model, at most so many at a time."""
+        parts = []
+        for radius_mm, rows in self._by_radius():
+            model = profile_model(method, np.ascontiguousarray(radius_mm), optics)
+            step = most or max(rows.size, 1)
+            for begin in range(0, max(rows.size, 1), step):
+                some = rows[begin : begin + step]
+                parts.append((some, fit(batch.select(some), model)))
+        return Fits.join(parts)
+
+    def _by_radius(self) -> Iterator[tuple[Float64Array, NDArray[np.intp]]]:
         """Yield each set of radii with the rows that have it."""
         distinct, which = np.unique(self.radius_mm, axis=0, return_inverse=True)
         which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])
         for number, own in enumerate(distinct):
             yield own, np.flatnonzero(which == number)
+
+
+def _prior(common_error: float, g: float, g_error: float) -> Float64Array:
+    """Return means and standard deviations of the parameters, (4, 2)."""
+    prior = np.zeros((kernels.N_PARAMETERS, 2))
+    prior[:2, 1] = math.inf
+    prior[2, 1] = common_error
+    prior[3] = g, g_error
+    return prior
 
 
 def _lay_out(
@@ -305,33 +277,34 @@ def _lay_out(
     y = np.asarray(reflectance_per_mm2, np.float64)
     if y.ndim == 0 or y.shape[-1] == 0:
         raise SubsurfaceError(f"reflectance_per_mm2: got shape {y.shape}, expected (..., fibres)")
-    shape, fibres = y.shape[:-1], y.shape[-1]
-    radius = _spread("radius_mm", np.asarray(radius_mm, np.float64), y.shape)
+    shape, full = y.shape[:-1], y.shape
+    radius = np.asarray(radius_mm, np.float64)
+    if radius.shape != full[-1:]:
+        radius = _broadcast("radius_mm", radius, full)
     if not np.all((radius >= 0.0) & np.isfinite(radius)):
         raise SubsurfaceError("radius_mm: got negative or not finite values, expected at least 0")
-    y = y.reshape(-1, fibres)
-    spread = None
-    if variance is not None:
-        spread = _spread("variance", np.asarray(variance, np.float64), (*shape, fibres))
-        spread = spread.reshape(y.shape)
-    left_out = np.zeros(y.shape, np.uint8)
+    y = y.reshape(-1, full[-1])
+    left_out = np.full(y.shape, LeftOut.USED, np.uint8)
+
+    def leave_out(where: BoolArray, reason: LeftOut) -> None:
+        left_out[(left_out == LeftOut.USED) & where] = reason
+
     if valid is not None:
-        given = _spread("valid", np.asarray(valid, bool), (*shape, fibres)).reshape(y.shape)
-        left_out[~given] = 1
-    left_out[(left_out == 0) & ~np.isfinite(y)] = 2
-    if spread is None:
-        with np.errstate(invalid="ignore"):
-            left_out[(left_out == 0) & ~(y > 0.0)] = 4
+        given = _broadcast("valid", np.asarray(valid, bool), full).reshape(y.shape)
+        leave_out(~given, LeftOut.MASKED)
+    leave_out(~np.isfinite(y), LeftOut.NOT_FINITE)
+    noise = None
+    if variance is None:
+        leave_out(~(y > 0.0), LeftOut.NOT_ABOVE_ZERO)
     else:
-        left_out[(left_out == 0) & ~((spread >= 0.0) & (spread < math.inf))] = 3
-    rows = radius.reshape(-1, fibres) if radius.ndim > 1 else radius[None]
-    return _Layout(y, spread, left_out, rows, shape)
+        noise = _broadcast("variance", np.asarray(variance, np.float64), full).reshape(y.shape)
+        leave_out(~((noise >= 0.0) & (noise < math.inf)), LeftOut.NO_VARIANCE)
+    rows = radius.reshape(-1, full[-1]) if radius.size else np.zeros((1, full[-1]))
+    return _Layout(y, noise, left_out, rows, shape)
 
 
-def _spread(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an argument broadcast to the profiles; radii of one axis stay as they are."""
-    if name == "radius_mm" and array.shape == shape[-1:]:
-        return array
+def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return an argument broadcast to the profiles."""
     try:
         return np.broadcast_to(array, shape)
     except ValueError as error:
@@ -340,13 +313,15 @@ def _spread(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[A
         ) from error
 
 
-def _check_settings(method: str, collection: str, eta: float, **not_negative: float) -> None:
+def _check_settings(method: str, optics: Optics, **not_negative: float) -> None:
     if method not in METHODS:
         raise SubsurfaceError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
-    if collection not in ("all", "fibre"):
-        raise SubsurfaceError(f'collection: got {collection!r}, expected "all" or "fibre"')
-    if not 1.0 <= eta < math.inf:
-        raise SubsurfaceError(f"eta: got {eta}, expected a relative refractive index >= 1")
+    if optics.collection not in ("all", "fibre"):
+        raise SubsurfaceError(f'collection: got {optics.collection!r}, expected "all" or "fibre"')
+    if not 1.0 <= optics.eta < math.inf:
+        raise SubsurfaceError(f"eta: got {optics.eta}, expected a relative refractive index >= 1")
+    for name in ("core_mm", "source_core_mm", "g", "g_error"):
+        not_negative[name] = getattr(optics, name)
     for name, value in not_negative.items():
         if not 0.0 <= value < math.inf:
             raise SubsurfaceError(f"{name}: got {value}, expected a number of at least 0")

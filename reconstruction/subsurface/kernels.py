@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-PARAMETERS = 4
-TABLE = 1
+N_PARAMETERS = 4
+TABLE_MODEL = 1
 """The model is a table; anything else is a closed form."""
 _FAST = {"contract", "reassoc", "nsz"}
 _FOUR_PI = 4.0 * math.pi
@@ -152,7 +152,7 @@ def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-de
 @njit(error_model="numpy")
 def evaluate_one(kind, theta, radius, constants, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
     """Fill one profile and its derivatives by all parameters."""
-    if kind == TABLE:
+    if kind == TABLE_MODEL:
         _tabled(theta, radius, axes, grid, w, m, jac)
     else:
         _closed(theta, radius, constants, m, jac)

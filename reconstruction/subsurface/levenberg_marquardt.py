@@ -18,12 +18,12 @@ from numba import njit, prange
 
 from reconstruction.subsurface.kernels import decay, evaluate_one
 
-MOST_STEP = 1.5
+MAX_LOG_STEP = 1.5
 """Largest change of a logarithm in one step."""
-CLOSE = 1e-5
+STEP_TOL = 1e-5
 """A step of the logarithms after which the next would change nothing that matters."""
 _FAST = {"contract", "reassoc", "nsz"}
-_LOWEST = 1e-290
+_MIN_REFLECTANCE = 1e-290
 
 
 @njit(error_model="numpy")
@@ -62,7 +62,7 @@ def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
     total = 0.0
     if logarithmic:
         for f in range(y.size):
-            d = y[f] - math.log(max(m[f], _LOWEST))
+            d = y[f] - math.log(max(m[f], _MIN_REFLECTANCE))
             total += weight[f] * d * d
     else:
         for f in range(y.size):
@@ -78,7 +78,7 @@ def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignor
         for r in range(count):
             row = jac[active[r]]
             for f in range(y.size):
-                row[f] /= max(m[f], _LOWEST)
+                row[f] /= max(m[f], _MIN_REFLECTANCE)
     for r in range(count):
         i = active[r]
         for c in range(r + 1):
@@ -91,7 +91,7 @@ def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignor
         total = 0.0
         if logarithmic:
             for f in range(y.size):
-                total += weight[f] * jac[i, f] * (y[f] - math.log(max(m[f], _LOWEST)))
+                total += weight[f] * jac[i, f] * (y[f] - math.log(max(m[f], _MIN_REFLECTANCE)))
         else:
             for f in range(y.size):
                 total += weight[f] * jac[i, f] * (y[f] - m[f])
@@ -145,7 +145,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
             model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
         )
         for round_ in range(rounds):
-            close = max(CLOSE, 1e-2 * 0.01**round_) if changing else CLOSE
+            close = max(STEP_TOL, 1e-2 * 0.01**round_) if changing else STEP_TOL
             extinction = math.exp(now[0]) + math.exp(now[1])
             base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
             for f in range(fibres):
@@ -193,7 +193,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                 longest = 0.0
                 for p in range(4):
                     longest = max(longest, abs(x[p]))
-                shrink = min(1.0, MOST_STEP / max(longest, 1e-300))
+                shrink = min(1.0, MAX_LOG_STEP / max(longest, 1e-300))
                 longest = 0.0
                 for p in range(4):
                     to = now[p] + shrink * x[p]
@@ -230,7 +230,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                     if damping > 1e10:
                         settled = longest < 1e-6
                         break
-            if not changing or (first and close <= CLOSE):
+            if not changing or (first and close <= STEP_TOL):
                 break
         steps[n] = done if settled else -done
         chi2[n] = best

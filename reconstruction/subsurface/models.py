@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -23,12 +23,14 @@ from reconstruction.subsurface import kernels
 Method = Literal["photon_table", "diffusion", "dipole"]
 METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
 Collection = Literal["all", "fibre"]
+G_SKIN, G_SKIN_SIGMA = 0.825, 0.072
+"""Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""
 
-SIGMA_A_LIMITS = (1e-6, 100.0)
-SIGMA_S_LIMITS = (1e-3, 1e3)
-SCALE_LIMITS = (1e-3, 1e3)
+SIGMA_A_RANGE = (1e-6, 100.0)
+SIGMA_S_RANGE = (1e-3, 1e3)
+SCALE_RANGE = (1e-3, 1e3)
 """Of the closed forms, 1/mm and 1: beyond them nothing that a probe reads changes any more."""
-MOST_RATIO = 0.3
+MAX_DIFFUSION_RATIO = 0.3
 """sigma_a/sigma_s' up to which diffusion is within some 25 % of transport beside a fibre."""
 DIFFUSION_ERROR = np.array([0.03, 0.4, 0.8])
 """Relative: in the middle of a profile of weak absorption, at the source, by sigma_a/sigma_s'.
@@ -39,25 +41,39 @@ DIFFUSION_BIAS, DIPOLE_BIAS = (0.02, 0.25), (0.1, 0.15)
 from -1 to -14 % and -5 to -22 %."""
 DIPOLE_ERROR = np.array([0.1, 0.0, 0.0])
 """Equal weights; the dipole is off by more than that."""
-START_RATIO = 15.0
+MAX_START_RATIO = 15.0
 """Greatest sigma_a/sigma_s' that a fit begins with."""
-TABLE_SIGMA_S = (0.05, 200.0)
+TABLE_SIGMA_S_RANGE = (0.05, 200.0)
 """Of the table, 1/mm; layered tissue may look like more scattering than any medium has."""
 TABLE_ERROR = np.array([0.005, 0.0, 0.0])
 """Relative: the table's own noise."""
-DIFFUSE_FROM = 30.0
+MIN_DIFFUSE_DISTANCE = 30.0
 """Distance in 1/sigma_s' from which weakly absorbed light is diffuse: the table over Kienle and
 Patterson's diffusion changes by no more than its own noise beyond. Its last nodes, at 45 to 50, are
 off by up to 3 % under next to no absorption, and beyond it is no table."""
-DIFFUSE_RATIO = (0.003, 0.01)
+DIFFUSE_RATIO_RANGE = (0.003, 0.01)
 """sigma_a/sigma_s' up to which diffusion continues the table, and from which it does not."""
 START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
 START_SIGMA_S = np.geomspace(0.06, 190.0, 19)
 """The pairs that each profile is compared with to find its starts, 1/mm."""
-CACHED = 1024
+PROFILES_PER_BLOCK = 1024
 """Profiles whose misfits stay in the cache."""
-LEAST_LOG = -100.0
+MIN_LOG_REFLECTANCE = -100.0
 """Logarithms of reflectance below this are as good as none, for starts."""
+
+
+class Optics(NamedTuple):
+    """What light meets between the source and a fiber."""
+
+    eta: float = fresnel.ETA_SKIN
+    """Refractive index of the medium over that outside, at least 1."""
+    collection: Collection = "all"
+    core_mm: float = 0.0
+    source_core_mm: float = 0.0
+    """These three as of `model.photon_table.reflectance`; closed forms do without."""
+    g: float = G_SKIN
+    g_error: float = G_SKIN_SIGMA
+    """The asymmetry's prior; closed forms do without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +84,16 @@ class ProfileModel:
     ----------
     radius_mm : ndarray, shape (F,)
     kind : int
-        As `subsurface_kernels.fit` takes it.
+        As `levenberg_marquardt.fit` takes it.
     constants, axes, grid : ndarray
         Likewise.
     bounds : ndarray, shape (4, 2)
         Of log sigma_a, log sigma_s', log of the common factor, g.
     error : ndarray, shape (3,)
-        Relative model error as `subsurface_kernels.fit` takes it.
+        Relative model error as `levenberg_marquardt.fit` takes it.
     bias : tuple of float
         Relative systematic error of sigma_tr, and its growth with sigma_a/sigma_s'.
-    most_ratio : float
+    max_ratio : float
         Greatest sigma_a/sigma_s' that the model is good for.
     """
 
@@ -89,12 +105,12 @@ class ProfileModel:
     bounds: Float64Array
     error: Float64Array
     bias: tuple[float, float]
-    most_ratio: float
+    max_ratio: float
 
     def profiles(self, theta: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return profiles (N, F), 1/mm^2, of parameters (N, 4), and derivatives (N, 4, F)."""
         out = np.empty((theta.shape[0], self.radius_mm.size))
-        slopes = np.zeros((theta.shape[0], kernels.PARAMETERS, self.radius_mm.size))
+        slopes = np.zeros((theta.shape[0], kernels.N_PARAMETERS, self.radius_mm.size))
         kernels.evaluate(
             self.kind,
             np.ascontiguousarray(theta),
@@ -107,9 +123,15 @@ class ProfileModel:
         )
         return out, slopes
 
-    def holds(self, theta: Float64Array) -> BoolArray:
+    def contains(self, theta: Float64Array) -> BoolArray:
         """Return where the model is good for parameters (N, 4)."""
-        return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
+        return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.max_ratio))
+
+    def at_bound(self, theta: Float64Array) -> BoolArray:
+        """Return where sigma_a or sigma_s' of parameters (N, 4) is at its limit."""
+        low, high = self.bounds[:2].T
+        pair = theta[:, :2]
+        return np.asarray(((pair <= low + 1e-6) | (pair >= high - 1e-6)).any(axis=1))
 
     def relative_variance(self, theta: Float64Array) -> Float64Array:
         """Return the model's own squared relative error at every fibre, (N, F)."""
@@ -153,22 +175,22 @@ class ProfileModel:
             How much worse the second is, as sum of weighted squares; infinite without a second.
         """
         log_k, log_s = np.log(START_SIGMA_TR), np.log(START_SIGMA_S)
-        theta = np.zeros((log_s.size, log_k.size, kernels.PARAMETERS))
+        theta = np.zeros((log_s.size, log_k.size, kernels.N_PARAMETERS))
         theta[..., 0] = _log_absorption(log_k, log_s[:, None])
         theta[..., 1], theta[..., 3] = log_s[:, None], g
-        outside = (theta[..., 0] - theta[..., 1] > np.log(START_RATIO)) | np.any(
+        outside = (theta[..., 0] - theta[..., 1] > np.log(MAX_START_RATIO)) | np.any(
             (theta < self.bounds[:, 0]) | (theta > self.bounds[:, 1]), axis=2
         )
-        profiles = self.profiles(theta.reshape(-1, kernels.PARAMETERS))[0]
-        curves = np.log(np.maximum(profiles, np.exp(LEAST_LOG)))
+        profiles = self.profiles(theta.reshape(-1, kernels.N_PARAMETERS))[0]
+        curves = np.log(np.maximum(profiles, np.exp(MIN_LOG_REFLECTANCE)))
         middle = np.median(curves, axis=0)  # single precision has digits enough for the rest
         curves = (curves - middle).astype(np.float32)
         grid = np.concatenate([-2.0 * curves, curves**2], axis=1).T
         nowhere = np.where(outside.ravel(), np.float32(np.inf), np.float32(0.0))
         place, depth = np.empty((2, 2, len(weight)))
         valley = np.empty((2, len(weight)), np.int64)
-        for begin in range(0, len(weight), CACHED):
-            part = slice(begin, begin + CACHED)
+        for begin in range(0, len(weight), PROFILES_PER_BLOCK):
+            part = slice(begin, begin + PROFILES_PER_BLOCK)
             given = weight[part].astype(np.float32)
             off = (log_reflectance[part] - middle).astype(np.float32)
             with _blas().limit(limits=1):  # threads would wait for one another
@@ -187,12 +209,12 @@ class ProfileModel:
             )
         ends = []
         for which, at in zip(valley, place, strict=True):
-            start = np.zeros((which.size, kernels.PARAMETERS))
+            start = np.zeros((which.size, kernels.N_PARAMETERS))
             refined = log_k[0] + at * (log_k[1] - log_k[0])
             start[:, 0] = _log_absorption(refined, log_s[which])
             start[:, 1], start[:, 3] = log_s[which], g
             if common_error > 0.0:
-                shown = np.log(np.maximum(self.profiles(start)[0], np.exp(LEAST_LOG)))
+                shown = np.log(np.maximum(self.profiles(start)[0], np.exp(MIN_LOG_REFLECTANCE)))
                 off = (weight * (log_reflectance - shown)).sum(axis=1)
                 start[:, 2] = off / (weight.sum(axis=1) + common_error**-2)
             ends.append(np.clip(start, self.bounds[:, 0], self.bounds[:, 1]))
@@ -212,103 +234,80 @@ def _log_absorption(log_sigma_tr: Float64Array, log_sigma_s: Float64Array) -> Fl
     return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
 
 
-def profile_model(
-    method: Method,
-    radius_mm: Float64Array,
-    *,
-    eta: float,
-    collection: Collection,
-    core_mm: float,
-    source_core_mm: float,
-    g: float,
-    g_error: float,
-) -> ProfileModel:
-    """Return a method's model at some radii.
-
-    Parameters
-    ----------
-    method : {"photon_table", "diffusion", "dipole"}
-    radius_mm : ndarray, shape (F,)
-    eta : float
-        Refractive index of the medium over that outside, at least 1.
-    collection, core_mm, source_core_mm
-        As of `model.photon_table.reflectance`; closed forms do without.
-    g, g_error : float
-        The asymmetry's prior; closed forms do without.
-    """
+def profile_model(method: Method, radius_mm: Float64Array, optics: Optics) -> ProfileModel:
+    """Return a method's model at some radii (F,)."""
     if method == "photon_table":
-        return _tabled(radius_mm.tobytes(), eta, collection, core_mm, source_core_mm, g, g_error)
-    nothing = np.ones((3, 2))
-    bounds = np.log(np.array([SIGMA_A_LIMITS, SIGMA_S_LIMITS, SCALE_LIMITS, (1.0, 1.0)]))
-    bounds[3] = 0.0, 1.0
-    constants, error, bias = _CLOSED[method](eta)
+        return _tabled(radius_mm.tobytes(), optics)
+    constants, error, bias = _CLOSED[method](optics.eta)
     return ProfileModel(
-        radius_mm, 0, constants, nothing, np.zeros((1, 1, 1, 1)), bounds, error, bias, MOST_RATIO
+        radius_mm=radius_mm,
+        kind=0,
+        constants=constants,
+        axes=np.ones((3, 2)),
+        grid=np.zeros((1, 1, 1, 1)),
+        bounds=_bounds(SIGMA_S_RANGE, (0.0, 1.0)),
+        error=error,
+        bias=bias,
+        max_ratio=MAX_DIFFUSION_RATIO,
     )
 
 
+def _bounds(sigma_s: tuple[float, float], g: tuple[float, float]) -> Float64Array:
+    return np.vstack([np.log(np.array([SIGMA_A_RANGE, sigma_s, SCALE_RANGE])), g])
+
+
 @lru_cache(maxsize=16)
-def _tabled(
-    radius: bytes,
-    eta: float,
-    collection: Collection,
-    core_mm: float,
-    source_core_mm: float,
-    g: float,
-    g_error: float,
-) -> ProfileModel:
+def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
     """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
     radius_mm = np.frombuffer(radius, np.float64).copy()  # not read-only: one kernel for all
     held = photon_table.asymmetries()
-    low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
+    low = max(optics.g - 3.0 * optics.g_error, held[0])
+    high = min(optics.g + 3.0 * optics.g_error, held[-1])
     count = 4 if high - low > 1e-6 else 1
-    asymmetries = np.linspace(low, high, count)
     # a single asymmetry is for layered tissue, which looks like media of much scattering: between
     # nodes log R bends with sigma_tr r, which grows with it
     fine = 0.075 if count > 1 else 0.0375
     steps = np.array([0.1, fine, (high - low) / 3.0 if count > 1 else 1.0])
-    logs = np.arange(np.log(TABLE_SIGMA_S[0]), np.log(TABLE_SIGMA_S[1]) + steps[0], steps[0])
+    first, last = np.log(TABLE_SIGMA_S_RANGE)
+    logs = np.arange(first, last + steps[0], steps[0])
     most = np.log1p(10.0 * np.sqrt(photon_table.MAX_ABSORPTION_RATIO))
     roots = np.arange(0.0, most + steps[1], steps[1])
     s = np.exp(logs)[:, None]
     a = s * (0.1 * np.expm1(roots)) ** 2
     grid = np.empty((*a.shape, count, radius_mm.size))
     decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
-    for n, each in enumerate(asymmetries):
+    a, s = a[..., None], s[..., None]
 
-        def told(
-            r: Float64Array, own_mm: float, source_mm: float, g: float = float(each)
-        ) -> Float64Array:
-            profile = photon_table.reflectance(
-                r,
-                a[..., None],
-                s[..., None],
-                eta=eta,
-                g=g,
-                collection=collection,
-                core_mm=own_mm,
-                source_core_mm=source_mm,
-            )
-            return np.asarray(np.log(np.maximum(profile, 1e-290)))
+    def log_table(r: Float64Array, g: float, cores_mm: tuple[float, float]) -> Float64Array:
+        profile = photon_table.reflectance(
+            r,
+            a,
+            s,
+            eta=optics.eta,
+            g=g,
+            collection=optics.collection,
+            core_mm=cores_mm[0],
+            source_core_mm=cores_mm[1],
+        )
+        return np.asarray(np.log(np.maximum(profile, 1e-290)))
 
-        # of points, as light turns diffuse within the cores of fibres where much is scattered
-        end = told(DIFFUSE_FROM / s[..., None], 0.0, 0.0)
-        point = np.where(radius_mm > 0.0, radius_mm, radius_mm.max(initial=1.0))
-        beyond = _diffused(told(point, 0.0, 0.0), point, a[..., None], s[..., None], end, eta)
-        grid[:, :, n] = told(radius_mm, core_mm, source_core_mm) + beyond + decay
-    bounds = np.log(np.array([SIGMA_A_LIMITS, TABLE_SIGMA_S, SCALE_LIMITS, (1.0, 1.0)]))
-    bounds[3] = low, high
-    axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
+    points, cores_mm = (0.0, 0.0), (optics.core_mm, optics.source_core_mm)
+    for n, g in enumerate(np.linspace(low, high, count).tolist()):
+        # of points, as light turns diffuse within the cores of fibers where much is scattered
+        end = log_table(MIN_DIFFUSE_DISTANCE / s, g, points)
+        r = np.where(radius_mm > 0.0, radius_mm, radius_mm.max(initial=1.0))
+        beyond = _diffused(log_table(r, g, points), r, a, s, end, optics.eta)
+        grid[:, :, n] = log_table(radius_mm, g, cores_mm) + beyond + decay
     return ProfileModel(
-        radius_mm,
-        kernels.TABLE,
-        np.zeros(4),
-        axes,
-        grid,
-        bounds,
-        TABLE_ERROR,
-        (0.0, 0.0),
-        photon_table.MAX_ABSORPTION_RATIO,
+        radius_mm=radius_mm,
+        kind=kernels.TABLE_MODEL,
+        constants=np.zeros(4),
+        axes=np.stack([np.array([logs[0], roots[0], low]), steps], axis=1),
+        grid=grid,
+        bounds=_bounds(TABLE_SIGMA_S_RANGE, (low, high)),
+        error=TABLE_ERROR,
+        bias=(0.0, 0.0),
+        max_ratio=photon_table.MAX_ABSORPTION_RATIO,
     )
 
 
@@ -329,10 +328,12 @@ def _diffused(
     radius_mm, a, s
         That broadcast to the table.
     """
-    near, far = DIFFUSE_RATIO
-    share = np.clip((far - a / s) / (far - near), 0.0, 1.0) * (radius_mm * s > DIFFUSE_FROM)
+    near, far = DIFFUSE_RATIO_RANGE
+    distance = MIN_DIFFUSE_DISTANCE / s
+    share = np.clip((far - a / s) / (far - near), 0.0, 1.0)
+    share = share * (radius_mm * s > MIN_DIFFUSE_DISTANCE)
     weak = np.minimum(a, far * s)  # the rest is not asked for
-    there, end = (diffusion.reflectance(r, weak, s, eta) for r in (radius_mm, DIFFUSE_FROM / s))
+    there, end = (diffusion.reflectance(r, weak, s, eta) for r in (radius_mm, distance))
     continued = log_end + np.log(np.maximum(there, 1e-290)) - np.log(np.maximum(end, 1e-290))
     return np.asarray(share * (continued - log_profile))
 

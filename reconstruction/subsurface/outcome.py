@@ -11,26 +11,27 @@ from scipy.special import gammaincc, stdtrit
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, UInt16Array
 from reconstruction.subsurface.models import Method
-from reconstruction.subsurface.profile_batch import FEWEST_READINGS, MISFIT_CHANCE, ProfileBatch
+from reconstruction.subsurface.profile_batch import Fits, LeftOut, ProfileBatch
+from reconstruction.subsurface.profile_fit import MIN_OBSERVED_FIBERS, MISFIT_P_VALUE
 
-FEWEST_FIBRES = 4
-LOG_LIMIT = 0.5
+MIN_FIBERS = 4
+MAX_LOG_STDERR = 0.5
 """Standard error of log sigma_tr above which the profile does not tell it."""
-COEFFICIENT_LIMIT = 0.3
+MAX_PAIR_LOG_STDERR = 0.3
 """Likewise of log sigma_a and log sigma_s', which is said apart."""
-FAR_OFF = 0.7
+MAX_LOG_RMS = 0.7
 """Root mean square of log(reading / model) above which a profile is of no such medium."""
-MOST_SPREAD = 0.5
+MAX_MODEL_ERROR = 0.5
 """Relative model error found from the residuals, likewise."""
-MOST_CORRELATION = 0.9
+MAX_CORRELATION = 0.9
 """Of residuals of neighbouring fibres."""
-CLEAR = 0.2
+MAX_SYMMETRIC_LOG_STDERR = 0.2
 """Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
-SHARE = 0.6827
+INTERVAL_PROBABILITY = 0.6827
 """Of the interval."""
-BY_CHANCE = 2.0
+CHANCE_SIGMAS = 2.0
 """Standard deviations of the correlation of independent neighbours up to which it says nothing."""
-MOST_OFF = 2.0
+MAX_RELATIVE_MISFIT = 2.0
 """Times the misfit that a fibre counts there at most: one must not hide what all others say."""
 
 
@@ -50,9 +51,9 @@ class Outcome(IntFlag):
 
 
 _INVALID = 255
-REASONS = {
-    Outcome.TOO_FEW_FIBRES: f"fewer than {FEWEST_FIBRES} fibres to use",
-    Outcome.NO_SIGNAL: f"fewer than {FEWEST_READINGS} fibres stand out of their noise",
+_REASONS = {
+    Outcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} fibres to use",
+    Outcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibres stand out of their noise",
     Outcome.NOT_CONVERGED: "the fit did not settle",
     Outcome.AT_BOUND: "a coefficient runs against its limit",
     Outcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
@@ -61,8 +62,6 @@ REASONS = {
     Outcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
     Outcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
 }
-LEFT_OUT = ("used", "masked", "not finite", "no variance", "not above zero", "outlier")
-"""Meaning of `SubsurfaceFit.left_out`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +98,7 @@ class SubsurfaceFit:
         by themselves, as by dirt, do not agree. False without a misfit.
     used : ndarray of bool, shape (..., F)
     left_out : ndarray of uint8, shape (..., F)
-        Index into `LEFT_OUT`, 0 where used.
+        Values of `LeftOut`.
     outcome : ndarray of uint16, shape (...)
         Bits of `Outcome`.
     predicted_per_mm2 : ndarray, shape (..., F)
@@ -172,138 +171,146 @@ class SubsurfaceFit:
             Of the leading axes; () for a single profile.
         """
         code = int(self.outcome[index])
-        return "; ".join(text for bit, text in REASONS.items() if code & bit)
+        return "; ".join(text for bit, text in _REASONS.items() if code & bit)
 
 
-def judged(
+def evaluate_fits(
     batch: ProfileBatch,
-    bounds: Float64Array,
-    inside: BoolArray,
-    bias: Float64Array,
-    left_out: UInt8Array,
+    fits: Fits,
     shape: tuple[int, ...],
     method: Method,
+    *,
+    by_definition: bool = False,
 ) -> SubsurfaceFit:
-    """Return estimates with errors, and say which can be used."""
-    a, s = np.exp(batch.theta[:, 0]), np.exp(batch.theta[:, 1])
+    """Return estimates with errors, and which of them can be used.
+
+    Parameters
+    ----------
+    shape
+        Leading axes of the estimates.
+    by_definition
+        Whether the model's error is no error of what is estimated.
+    """
+    a, s = np.exp(fits.theta[:, 0]), np.exp(fits.theta[:, 1])
     sigma_tr = np.sqrt(3.0 * a * (a + s))
-    fibres = batch.used.sum(axis=1)
-    dof = np.maximum(fibres - 2, 0)
-    p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
-    reduced = batch.chi2 / np.maximum(dof, 1)
-    misfit: BoolArray = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_CHANCE)
+    fibers = fits.used.sum(axis=1)
+    dof = np.maximum(fibers - 2, 0)
+    p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, fits.chi2 / 2.0), 1.0)
+    reduced = fits.chi2 / np.maximum(dof, 1)
+    misfit: BoolArray = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_P_VALUE)
     inflation = np.where(
         (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
     )
-    residual = _residuals(batch)
-    widening = np.where((batch.spread > 0.0) & batch.erring, _repeats(residual), 1.0)
+    residual = _residuals(batch, fits)
+    widening = np.ones(a.shape)
     if batch.logarithmic:
         widening = inflation**2
-    logs = batch.covariance[:, :2, :2] * widening[:, None, None]
+    elif not by_definition:
+        widening = np.where(fits.model_error > 0.0, _repeats(residual), 1.0)
+    logs = fits.covariance[:, :2, :2] * widening[:, None, None]
     slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
-    told = np.asarray(np.isfinite(logs).all(axis=(1, 2)))
-    safe = np.where(told[:, None, None], logs, 0.0)
+    known = np.asarray(np.isfinite(logs).all(axis=(1, 2)))
+    safe = np.where(known[:, None, None], logs, 0.0)
     log_variance = np.einsum("ni,nij,nj->n", slope, safe, slope)
-    log_stderr = np.where(told, np.sqrt(np.maximum(log_variance, 0.0) + bias**2), math.inf)
+    log_stderr = np.where(known, np.sqrt(np.maximum(log_variance, 0.0) + fits.bias**2), math.inf)
+    pair_stderr = np.where(known, np.sqrt(np.maximum(safe[:, 0, 0], safe[:, 1, 1])), math.inf)
     scales = np.stack([a, s], axis=1)
     covariance = safe * scales[:, :, None] * scales[:, None, :]
-    covariance[~told] = math.inf
-    apart = np.where(told, np.sqrt(np.maximum(safe[:, 0, 0], safe[:, 1, 1])), math.inf)
+    covariance[~known] = math.inf
 
-    seen = batch.seen.sum(axis=1)
-    with np.errstate(divide="ignore"):
-        off = (
-            batch.y - np.log(batch.predicted)
-            if batch.logarithmic
-            else (
-                np.log(np.where(batch.seen, batch.y, 1.0))
-                - np.log(np.maximum(batch.predicted, 1e-290))
-            )
-        )
-    far = np.sqrt(np.where(batch.seen, off**2, 0.0).sum(axis=1) / np.maximum(seen, 1))
-    at_bound = (
-        (batch.theta[:, :2] <= bounds[:2, 0] + 1e-6) | (batch.theta[:, :2] >= bounds[:2, 1] - 1e-6)
-    ).any(axis=1)
-    outcome = np.zeros(a.shape, np.uint16)
-    for bit, where in (
-        (Outcome.TOO_FEW_FIBRES, fibres < FEWEST_FIBRES),
-        (Outcome.NO_SIGNAL, (fibres >= FEWEST_FIBRES) & (seen < FEWEST_READINGS)),
-        (Outcome.NOT_CONVERGED, batch.steps < 0),
-        (Outcome.AT_BOUND, at_bound),
-        (Outcome.OUTSIDE_DOMAIN, ~inside),
-        (Outcome.NOT_IDENTIFIED, log_stderr > LOG_LIMIT),
-        (Outcome.WRONG_PROFILE, (far > FAR_OFF) | (batch.spread > MOST_SPREAD)),
-        (Outcome.MISFIT, misfit),
-        (Outcome.COEFFICIENTS_NOT_IDENTIFIED, apart > COEFFICIENT_LIMIT),
-    ):
-        outcome[where] |= np.uint16(bit)
+    outcome = _outcomes(batch, fits, misfit, log_stderr, pair_stderr)
     nothing = (outcome & np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)) != 0
-    outcome[nothing] &= np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)
     for estimate in (a, s, sigma_tr, p_value):
         estimate[nothing] = math.nan
     covariance[nothing] = math.inf
     log_stderr[nothing] = math.inf
     reach = np.full(a.shape, 1.0)
     if batch.logarithmic:  # the noise itself is known from few residuals
-        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * SHARE)
-    low, high = _interval(sigma_tr, log_stderr * reach)
-    fibres_in_all = batch.y.shape[1]
-    left_out = np.where(batch.odd, np.uint8(LEFT_OUT.index("outlier")), left_out)
-    predicted = np.where(nothing[:, None], math.nan, batch.predicted)
-    return SubsurfaceFit(
-        sigma_a_per_mm=a.reshape(shape),
-        sigma_s_prime_per_mm=s.reshape(shape),
-        sigma_tr_per_mm=sigma_tr.reshape(shape),
-        covariance=covariance.reshape((*shape, 2, 2)),
-        valid=((outcome & np.uint16(_INVALID)) == 0).reshape(shape),
-        sigma_tr_stderr=_deviation(sigma_tr, log_stderr).reshape(shape),
-        interval_per_mm=np.stack([low, high], axis=-1).reshape((*shape, 2)),
-        chi2=batch.chi2.reshape(shape),
-        dof=dof.reshape(shape),
-        p_value=p_value.reshape(shape),
-        inflation=inflation.reshape(shape),
-        model_error=batch.spread.reshape(shape),
-        bent=_bent(batch).reshape(shape),
-        used=batch.used.reshape((*shape, fibres_in_all)),
-        left_out=left_out.reshape((*shape, fibres_in_all)),
-        outcome=outcome.reshape(shape),
-        predicted_per_mm2=predicted.reshape((*shape, fibres_in_all)),
-        residual=residual.reshape((*shape, fibres_in_all)),
-        scale=np.exp(batch.theta[:, 2]).reshape(shape),
-        asymmetry=batch.theta[:, 3].reshape(shape),
-        evaluations=np.abs(batch.steps).reshape(shape),
-        method=method,
-    )
+        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * INTERVAL_PROBABILITY)
+    arrays = {
+        "sigma_a_per_mm": a,
+        "sigma_s_prime_per_mm": s,
+        "sigma_tr_per_mm": sigma_tr,
+        "covariance": covariance,
+        "valid": (outcome & np.uint16(_INVALID)) == 0,
+        "sigma_tr_stderr": _deviation(sigma_tr, log_stderr),
+        "interval_per_mm": np.stack(_interval(sigma_tr, log_stderr * reach), axis=-1),
+        "chi2": fits.chi2,
+        "dof": dof,
+        "p_value": p_value,
+        "inflation": inflation,
+        "model_error": fits.model_error,
+        "bent": _bent(batch, fits),
+        "used": fits.used,
+        "left_out": np.where(fits.outlier, np.uint8(LeftOut.OUTLIER), batch.left_out),
+        "outcome": outcome,
+        "predicted_per_mm2": np.where(nothing[:, None], math.nan, fits.predicted),
+        "residual": residual,
+        "scale": np.exp(fits.theta[:, 2]),
+        "asymmetry": fits.theta[:, 3],
+        "evaluations": np.abs(fits.steps),
+    }
+    rows = {name: array.reshape((*shape, *array.shape[1:])) for name, array in arrays.items()}
+    return SubsurfaceFit(**rows, method=method)
 
 
-def _residuals(batch: ProfileBatch) -> Float64Array:
-    """Return residuals over their standard deviations, (N, F), 0 where a fibre is not used."""
-    value = batch.predicted
-    if batch.logarithmic:
-        value = np.log(np.maximum(value, 1e-290))
+def _outcomes(
+    batch: ProfileBatch,
+    fits: Fits,
+    misfit: BoolArray,
+    log_stderr: Float64Array,
+    pair_stderr: Float64Array,
+) -> UInt16Array:
+    """Return bits of `Outcome`, (N,), by the errors of log sigma_tr and of the coefficients."""
+    fibers, observed = fits.used.sum(axis=1), fits.observed.sum(axis=1)
+    y = batch.y if batch.logarithmic else np.log(np.where(fits.observed, batch.y, 1.0))
+    square = np.where(fits.observed, (y - fits.log_predicted) ** 2, 0.0)
+    off = np.sqrt(square.sum(axis=1) / np.maximum(observed, 1))
+    outcome = np.zeros(fibers.shape, np.uint16)
+    for bit, where in (
+        (Outcome.TOO_FEW_FIBRES, fibers < MIN_FIBERS),
+        (Outcome.NO_SIGNAL, (fibers >= MIN_FIBERS) & (observed < MIN_OBSERVED_FIBERS)),
+        (Outcome.NOT_CONVERGED, fits.steps < 0),
+        (Outcome.AT_BOUND, fits.at_bound),
+        (Outcome.OUTSIDE_DOMAIN, ~fits.in_domain),
+        (Outcome.NOT_IDENTIFIED, log_stderr > MAX_LOG_STDERR),
+        (Outcome.WRONG_PROFILE, (off > MAX_LOG_RMS) | (fits.model_error > MAX_MODEL_ERROR)),
+        (Outcome.MISFIT, misfit),
+        (Outcome.COEFFICIENTS_NOT_IDENTIFIED, pair_stderr > MAX_PAIR_LOG_STDERR),
+    ):
+        outcome[where] |= np.uint16(bit)
+    alone = np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)
+    outcome[(outcome & alone) != 0] &= alone
+    return outcome
+
+
+def _residuals(batch: ProfileBatch, fits: Fits) -> Float64Array:
+    """Return residuals over their standard deviations, (N, F), 0 where a fiber is not used."""
+    value = fits.log_predicted if batch.logarithmic else fits.predicted
     residual = np.zeros(batch.y.shape)
-    np.divide(batch.y - value, np.sqrt(batch.total), out=residual, where=batch.used)
+    np.divide(batch.y - value, np.sqrt(fits.total), out=residual, where=fits.used)
     return residual
 
 
-def _bent(batch: ProfileBatch) -> BoolArray:
-    """Return whose neighbouring fibres agree about the misfit by more than chance, (N,).
+def _bent(batch: ProfileBatch, fits: Fits) -> BoolArray:
+    """Return whose neighboring fibers agree about the misfit by more than chance, (N,).
 
-    By their correlation, of fibres as far as their noise is below the misfit: that of n
+    By their correlation, of fibers as far as their noise is below the misfit: that of n
     independent ones is off from 0 by 1 / sqrt(n).
     """
-    there = batch.used & (batch.spread[:, None] > 0.0)
-    m, y = np.where(there, batch.predicted, 1.0), np.where(there, batch.y, 0.0)
+    model_error = fits.model_error[:, None]
+    there = fits.used & (model_error > 0.0)
+    m, y = np.where(there, fits.predicted, 1.0), np.where(there, batch.y, 0.0)
     noise = np.where(there, batch.variance, 0.0) / (1.0 if batch.logarithmic else m**2)
-    square = np.broadcast_to(batch.spread[:, None] ** 2, y.shape)
-    share = np.divide(square, square + noise, out=np.zeros(y.shape), where=there)
+    square = np.broadcast_to(model_error**2, y.shape)
+    weight = np.divide(square, square + noise, out=np.zeros(y.shape), where=there)
     off = y - np.log(m) if batch.logarithmic else y / m - 1.0
-    most = MOST_OFF * batch.spread[:, None]
-    off = share * np.clip(off, -most, most)
-    pairs = np.maximum((share[:, 1:] * share[:, :-1]).sum(axis=1), 1e-290)
-    alone = np.maximum((share**2).sum(axis=1), 1e-290)
+    most = MAX_RELATIVE_MISFIT * model_error
+    off = weight * np.clip(off, -most, most)
+    pairs = np.maximum((weight[:, 1:] * weight[:, :-1]).sum(axis=1), 1e-290)
+    alone = np.maximum((weight**2).sum(axis=1), 1e-290)
     alike = (off[:, 1:] * off[:, :-1]).sum(axis=1) / pairs
-    return np.asarray(alike > BY_CHANCE / np.sqrt(pairs) * (off**2).sum(axis=1) / alone)
+    return np.asarray(alike > CHANCE_SIGMAS / np.sqrt(pairs) * (off**2).sum(axis=1) / alone)
 
 
 def _repeats(residual: Float64Array) -> Float64Array:
@@ -314,7 +321,7 @@ def _repeats(residual: Float64Array) -> Float64Array:
     """
     squares = np.maximum((residual**2).sum(axis=1), 1e-290)
     c = (residual[:, 1:] * residual[:, :-1]).sum(axis=1) / squares
-    c = np.clip(c, 0.0, MOST_CORRELATION)
+    c = np.clip(c, 0.0, MAX_CORRELATION)
     return np.asarray((1.0 + c) / (1.0 - c))
 
 
@@ -326,7 +333,7 @@ def _interval(
     Symmetric in the logarithm while that is well told; then in sigma_tr^2, which a profile is
     linear in where the absorption is next to none.
     """
-    clear = log_stderr < CLEAR
+    clear = log_stderr < MAX_SYMMETRIC_LOG_STDERR
     spread = np.where(clear, log_stderr, 0.0)
     low, high = sigma_tr * np.exp(-spread), sigma_tr * np.exp(spread)
     wide = np.where(np.isfinite(log_stderr), 2.0 * log_stderr, 0.0)
@@ -341,5 +348,5 @@ def _deviation(sigma_tr: Float64Array, log_stderr: Float64Array) -> Float64Array
     low, high = _interval(sigma_tr, log_stderr)
     half = np.full(sigma_tr.shape, math.inf)
     np.subtract(0.5 * high, 0.5 * low, out=half, where=np.isfinite(high) & np.isfinite(low))
-    known = np.isfinite(sigma_tr) & (log_stderr < CLEAR)
+    known = np.isfinite(sigma_tr) & (log_stderr < MAX_SYMMETRIC_LOG_STDERR)
     return np.where(known, np.where(known, sigma_tr, 0.0) * np.where(known, log_stderr, 0.0), half)

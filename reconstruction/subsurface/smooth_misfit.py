@@ -20,13 +20,13 @@ import numpy as np
 
 from reconstruction.arrays import Float64Array
 
-STRENGTHS: Final = np.geomspace(1e-3, 1e3, 31)
+BEND_STRENGTHS: Final = np.geomspace(1e-3, 1e3, 31)
 """Of the second derivative by the root of mm, variance over a root of mm: from next to straight
 lines to those that follow every fibre."""
-USUAL, SPREAD = 1.0, 1.5
+PRIOR_STRENGTH, PRIOR_LOG_SIGMA = 1.0, 1.5
 """Of strengths: the median of simulated skin of two layers (presets I to VI, three sites, seeds 0
 to 19), and a standard deviation of the logarithm half as large again as theirs, 0.9."""
-WEAKEST: Final = 1e-6
+MIN_INFORMATION: Final = 1e-6
 """Information of a reading that is none, so that even without any the rest is finite."""
 
 
@@ -61,10 +61,11 @@ def smooth_misfit(
     """
     order = np.argsort(radius_mm)
     bend, mass = _bends(np.sqrt(radius_mm[order]))
-    weight = np.full(variance.shape, WEAKEST)
-    np.divide(1.0, variance, out=weight, where=variance < 1.0 / WEAKEST)
-    told = np.where(weight > WEAKEST, value, 0.0)
-    strength = STRENGTHS[log_posterior(bend, mass, told[:, order], weight[:, order]).argmax(axis=1)]
+    weight = np.full(variance.shape, MIN_INFORMATION)
+    np.divide(1.0, variance, out=weight, where=variance < 1.0 / MIN_INFORMATION)
+    told = np.where(weight > MIN_INFORMATION, value, 0.0)
+    likely = log_posterior(bend, mass, told[:, order], weight[:, order])
+    strength = BEND_STRENGTHS[likely.argmax(axis=1)]
     penalty = np.empty((order.size, order.size))
     penalty[np.ix_(order, order)] = bend @ np.linalg.solve(mass, bend.T)
     covariance = np.linalg.inv(_whole(weight, penalty, strength))
@@ -74,7 +75,7 @@ def smooth_misfit(
 def log_posterior(
     bend: Float64Array, mass: Float64Array, value: Float64Array, weight: Float64Array
 ) -> Float64Array:
-    """Return twice the logarithm of how likely each of `STRENGTHS` is, up to a constant.
+    """Return twice the logarithm of how likely each of `BEND_STRENGTHS` is, up to a constant.
 
     With Q and R of the penalty Q R^-1 Q' and W the weights, what is left after level and slope is
     Q' y, of covariance s R + Q' W^-1 Q: five diagonals, so that all strengths take as many steps as
@@ -107,17 +108,17 @@ def log_posterior(
             rest[k] -= lowest[k - 2] * rest[k - 2]
         lower[k] = whole[1][k] / pivot[k]
         lowest[k] = whole[2][k] / pivot[k]
-    usual = (np.log(STRENGTHS / USUAL) / SPREAD) ** 2
+    usual = (np.log(BEND_STRENGTHS / PRIOR_STRENGTH) / PRIOR_LOG_SIGMA) ** 2
     return np.asarray(-(rest**2 / pivot + np.log(pivot)).sum(axis=0) - usual)
 
 
 def _below(bend: Float64Array, mass: Float64Array, variance: Float64Array, by: int) -> Float64Array:
-    """Return a diagonal of s R + Q' V Q for each of `STRENGTHS`, (F - 2, N, S); 0 past its end."""
+    """Return a diagonal of s R + Q' V Q for each strength, (F - 2, N, S); 0 past its end."""
     inner = np.arange(mass.shape[0] - by)
     pairs = bend[:, inner] * bend[:, inner + by]
-    out = np.zeros((mass.shape[0], len(variance), STRENGTHS.size))
+    out = np.zeros((mass.shape[0], len(variance), BEND_STRENGTHS.size))
     out[: inner.size] = (variance @ pairs).T[..., None]
-    out[: inner.size] += (mass[inner, inner + by])[:, None, None] * STRENGTHS
+    out[: inner.size] += (mass[inner, inner + by])[:, None, None] * BEND_STRENGTHS
     return out
 
 

@@ -18,10 +18,9 @@ Weyrich et al. 2005, MERL TR2005-071, published as doi:10.1145/1141911.1141987
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -31,32 +30,20 @@ from threadpoolctl import ThreadpoolController
 
 from model.translucency_population import TranslucencyPopulation, weyrich_2005
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.correspondence import landmark_table
 
-SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
-    "forehead": (0.500, 0.820),
-    "cheek": (0.263, 0.528),
-    "cheek left": (0.263, 0.528),
-    "cheek right": (0.737, 0.528),
-    "chin": (0.500, 0.205),
-}
-"""Texture coordinates of the places where a probe is set down, on the simulated heads: of the
-points nearest to the landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002);
-chin is below it, where the skin faces down. Left and right as seen in the picture; a cheek that is
-not named otherwise is the left one."""
 TEXTURE_MM: Final = (200.0, 330.0)
 """What the width and the height of that texture measure on the skin near the middle of the face;
 towards the ears the width is up to 340."""
-LENGTH_MM: Final = 60.0
+CORRELATION_LENGTH_MM: Final = 60.0
 """Distance at which deviations from the person's level are correlated by 0.61: assumed, about from
 a cheek to the nose. The paper says "slowly varying" and no number."""
-LARGEST_RELATIVE_ERROR: Final = 0.5
+MAX_RELATIVE_ERROR: Final = 0.5
 """A place whose standard error is more of its sigma_tr cannot be told from 0 and is left out."""
-SAME_PLACE_MM: Final = 2.0
+REPEAT_DISTANCE_MM: Final = 2.0
 """Measurements so near to each other are repeats of one place."""
-CONFLICT_RATE: Final = 0.01
+CONFLICT_P_VALUE: Final = 0.01
 """Repeats of one place that differ so much by chance only this often are said to contradict."""
-ROUNDING: Final = 1e-10
+MIN_RELATIVE_VARIANCE: Final = 1e-10
 """Of the prior variance: no place is known better."""
 
 
@@ -84,7 +71,7 @@ class TranslucencyPrior:
     log_mean: Float64Array
     person_deviation: Float64Array
     place_deviation: Float64Array
-    length_mm: float = LENGTH_MM
+    length_mm: float = CORRELATION_LENGTH_MM
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -105,7 +92,7 @@ class TranslucencyPrior:
 
 
 def population_prior(
-    population: TranslucencyPopulation | None = None, *, length_mm: float = LENGTH_MM
+    population: TranslucencyPopulation | None = None, *, length_mm: float = CORRELATION_LENGTH_MM
 ) -> TranslucencyPrior:
     """Return the prior of a person from a population.
 
@@ -198,7 +185,7 @@ def interpolate(
     ----------
     sites_uv : array_like, shape (S, 2)
         Texture coordinates of the measurements, u to the right, v up, each 0...1; repeats have
-        equal ones (within `SAME_PLACE_MM`).
+        equal ones (within `REPEAT_DISTANCE_MM`).
     sigma_tr_per_mm, stderr_per_mm : array_like, shape (S, C)
         Measured, with standard errors, 1/mm.
     shape : (int, int)
@@ -226,6 +213,7 @@ def interpolate(
 
     Examples
     --------
+    >>> from reconstruction.subsurface.probe_sites import SITE_UV
     >>> places = [SITE_UV[name] for name in ("forehead", "cheek", "chin")]
     >>> sigma_tr = np.array([[0.54, 0.98, 1.55], [0.56, 0.98, 1.55], [0.69, 1.25, 1.92]])
     >>> found = interpolate(places, sigma_tr, 0.03 * sigma_tr, (64, 64))
@@ -339,7 +327,7 @@ def _usable(
             reason = "not valid"
         elif not (math.isfinite(value) and math.isfinite(error)):
             reason = "sigma_tr or its standard error is not finite"
-        elif value <= 0 or error > LARGEST_RELATIVE_ERROR * value:
+        elif value <= 0 or error > MAX_RELATIVE_ERROR * value:
             reason = f"sigma_tr {value:.3g} ± {error:.3g} per mm cannot be told from 0"
         usable[s, c] = not reason
         if reason:
@@ -366,14 +354,14 @@ def _merged(
     left = np.arange(len(log))
     at, mean, variance, conflicts = [], [], [], []
     while left.size:
-        near = np.hypot(*(at_mm[left] - at_mm[left[0]]).T) <= SAME_PLACE_MM
+        near = np.hypot(*(at_mm[left] - at_mm[left[0]]).T) <= REPEAT_DISTANCE_MM
         same, left = left[near], left[~near]
         weight = error[same] ** -2.0
         center = float((weight * log[same]).sum() / weight.sum())
         chi2 = float((weight * (log[same] - center) ** 2).sum())
         dof = same.size - 1
         spread = max(1.0, chi2 / dof) if dof else 1.0
-        if dof and stats.chi2.sf(chi2, dof) < CONFLICT_RATE:
+        if dof and stats.chi2.sf(chi2, dof) < CONFLICT_P_VALUE:
             conflicts.append(
                 (
                     labels[same[0]],
@@ -410,7 +398,7 @@ class _Posterior:
         mean = float(prior.log_mean[channel])
         apart = places.at_mm[:, None] - places.at_mm[None]
         squared = (apart**2).sum(axis=-1) / prior.length_mm**2
-        noise = places.variance + ROUNDING * (shared + local)
+        noise = places.variance + MIN_RELATIVE_VARIANCE * (shared + local)
         covariance = shared + local * np.exp(-0.5 * squared) + np.diag(noise)
         inverse = np.linalg.inv(covariance)
         off = places.log - mean
@@ -441,7 +429,7 @@ class _Posterior:
             ),
             np.column_stack([across, across[:, first] * across[:, second]]),
         )
-        np.maximum(variance, ROUNDING * total, out=variance)
+        np.maximum(variance, MIN_RELATIVE_VARIANCE * total, out=variance)
         return mean, np.sqrt(variance, out=variance)
 
 
@@ -450,77 +438,3 @@ def _product(constant: float, rows: Float64Array, columns: Float64Array) -> Floa
     left = np.column_stack([np.full(len(rows), constant), rows])
     right = np.column_stack([np.ones(len(columns)), columns])
     return np.asarray(left @ right.T)
-
-
-def sites_of_labels(
-    labels: Iterable[str], landmarks: Mapping[str, tuple[float, float]] | None = None
-) -> Float64Array:
-    """Return the texture coordinates (S, 2) of a session's sites.
-
-    Parameters
-    ----------
-    labels : iterable of str
-        Labels of the session's sites.
-    landmarks : mapping of str to (float, float), optional
-        u and v by label, as :func:`read_landmarks` gives; labels that it lacks, and all without
-        it, are looked up in `SITE_UV`.
-
-    Raises
-    ------
-    TranslucencyError
-        For a label found in neither.
-
-    Examples
-    --------
-    >>> sites_of_labels(["chin"]).tolist()
-    [[0.5, 0.205]]
-    """
-    places = {**SITE_UV, **(landmarks or {})}
-    wanted = list(labels)
-    for label in wanted:
-        if label not in places:
-            raise TranslucencyError(
-                f"site: got {label!r}, expected one of {', '.join(sorted(places))}; "
-                "landmarks.csv may name others"
-            )
-    return np.array([places[label] for label in wanted], np.float64).reshape(-1, 2)
-
-
-def read_landmarks(
-    path: str | Path, *, texture_px: tuple[int, int]
-) -> dict[str, tuple[float, float]]:
-    """Read where sites lie on a texture from a table ``name,x,y``.
-
-    Parameters
-    ----------
-    path
-        CSV with a header; x to the right and y down from the centre of the texture's upper left
-        pixel, px.
-    texture_px : (int, int)
-        Height and width of the texture they were read from.
-
-    Returns
-    -------
-    dict
-        Name to (u, v).
-
-    Raises
-    ------
-    TranslucencyError
-        For another header, something that is no number, a name twice, or a place beyond the
-        texture.
-    """
-    height, width = texture_px
-    try:
-        places_px = landmark_table.read(path)
-    except landmark_table.LandmarkError as error:
-        raise TranslucencyError(str(error)) from error
-    found: dict[str, tuple[float, float]] = {}
-    for name, (x, y) in places_px.items():
-        u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
-        if not (0 <= u <= 1 and 0 <= v <= 1):
-            raise TranslucencyError(
-                f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
-            )
-        found[name] = (u, v)
-    return found

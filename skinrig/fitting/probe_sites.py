@@ -13,7 +13,7 @@ import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
-from reconstruction.subsurface import translucency
+from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
 from skinrig.arrays import Float32Array, Float64Array
 
@@ -120,7 +120,7 @@ def place(
         raise ProbeSiteError("position: got no valid texel, expected those of a face")
     given: dict[str, tuple[float, float]] = {}
     if landmarks is not None:
-        given = translucency.read_landmarks(landmarks, texture_px=(height, width))
+        given = probe_sites.read_landmarks(landmarks, texture_px=(height, width))
     at_mm = position.values.astype(np.float64)
     sites: list[Site] = []
     left_out: list[tuple[str, str]] = []

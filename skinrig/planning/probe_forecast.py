@@ -225,21 +225,22 @@ def _between(
 ) -> Float64Array:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
     from reconstruction.subsurface import translucency
+    from reconstruction.subsurface.probe_sites import SITE_UV
 
-    known = [k for k, site in enumerate(look.sites) if site in translucency.SITE_UV]
+    known = [k for k, site in enumerate(look.sites) if site in SITE_UV]
     measured = [k for k in known if good[k].any()]
     out = np.full(found.shape, np.inf)
     if not measured:
         return out
     made = translucency.interpolate(
-        [translucency.SITE_UV[look.sites[k]] for k in measured],
+        [SITE_UV[look.sites[k]] for k in measured],
         np.where(good[measured], found[measured], 1.0),
         np.where(good[measured], sigma[measured] * found[measured], np.inf),
         (MAP_PX, MAP_PX),
         valid=good[measured],
     )
     for k in known:
-        u, v = translucency.SITE_UV[look.sites[k]]
+        u, v = SITE_UV[look.sites[k]]
         at = min(int((1.0 - v) * MAP_PX), MAP_PX - 1), min(int(u * MAP_PX), MAP_PX - 1)
         out[k] = np.where(made.valid[at], made.log_stderr[at], np.inf)
     return out

@@ -43,7 +43,7 @@ NOT_DRIVEN = {
                 "reconstruction.correspondence.landmark_table": "read",
                 "reconstruction.scan.mesh": "load_ply",
                 "reconstruction.pipeline.flash.state_images": "read",
-                "reconstruction.subsurface.translucency": "read_landmarks",
+                "reconstruction.subsurface.probe_sites": "read_landmarks",
             },
         ),
         (
@@ -141,10 +141,11 @@ NOT_DRIVEN = {
                 "reconstruction.chromophores.lines": "lines_of",
                 "reconstruction.chromophores.start": "start_for",
                 "reconstruction.subsurface.nearest": "fit_nearest",
-                "reconstruction.subsurface.profile_batch": "fits_from",
+                "reconstruction.subsurface.profile_batch": "fit_from",
+                "reconstruction.subsurface.profile_fit": "fit_profiles",
                 "reconstruction.anisotropy.profile_comparison": "compare",
                 "reconstruction.subsurface.models": "profile_model",
-                "reconstruction.subsurface.outcome": "judged",
+                "reconstruction.subsurface.outcome": "evaluate_fits",
             },
         ),
         (

@@ -26,7 +26,7 @@ from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages
-from reconstruction.subsurface import SubsurfaceFit, translucency
+from reconstruction.subsurface import SubsurfaceFit, probe_sites, translucency
 from reconstruction.subsurface import nearest as nearest_medium
 
 REVISION = 7
@@ -287,7 +287,11 @@ def fit_profiles(
             other = subsurface.nearest_medium(first.radius_mm, every, **told)
         else:
             other = subsurface.invert(
-                first.radius_mm, every, method=method, common_error=nearest_medium.DIMMING, **told
+                first.radius_mm,
+                every,
+                method=method,
+                common_error=nearest_medium.LOG_FACTOR_SIGMA,
+                **told,
             )
         unlike = _layered(profiles, unlike, other.scale[0])
         fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
@@ -485,11 +489,11 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
 
 def _places(evidence: Evidence) -> Mapping[str, tuple[float, float]]:
     """Return where sites lie on a face's texture, u and v by name; a bad table is told at once."""
-    places = dict(translucency.SITE_UV)
+    places = dict(probe_sites.SITE_UV)
     if evidence.landmarks is None:
         return places
     try:
-        return places | translucency.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
+        return places | probe_sites.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
     except translucency.TranslucencyError as error:
         raise EvidenceError(f"landmarks: {error}") from error
 

@@ -16,7 +16,8 @@ from reconstruction import subsurface
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy import profile_anisotropy
 from reconstruction.subsurface import translucency
-from reconstruction.subsurface.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
+from reconstruction.subsurface.probe_sites import SITE_UV
+from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS

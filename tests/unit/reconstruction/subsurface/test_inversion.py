@@ -8,23 +8,19 @@ from model import dipole, photon_table
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from reconstruction.subsurface.inversion import SubsurfaceError
-from reconstruction.subsurface.models import DIFFUSE_FROM, DIFFUSE_RATIO, profile_model
+from reconstruction.subsurface.models import (
+    DIFFUSE_RATIO_RANGE,
+    MIN_DIFFUSE_DISTANCE,
+    Optics,
+    profile_model,
+)
 from reconstruction.subsurface.outcome import Outcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 
 
 def closed(method, eta=1.4):
-    return profile_model(
-        method,
-        RADIUS,
-        eta=eta,
-        collection="all",
-        core_mm=0.0,
-        source_core_mm=0.0,
-        g=0.8,
-        g_error=0.0,
-    )
+    return profile_model(method, RADIUS, Optics(eta, g=0.8, g_error=0.0))
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.4, 1.6])
@@ -125,7 +121,7 @@ def fit_table(profile, variance, **settings):
 @pytest.mark.parametrize(("g_error", "limit"), [(0.0, 5e-3), (0.07, 1.5e-2)])
 def test_the_tables_layout_is_the_table(g_error, limit):
     """Within the table's domain, but for diffused light; between its g its noise is larger."""
-    model = profile_model("photon_table", RADIUS, eta=1.4, g=0.825, g_error=g_error, **FIBRES)
+    model = profile_model("photon_table", RADIUS, Optics(g=0.825, g_error=g_error, **FIBRES))
     rng = np.random.default_rng(5)
     theta = np.full((100, 4), [0.0, 0.0, 0.0, 0.825])
     theta[:, 1] = rng.uniform(np.log(0.1), np.log(7.0), 100)
@@ -135,8 +131,8 @@ def test_the_tables_layout_is_the_table(g_error, limit):
     found, slopes = model.profiles(theta)
     expected = np.stack([table(*np.exp(each[:2]), g=float(each[3])) for each in theta])
     seen = expected > 1e-9
-    weak = np.exp(theta[:, 0] - theta[:, 1]) < DIFFUSE_RATIO[1]
-    seen &= ~(weak[:, None] & (np.exp(theta[:, 1:2]) * RADIUS > DIFFUSE_FROM))
+    weak = np.exp(theta[:, 0] - theta[:, 1]) < DIFFUSE_RATIO_RANGE[1]
+    seen &= ~(weak[:, None] & (np.exp(theta[:, 1:2]) * RADIUS > MIN_DIFFUSE_DISTANCE))
     assert np.abs(np.log(found / expected))[seen].max() < limit
     for p in range(4 if g_error > 0.0 else 3):
         step = np.zeros(4)
@@ -149,12 +145,12 @@ def test_the_tables_layout_is_the_table(g_error, limit):
 @pytest.mark.parametrize("ratio", [1e-4, 3e-4, 2e-3])
 def test_far_from_the_source_of_weakly_absorbed_light_the_model_is_diffusion_up_to_a_factor(ratio):
     """At up to 350 transport lengths, where no table reaches; the factor is the fibre's, 5 %."""
-    model = profile_model("photon_table", RADIUS, eta=1.4, g=0.8, g_error=0.0, **FIBRES)
+    model = profile_model("photon_table", RADIUS, Optics(g=0.8, g_error=0.0, **FIBRES))
     for scattering in (8.0, 20.0, 50.0):
         theta = np.array([[np.log(ratio * scattering), np.log(scattering), 0.0, 0.8]])
         exact = diffusion.reflectance(RADIUS, ratio * scattering, scattering, 1.4)
         # where averaging over cores does next to nothing
-        far = (scattering * RADIUS > 1.05 * DIFFUSE_FROM) & (RADIUS > 2.0)
+        far = (scattering * RADIUS > 1.05 * MIN_DIFFUSE_DISTANCE) & (RADIUS > 2.0)
         factor = np.log(model.profiles(theta)[0][0] / exact)[far]
         assert np.ptp(factor) < 0.02
         assert abs(factor.mean()) < 0.12
@@ -333,7 +329,7 @@ def test_a_fibre_far_off_all_others_is_left_out(rng):
     profile, variance = noisy(table(0.1, 1.2), rng)
     profile[9] *= 2.0
     fit = fit_table(profile, variance)
-    assert fit.left_out[9] == subsurface.LEFT_OUT.index("outlier")
+    assert fit.left_out[9] == subsurface.LeftOut.OUTLIER
     assert fit.used.sum() == 27
     assert fit.valid
     assert abs(fit.sigma_tr_per_mm - dipole.effective_transport(0.1, 1.2)) < (

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 
 from model import photon_table
 from reconstruction import subsurface
-from reconstruction.subsurface.nearest import FAINTEST_PER_MM2
+from reconstruction.subsurface.nearest import MIN_REFLECTANCE_PER_MM2
 from reconstruction.subsurface.outcome import Outcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
@@ -36,7 +36,7 @@ def by_definition(profile):
 
 
 def test_the_medium_is_that_of_the_definition_whatever_the_readings_noise(layered):
-    assert (layered > FAINTEST_PER_MM2).all()
+    assert (layered > MIN_REFLECTANCE_PER_MM2).all()
     told = by_definition(layered)
     for noise in (1e-4, 1e-3):
         growing = noise * np.exp(0.3 * RADIUS)  # far fibres are the worse
@@ -104,7 +104,7 @@ def test_fibres_that_take_less_than_the_definitions_light_do_not_count():
     fit = subsurface.nearest_medium(RADIUS, dark, variance=(1e-3 * dark) ** 2, **CORES)
     assert 10 < fit.used.sum() < 28
     # one fibre at the limit may be on either side of it
-    assert (fit.used != (dark >= FAINTEST_PER_MM2)).sum() <= 1
+    assert (fit.used != (dark >= MIN_REFLECTANCE_PER_MM2)).sum() <= 1
 
 
 def test_without_enough_light_nothing_is_told(layered):

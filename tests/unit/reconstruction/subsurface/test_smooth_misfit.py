@@ -5,7 +5,12 @@ import pytest
 from scipy.interpolate import make_smoothing_spline
 
 from reconstruction.subsurface import smooth_misfit as module
-from reconstruction.subsurface.smooth_misfit import SPREAD, STRENGTHS, USUAL, smooth_misfit
+from reconstruction.subsurface.smooth_misfit import (
+    BEND_STRENGTHS,
+    PRIOR_LOG_SIGMA,
+    PRIOR_STRENGTH,
+    smooth_misfit,
+)
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 PLACE = np.sqrt(RADIUS)
@@ -26,7 +31,7 @@ def kriged(value, variance, strength):
         np.linalg.slogdet(kernel + np.diag(variance))[1]
         + np.linalg.slogdet(firm)[1]
         + rest @ inverse @ rest
-        + (np.log(strength / USUAL) / SPREAD) ** 2
+        + (np.log(strength / PRIOR_STRENGTH) / PRIOR_LOG_SIGMA) ** 2
     )
     left = lines - kernel @ inverse @ lines
     covariance = kernel - kernel @ inverse @ kernel + left @ np.linalg.solve(firm, left.T)
@@ -38,12 +43,12 @@ def test_curve_and_errors_are_those_of_kriging_at_the_likeliest_strength(noise):
     rng = np.random.default_rng(2)
     spread = noise * np.exp(0.2 * RADIUS)
     value = CURVE + spread * rng.standard_normal(28)
-    each = [kriged(value, spread**2, strength) for strength in STRENGTHS]
+    each = [kriged(value, spread**2, strength) for strength in BEND_STRENGTHS]
     best = int(np.argmax([one[0] for one in each]))
     curve, covariance = smooth_misfit(RADIUS, value[None], (spread**2)[None])
     np.testing.assert_allclose(curve[0], each[best][1], atol=1e-4 * noise)
     np.testing.assert_allclose(covariance[0], each[best][2], atol=1e-3 * noise**2)
-    spline = make_smoothing_spline(PLACE, value, w=spread**-2.0, lam=1.0 / STRENGTHS[best])
+    spline = make_smoothing_spline(PLACE, value, w=spread**-2.0, lam=1.0 / BEND_STRENGTHS[best])
     np.testing.assert_allclose(curve[0], spline(PLACE), atol=1e-4 * noise)
 
 
@@ -60,13 +65,16 @@ def test_strengths_are_as_likely_as_the_whole_matrix_says(unread):
     gone = rng.random((6, 28)) < unread
     weight = np.where(gone, 0.01, 0.03**-2.0 * np.exp(-0.4 * RADIUS))
     value = np.where(gone, 0.0, value)
-    whole = bend @ np.linalg.solve(mass, bend.T) / STRENGTHS[:, None, None]
+    whole = bend @ np.linalg.solve(mass, bend.T) / BEND_STRENGTHS[:, None, None]
     whole = whole + (weight[:, None, :, None] * np.eye(28))
     told = (weight * value)[:, None]
     curve = np.linalg.solve(whole, np.broadcast_to(told, whole.shape[:-1])[..., None])[..., 0]
     square = (told * curve).sum(axis=-1)
     expected = square - np.linalg.slogdet(whole)[1]
-    expected -= 26 * np.log(STRENGTHS) + (np.log(STRENGTHS / USUAL) / SPREAD) ** 2
+    expected -= (
+        26 * np.log(BEND_STRENGTHS)
+        + (np.log(BEND_STRENGTHS / PRIOR_STRENGTH) / PRIOR_LOG_SIGMA) ** 2
+    )
     found = module.log_posterior(bend, mass, value, weight)
     assert np.ptp(found, axis=1).min() > 3.0  # some are unlikely
     np.testing.assert_allclose(

@@ -3,21 +3,20 @@ import pytest
 from scipy import stats
 
 from model.translucency_population import weyrich_2005
+from reconstruction.subsurface.probe_sites import SITE_UV, read_landmarks
 from reconstruction.subsurface.translucency import (
-    LARGEST_RELATIVE_ERROR,
-    LENGTH_MM,
-    SITE_UV,
+    CORRELATION_LENGTH_MM,
+    MAX_RELATIVE_ERROR,
     TEXTURE_MM,
     TranslucencyError,
     TranslucencyPrior,
     interpolate,
     population_prior,
-    read_landmarks,
-    sites_of_labels,
 )
 
 ONE = TranslucencyPrior(np.array([0.2]), np.array([0.15]), np.array([0.25]))
 NAMES = ("forehead", "cheek left", "cheek right", "chin")
+PLACES = np.array([SITE_UV[name] for name in NAMES])
 SIGMA_TR = np.array([[0.54, 0.98, 1.55], [0.5, 0.9, 1.5], [0.6, 1.05, 1.6], [0.69, 1.25, 1.92]])
 
 
@@ -65,12 +64,12 @@ def test_the_map_is_the_posterior_of_a_gaussian_process(rng):
 
 def drawn_map(rng, error, stated=1.0):
     """A face drawn from the prior, mapped from four places; z of each pixel."""
-    places = sites_of_labels(NAMES)
+    places = PLACES
     shape = (64, 64)
     at = tuple(np.concatenate([[pixel(uv, shape) for uv in places], rng.integers(0, 64, (6, 2))]).T)
     to = np.concatenate([places, centers(shape)[at]])
     size = np.array(TEXTURE_MM)
-    squared = (((to[:, None] - to[None]) * size) ** 2).sum(axis=-1) / LENGTH_MM**2
+    squared = (((to[:, None] - to[None]) * size) ** 2).sum(axis=-1) / CORRELATION_LENGTH_MM**2
     covariance = 0.15**2 + 0.25**2 * np.exp(-0.5 * squared) + 1e-12 * np.eye(len(to))
     log = 0.2 + np.linalg.cholesky(covariance) @ rng.standard_normal(len(to))
     measured = np.exp(-log[:4] + error * rng.standard_normal(4))[:, None]
@@ -90,7 +89,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rng):
 
 
 def test_the_map_runs_through_well_measured_places_and_is_uncertain_away_from_them():
-    places = sites_of_labels(NAMES)
+    places = PLACES
     found = interpolate(places, SIGMA_TR, 0.001 * SIGMA_TR, (256, 256))
     prior = population_prior()
     total = np.hypot(prior.person_deviation, prior.place_deviation)
@@ -109,7 +108,7 @@ def test_the_map_runs_through_well_measured_places_and_is_uncertain_away_from_th
 
 def test_rows_of_the_map_run_from_the_forehead_down_and_columns_to_the_right():
     sigma = np.array([[0.4], [0.6], [0.9], [0.5]])
-    found = interpolate(sites_of_labels(NAMES), sigma, 0.01 * sigma, (64, 64), prior=ONE)
+    found = interpolate(PLACES, sigma, 0.01 * sigma, (64, 64), prior=ONE)
     assert found.values[pixel(SITE_UV["forehead"], (64, 64))][0] > 2.2
     assert found.values[int(0.18 * 64), 32, 0] > found.values[int(0.8 * 64), 32, 0]
     left, right = found.values[int(0.472 * 64), [16, 47], 0]
@@ -191,7 +190,7 @@ def test_places_that_do_not_count_are_left_out_with_their_reasons():
     stderr[2, 2] = np.inf
     good = np.ones((4, 3), bool)
     good[3, 0] = False
-    found = interpolate(sites_of_labels(NAMES), sigma, stderr, (16, 16), valid=good, names=NAMES)
+    found = interpolate(PLACES, sigma, stderr, (16, 16), valid=good, names=NAMES)
     assert found.used.sum() == 8
     reasons = dict(found.left_out)
     assert reasons["forehead, channel 0"] == "sigma_tr or its standard error is not finite"
@@ -200,14 +199,12 @@ def test_places_that_do_not_count_are_left_out_with_their_reasons():
     assert reasons["chin, channel 0"] == "not valid"
     assert found.valid.all()
     # the same as if they had never been there
-    kept = interpolate(
-        sites_of_labels(NAMES)[[0, 2, 3]], SIGMA_TR[[0, 2, 3]], 0.03 * SIGMA_TR[[0, 2, 3]], (16, 16)
-    )
+    kept = interpolate(PLACES[[0, 2, 3]], SIGMA_TR[[0, 2, 3]], 0.03 * SIGMA_TR[[0, 2, 3]], (16, 16))
     np.testing.assert_allclose(found.values[..., 1], kept.values[..., 1], rtol=1e-6)
 
 
 def test_a_channel_without_a_place_is_masked_and_all_without_is_an_error():
-    places = sites_of_labels(NAMES)
+    places = PLACES
     good = np.ones((4, 3), bool)
     good[:, 2] = False
     found = interpolate(places, SIGMA_TR, 0.03 * SIGMA_TR, (8, 8), valid=good)
@@ -217,13 +214,13 @@ def test_a_channel_without_a_place_is_masked_and_all_without_is_an_error():
     with pytest.raises(TranslucencyError, match=r"no usable.*forehead, channel 0: not valid"):
         interpolate(places, SIGMA_TR, SIGMA_TR, (8, 8), valid=np.zeros(4, bool), names=NAMES)
     with pytest.raises(TranslucencyError, match="cannot be told from 0"):
-        interpolate(places, SIGMA_TR, SIGMA_TR * LARGEST_RELATIVE_ERROR * 1.01, (8, 8))
+        interpolate(places, SIGMA_TR, SIGMA_TR * MAX_RELATIVE_ERROR * 1.01, (8, 8))
 
 
 def test_nothing_is_said_where_there_is_no_skin():
     skin = np.zeros((8, 8), bool)
     skin[2:5] = True
-    found = interpolate(sites_of_labels(NAMES), SIGMA_TR, 0.03 * SIGMA_TR, (8, 8), mask=skin)
+    found = interpolate(PLACES, SIGMA_TR, 0.03 * SIGMA_TR, (8, 8), mask=skin)
     assert (found.valid == skin[..., None]).all()
     assert (found.values[~skin] == 0).all()
     assert (found.stderr[skin] > 0).all()
@@ -231,7 +228,7 @@ def test_nothing_is_said_where_there_is_no_skin():
 
 def test_a_face_unlike_the_population_is_told(rng):
     prior = population_prior()
-    places = sites_of_labels(NAMES)
+    places = PLACES
     usual = interpolate(places, SIGMA_TR, 0.03 * SIGMA_TR, (4, 4))
     other = interpolate(places, 4 * SIGMA_TR, 0.12 * SIGMA_TR, (4, 4), prior=prior)
     assert (usual.p_value > 0.01).all()
@@ -296,11 +293,6 @@ def test_landmarks_name_pixels_of_a_texture(tmp_path):
     path.write_text("# made by hand\nname, x, y\nforehead,31.5,9.5\nscar,0,99\n")
     found = read_landmarks(path, texture_px=(100, 64))
     assert found == {"forehead": (0.5, 0.9), "scar": (0.5 / 64, pytest.approx(0.005))}
-    np.testing.assert_allclose(
-        sites_of_labels(["forehead", "chin"], found), [(0.5, 0.9), SITE_UV["chin"]]
-    )
-    with pytest.raises(TranslucencyError, match=r"got 'nose', expected one of .*landmarks.csv"):
-        sites_of_labels(["nose"], found)
     for text, match in (
         ("label,x,y\na,1,1\n", "expected name, x, y"),
         ("name,x,y\na,1,one\n", "line 2, column y: got 'one'"),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.subsurface.translucency import SITE_UV, TranslucencyError
+from reconstruction.subsurface.probe_sites import SITE_UV
+from reconstruction.subsurface.translucency import TranslucencyError
 from rigsim.subject.head import build_head
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import ProbeSiteError

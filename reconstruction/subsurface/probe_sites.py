@@ -1,0 +1,62 @@
+"""Where on a face's texture a probe's sites are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from reconstruction.correspondence import landmark_table
+from reconstruction.subsurface.translucency import TranslucencyError
+
+SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
+    "forehead": (0.500, 0.820),
+    "cheek": (0.263, 0.528),
+    "cheek left": (0.263, 0.528),
+    "cheek right": (0.737, 0.528),
+    "chin": (0.500, 0.205),
+}
+"""Texture coordinates of the places where a probe is set down, on the simulated heads: of the
+points nearest to the landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002);
+chin is below it, where the skin faces down. Left and right as seen in the picture; a cheek that is
+not named otherwise is the left one."""
+
+
+def read_landmarks(
+    path: str | Path, *, texture_px: tuple[int, int]
+) -> dict[str, tuple[float, float]]:
+    """Read where sites lie on a texture from a table ``name,x,y``.
+
+    Parameters
+    ----------
+    path
+        CSV with a header; x to the right and y down from the centre of the texture's upper left
+        pixel, px.
+    texture_px : (int, int)
+        Height and width of the texture they were read from.
+
+    Returns
+    -------
+    dict
+        Name to (u, v).
+
+    Raises
+    ------
+    TranslucencyError
+        For another header, something that is no number, a name twice, or a place beyond the
+        texture.
+    """
+    height, width = texture_px
+    try:
+        places_px = landmark_table.read(path)
+    except landmark_table.LandmarkError as error:
+        raise TranslucencyError(str(error)) from error
+    found: dict[str, tuple[float, float]] = {}
+    for name, (x, y) in places_px.items():
+        u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
+        if not (0 <= u <= 1 and 0 <= v <= 1):
+            raise TranslucencyError(
+                f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
+            )
+        found[name] = (u, v)
+    return found
