@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from model.skin import SkinAppearance
@@ -33,19 +33,19 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def section(appearance: SkinAppearance) -> str:
-    """Return what was assumed and left out, and where an appearance comes from."""
-    body = ""
+def section(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield what was assumed and left out, and where an appearance comes from."""
     assumed = appearance.parameters.get("assumed")
     if isinstance(assumed, (list, tuple)) and assumed:
-        body += "<h3>Assumed</h3>" + page.table(
+        yield page.Heading("Assumed")
+        yield page.table(
             ("assumption",), [[text] for text in assumed], caption="Taken for granted, not measured"
         )
     if appearance.left_out:
-        body += "<h3>Left out</h3>" + page.table(
-            ("what", "why"), appearance.left_out, caption="Stages that were not run"
-        )
-    origin = page.facts(
+        yield page.Heading("Left out")
+        yield page.table(("what", "why"), appearance.left_out, caption="Stages that were not run")
+    yield page.Heading("Provenance")
+    yield page.facts(
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": short(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
@@ -57,7 +57,7 @@ def section(appearance: SkinAppearance) -> str:
         if not name.startswith(("stages.", "assumed"))
     }
     told = page.facts(settings, caption="Parameters that the folder records")
-    return body + "<h3>Provenance</h3>" + origin + page.folded(f"{len(settings)} parameters", told)
+    yield page.Folded(f"{len(settings)} parameters", [told])
 
 
 def short(digest: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -41,8 +41,10 @@ def headline(checks: Sequence[page.Check]) -> str:
     return f"All {len(checks)} checks kept their limits."
 
 
-def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()) -> str:
-    """Return the verdict, where it is worst, and all checks.
+def section(
+    checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()
+) -> Iterator[page.Block]:
+    """Yield the verdict, where it is worst, and all checks.
 
     Parameters
     ----------
@@ -54,22 +56,22 @@ def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[st
         What maps without a truth know least of, in sentences.
     """
     kind = "bad" if any(not check.passed for check in checks) else "good"
-    body = f'<p class="verdict {kind if checks else ""}">{page.escape(headline(checks))}</p>'
+    yield page.Paragraph(headline(checks), f"verdict {kind if checks else ''}")
     if about:
-        body += f"<p>{page.escape(about)}</p>"
+        yield page.Paragraph(about)
     weak = weaknesses(checks)
     if weak:
-        items = "".join(f"<li>{page.escape(text)}</li>" for text in weak)
-        body += f'<h2>Where it is worst</h2><ul class="worst">{items}</ul>'
+        yield page.Heading("Where it is worst", level=2)
+        yield page.Bullets(weak)
     if unjudged:
-        items = "".join(f"<li>{page.escape(text)}</li>" for text in unjudged)
-        body += "<h2>Without a truth: least known</h2>" + page.note(
+        yield page.Heading("Without a truth: least known", level=2)
+        yield page.note(
             "By their own standard errors; how far they are from the truth is not known."
         )
-        body += f'<ul class="worst">{items}</ul>'
+        yield page.Bullets(unjudged)
     if checks:
-        body += "<h2>Checks</h2>" + page.checks_table(checks)
-    return body
+        yield page.Heading("Checks", level=2)
+        yield page.checks_table(checks)
 
 
 def weaknesses(checks: Sequence[page.Check]) -> list[str]:

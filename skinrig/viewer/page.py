@@ -10,6 +10,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Final
 
+from skinrig.drawing import templates
 from skinrig.viewer.packing.arrays import Packed, pack
 from skinrig.viewer.packing.page_text import as_text
 from skinrig.viewer.scene import ViewerScene
@@ -46,7 +47,7 @@ _CHUNK = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
 class PageError(ValueError):
-    """A part of the page that is missing or named twice."""
+    """A piece of the page that is named twice."""
 
 
 def chunks() -> dict[str, str]:
@@ -96,7 +97,6 @@ def build(scene: ViewerScene, *, connect: bool = False) -> str:
 def render(packed: Packed, *, connect: bool = False) -> str:
     """Return the page of a packed scene."""
     here = resources.files("skinrig.viewer")
-    page = here.joinpath("page.html").read_text(encoding="utf-8")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
     code = script().replace("</", "<\\/")
     policy = "; ".join(
@@ -110,17 +110,14 @@ def render(packed: Packed, *, connect: bool = False) -> str:
             "form-action 'none'",
         ]
     )
-    parts = {
-        "POLICY": policy,
-        "STYLE": style,
-        "HEADER": packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
-        "PAYLOAD": as_text(packed.payload),
-        "SCRIPT": code,
-    }
-    for name in parts:
-        if page.count("{{" + name + "}}") != 1:
-            raise PageError(f"page.html: expected {{{{{name}}}}} once")
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+    return templates.render(
+        "viewer/page.html",
+        policy=policy,
+        style=style,
+        header=packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
+        payload=as_text(packed.payload),
+        script=code,
+    )
 
 
 def _bare(text: str) -> str:

@@ -132,15 +132,14 @@ def sentence(a: Run, b: Run) -> str:
     return f"{differ} of {len(both)} pictures of both differ."
 
 
-def section(a: Run, b: Run) -> str:
-    """Return the pictures of two runs with their differences, and what their records differ in."""
-    body = ""
+def section(a: Run, b: Run) -> Iterator[page.Block]:
+    """Yield the pictures of two runs with their differences, and what their records differ in."""
     for name, path_a, path_b in pairs(a, b):
         found, refused = compared(path_a, path_b)
-        body += f"<h2>Pictures: {page.escape(name)}</h2>"
+        yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            body += page.table(
+            yield page.table(
                 (
                     "picture",
                     "values",
@@ -165,15 +164,14 @@ def section(a: Run, b: Run) -> str:
             )
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MOST_DRAWN]:
-                body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"
-                body += "".join(_drawn(a, b, one)) + "</div>"
+                yield page.Heading(one.name)
+                yield page.Images(list(_drawn(a, b, one)))
             if drawn[MOST_DRAWN:]:
                 rest = ", ".join(one.name for one in drawn[MOST_DRAWN:])
-                body += page.note(f"Not drawn, since they differ less: {rest}.")
+                yield page.note(f"Not drawn, since they differ less: {rest}.")
         if refused:
-            body += page.table(("picture", "why"), refused, caption="Pictures not subtracted")
-        body += _records(a, b, path_a, path_b)
-    return body
+            yield page.table(("picture", "why"), refused, caption="Pictures not subtracted")
+        yield _records(a, b, path_a, path_b)
 
 
 def alone(a: Run, b: Run) -> list[tuple[str, str]]:
@@ -184,7 +182,7 @@ def alone(a: Run, b: Run) -> list[tuple[str, str]]:
     return [(n, a.label) for n in sorted(one - other)] + [(n, b.label) for n in sorted(other - one)]
 
 
-def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
+def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[page.Image]:
     """Draw A | B | B − A: linear ones at one brightness for both."""
     bright = float(np.percentile(np.concatenate([one.a, one.b]), PERCENTILE)) or 1.0
     for label, values in ((a.label, one.a), (b.label, one.b)):
@@ -210,7 +208,7 @@ def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
     )
 
 
-def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> str:
+def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
     rows = [
         (key, sides[0].get(key, "–"), sides[1].get(key, "–"))

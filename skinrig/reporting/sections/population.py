@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,8 @@ MEDIA = ("homogeneous:", "anisotropic:")
 
 def section(
     appearances: Mapping[str, SkinAppearance], truths: Mapping[str, Path] | None = None
-) -> str:
-    """Return the tables of sigma_tr over people; empty where nobody's skin was probed.
+) -> Iterator[page.Block]:
+    """Yield the tables of sigma_tr over people; empty where nobody's skin was probed.
 
     Parameters
     ----------
@@ -47,14 +47,15 @@ def section(
         and not _is_medium(appearance, truths or {})
     }
     if not people:
-        return ""
+        return
     published = weyrich_2005()
     drawn = table(published.sample(PEOPLE, rng=np.random.default_rng(0)), sites=published.sites)
-    body = "<h2>sigma_tr over people, 1/mm</h2>" + (
-        "<p class='note'>Deviations are over people. The publication heads its second column "
+    yield page.Heading("sigma_tr over people, 1/mm", level=2)
+    yield page.note(
+        "Deviations are over people. The publication heads its second column "
         "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
         "they are read as standard deviations. The smallest sigma_tr is the most translucent "
-        "skin.</p>"
+        "skin."
     )
     rows: list[tuple[object, ...]] = []
     for c, channel in enumerate(CHANNELS):
@@ -70,7 +71,7 @@ def section(
         rows += _rows(f"measured here, {len(people)} {many}", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
     head = ("who", "channel", *columns)
-    return body + page.table(
+    yield page.table(
         head, rows, caption="Mean and standard deviation over people, red, green and blue light"
     )
 
