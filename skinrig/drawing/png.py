@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 
-SCALES = {"viridis": "viridis", "magma": "magma", "RdBu_r": "diverging", "gray": "grays"}
+SCALE_CLASSES = {"viridis": "viridis", "magma": "magma", "RdBu_r": "diverging", "gray": "grays"}
 """matplotlib's color maps that maps are shown by, and what a style sheet calls them."""
-GRAY = 128
+INVALID_GRAY = 128
 """Of pixels without a value."""
 
 
@@ -164,7 +164,7 @@ def colorize(
     table = palette(scale, 256)
     position, shown = _position(values, low, high, valid)
     image = table[np.round(255 * position).astype(np.intp)]
-    image[~shown] = GRAY
+    image[~shown] = INVALID_GRAY
     return image
 
 
@@ -202,7 +202,7 @@ def encode_scalar(
     position, shown = _position(values, low, high, valid)
     index = np.round((levels - 1) * position).astype(np.uint8)
     index[~shown] = levels
-    gray = np.full((1, 3), GRAY, np.uint8)
+    gray = np.full((1, 3), INVALID_GRAY, np.uint8)
     return encode_indexed(index, np.concatenate([palette(scale, levels), gray]))
 
 

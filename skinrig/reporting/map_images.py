@@ -13,7 +13,7 @@ from skinrig.reporting import page
 from skinrig.reporting.page import number
 from skinrig.written_units import written
 
-LEVELS = 128
+SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
 
 
@@ -49,7 +49,7 @@ def scalar_picture(
     low, high
         Ends of the color scale, in ``unit``.
     scale
-        A key of `skinrig.drawing.png.SCALES`.
+        A key of `skinrig.drawing.png.SCALE_CLASSES`.
     valid
         (H, W); other pixels are gray.
     unit
@@ -61,11 +61,11 @@ def scalar_picture(
     """
     small = shrink(values, width).astype(float)
     mask = None if valid is None else shrink(valid, width).astype(bool)
-    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=LEVELS)
+    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
     named = f"{of}, {title}" if of else title
     scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
     alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
-    bar = page.ColorScale(png.SCALES[scale], number(low), number(high), unit)
+    bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), unit)
     return _stored(title, data, alt, small.shape, bar)
 
 
@@ -104,7 +104,7 @@ def normal_picture(
     small = shrink(normals, width).astype(float)
     mask = shrink(valid, width).astype(bool)
     image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
-    image[~mask] = png.GRAY
+    image[~mask] = png.INVALID_GRAY
     alt = f"{of}, {title}: x, y, z as red, green, blue"
     if mask.any():
         length = np.linalg.norm(small[mask], axis=-1)

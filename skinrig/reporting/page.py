@@ -15,7 +15,7 @@ import numpy as np
 from skinrig.drawing import templates
 from skinrig.written_units import written
 
-STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
+PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
 """Characters up to which a cell's text is not broken over lines."""
 BAR_STOPS = 17
@@ -296,7 +296,7 @@ def document(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> st
     sections
         The rest, below the contents.
     """
-    style = STYLE + _bars()
+    style = PAGE_STYLE + _bars()
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     taken = {"content", "contents"}
     head, body = _parts(lead, taken), _parts(sections, taken)
@@ -345,7 +345,7 @@ def _bars() -> str:
     from skinrig.drawing import png
 
     rules = []
-    for scale, name in png.SCALES.items():
+    for scale, name in png.SCALE_CLASSES.items():
         stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))
         rules.append(f".bar.{name}{{background:linear-gradient(90deg,{stops})}}")
     return "\n".join(rules)

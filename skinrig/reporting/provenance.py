@@ -9,7 +9,7 @@ from typing import Any
 from model.skin import SkinAppearance
 from skinrig.reporting import page
 
-DIGEST_SHOWN = 16
+DIGEST_CHARS = 16
 """Characters of a digest that a table shows."""
 
 
@@ -49,7 +49,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": short(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
-        caption=f"Inputs by the first {DIGEST_SHOWN} digits of their SHA-256",
+        caption=f"Inputs by the first {DIGEST_CHARS} digits of their SHA-256",
     )
     settings = {
         name: value
@@ -68,4 +68,4 @@ def short(digest: str) -> str:
     >>> short("sha256:0123456789abcdef0123")
     '0123456789abcdef'
     """
-    return digest.removeprefix("sha256:")[:DIGEST_SHOWN]
+    return digest.removeprefix("sha256:")[:DIGEST_CHARS]

@@ -12,12 +12,12 @@ from skinrig.evaluating import flash
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band, words
 
-RESIDUALS = ("residual", "misfit", "gamut_distance")
+RESIDUAL_WORDS = ("residual", "misfit", "gamut_distance")
 """Words in the names of maps that tell how badly a model fits."""
-BANDED = ("melanin", "hemoglobin")
+BANDED_MAPS = ("melanin", "hemoglobin")
 
 
-MOST_NAMED = 3
+MAX_NAMED_MAPS = 3
 """Maps of an appearance that are named first: those that know least."""
 
 
@@ -53,7 +53,7 @@ def weaknesses(name: str, appearance: SkinAppearance) -> list[str]:
         elif np.isfinite(percent := float(str(row[5]))):
             text = f"{of} {page.number(percent)} % of its value"
             told.append((percent, text + missing))
-    first = sorted(told, reverse=True)[:MOST_NAMED] + sorted(angles, reverse=True)[:1]
+    first = sorted(told, reverse=True)[:MAX_NAMED_MAPS] + sorted(angles, reverse=True)[:1]
     return [text for _, text in first]
 
 
@@ -73,7 +73,8 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     residuals = [
         row
         for name, one in sorted(appearance.maps.items())
-        if any(word in name for word in RESIDUALS) and (row := _residual(name, one)) is not None
+        if any(word in name for word in RESIDUAL_WORDS)
+        and (row := _residual(name, one)) is not None
     ]
     yield page.Heading("Without a truth")
     yield page.note(
@@ -154,7 +155,7 @@ def _by_band(appearance: SkinAppearance) -> Iterator[page.Block]:
         return
     levels, known = _values(melanin)
     rows: list[tuple[object, ...]] = []
-    for name in BANDED:
+    for name in BANDED_MAPS:
         one = appearance.maps.get(name)
         if one is None or one.stderr is None or one.values.shape != levels.shape:
             continue

@@ -9,12 +9,12 @@ import numpy as np
 from skinrig.reporting import page
 from skinrig.written_units import written
 
-NAMED = 3
+MAX_NAMED_CLOSE = 3
 """Checks named that come closest to their limit."""
-MISSED_NAMED = 8
-OVERCONFIDENT, UNDERCONFIDENT = 0.5, 0.9
+MAX_NAMED_MISSED = 8
+MIN_COVERAGE, MAX_COVERAGE = 0.5, 0.9
 """Share of truths inside 68 % intervals beyond which intervals are called too small or large."""
-MUCH_MASKED = 0.2
+MAX_UNREMARKED_MASK = 0.2
 """Share of pixels without a value that is worth a sentence."""
 
 
@@ -90,11 +90,11 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
     """
     out = []
     missed = [check for check in checks if not check.passed]
-    for check in missed[:MISSED_NAMED]:
+    for check in missed[:MAX_NAMED_MISSED]:
         sign = "at most" if check.sense == "<=" else "at least"
         out.append(f"missed: {check.name}, {_measured(check)}, {sign} {_bound(check)}{_at(check)}")
-    if len(missed) > MISSED_NAMED:
-        out.append(f"missed: {len(missed) - MISSED_NAMED} more, in the table below")
+    if len(missed) > MAX_NAMED_MISSED:
+        out.append(f"missed: {len(missed) - MAX_NAMED_MISSED} more, in the table below")
     told: set[str] = set()
     for check in checks:
         beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
@@ -108,18 +108,18 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
         (check for check in checks if check.passed and np.isfinite(check.used)),
         key=lambda check: -check.used,
     )
-    for check in close[:NAMED]:
+    for check in close[:MAX_NAMED_CLOSE]:
         out.append(
             f"closest to its limit: {check.name}, {_measured(check)} of at most {_bound(check)} "
             f"({100 * check.used:.0f} % of it used){_at(check)}"
         )
     for check in checks:
-        if check.coverage < OVERCONFIDENT:
+        if check.coverage < MIN_COVERAGE:
             out.append(f"intervals too small: {_covered(check)}")
-        elif check.coverage > UNDERCONFIDENT:
+        elif check.coverage > MAX_COVERAGE:
             out.append(f"intervals too large: {_covered(check)}")
     for check in checks:
-        if check.masked > MUCH_MASKED:
+        if check.masked > MAX_UNREMARKED_MASK:
             of_what = check.name.rsplit(",", 1)[0]  # without what is measured, such as the median
             out.append(f"masked: {of_what}: {100 * check.masked:.0f} % of pixels have no value")
     return out

@@ -15,7 +15,7 @@ from skinrig.viewer.packing.arrays import Packed, pack
 from skinrig.viewer.packing.page_text import as_text
 from skinrig.viewer.scene import ViewerScene
 
-SCRIPTS: Final = (
+SCRIPT_FILES: Final = (
     "graph.js",
     "gl.js",
     "load.js",
@@ -43,7 +43,7 @@ SCRIPTS: Final = (
 )
 """Scripts in the order in which they run, all in one function; `main.js` comes last."""
 
-_CHUNK = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
+_CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
 class PageError(ValueError):
@@ -60,7 +60,7 @@ def chunks() -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for entry in sorted(_files("glsl", ".glsl"), key=lambda one: one.name):
-        parts = _CHUNK.split(entry.read_text(encoding="utf-8"))
+        parts = _CHUNK_LINE.split(entry.read_text(encoding="utf-8"))
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
                 raise PageError(f"glsl/{entry.name}: chunk {name!r} is there twice")
@@ -71,7 +71,9 @@ def chunks() -> dict[str, str]:
 def script() -> str:
     """Return all scripts as one strict function that shares an object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
-    body = "\n".join(_bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPTS)
+    body = "\n".join(
+        _bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPT_FILES
+    )
     glsl = json.dumps(chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 

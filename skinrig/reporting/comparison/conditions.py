@@ -14,7 +14,7 @@ from skinrig.reporting import folders as report_folders
 from skinrig.reporting import page, provenance
 from skinrig.reporting.comparison.runs import Pair, Run
 
-MOST_DRIFTS = 3
+MAX_LISTED_DRIFTS = 3
 """Quantities told of each kind of calibration."""
 
 
@@ -180,7 +180,7 @@ def moved_calibrations(a: Run, b: Run) -> Iterator[page.Block]:
                     float("nan") if one.sigmas is None else one.sigmas,
                     f"{len(moved)} moved",
                 )
-                for one in moved[:MOST_DRIFTS]
+                for one in moved[:MAX_LISTED_DRIFTS]
             ]
     if not rows:
         return

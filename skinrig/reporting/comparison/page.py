@@ -19,12 +19,12 @@ from skinrig.reporting.comparison.runs import Pair, Run, alone
 from skinrig.reporting.map_names import heading, melanin_band, words
 from skinrig.written_units import written
 
-WIDTH_PX = 200
-MOST_NAMED = 10
+IMAGE_WIDTH_PX = 200
+MAX_NAMED_MAPS = 10
 """Maps that are named first."""
-MOST_SHOWN = 4
+MAX_DRAWN_MAPS = 4
 """Maps of a pair that are drawn: of those with standard errors the ones that disagree most."""
-SIGMAS_SHOWN = 5.0
+MAX_SHOWN_SIGMAS = 5.0
 """End of the scale of differences in combined standard errors."""
 
 
@@ -64,9 +64,9 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
         yield page.Heading("Where they disagree", level=2)
         yield page.note(
             "Shares of pixels that lie more than three combined standard errors apart; chance "
-            f"leaves 0.27 %. The {min(len(worst), MOST_NAMED)} farthest of {len(worst)}."
+            f"leaves 0.27 %. The {min(len(worst), MAX_NAMED_MAPS)} farthest of {len(worst)}."
         )
-        yield page.Bullets([f"{name}: {_in_words(one)}" for name, one in worst[:MOST_NAMED]])
+        yield page.Bullets([f"{name}: {_in_words(one)}" for name, one in worst[:MAX_NAMED_MAPS]])
     yield from check_comparison.table(a, b, rows)
 
 
@@ -171,11 +171,11 @@ def _pictures(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     """Yield A | B | difference | difference over the combined standard error."""
     told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
     order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
-    for one in order[:MOST_SHOWN]:
+    for one in order[:MAX_DRAWN_MAPS]:
         yield page.Heading(heading(one.name))
         yield page.Images(list(_four(a, b, pair, one)))
-    if len(order) > MOST_SHOWN:
-        names = "; ".join(words(one.name) for one in order[MOST_SHOWN:])
+    if len(order) > MAX_DRAWN_MAPS:
+        names = "; ".join(words(one.name) for one in order[MAX_DRAWN_MAPS:])
         yield page.note(f"Not drawn, since they disagree less: {names}.")
 
 
@@ -200,10 +200,12 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
         if one.unit == "°":
-            yield map_pictures.normal_picture(label, image, valid=mask, width=WIDTH_PX, of=one.name)
+            yield map_pictures.normal_picture(
+                label, image, valid=mask, width=IMAGE_WIDTH_PX, of=one.name
+            )
         elif image.ndim == 3:
             yield map_pictures.color_picture(
-                label, np.where(mask[..., None], image, 0.2), width=WIDTH_PX, of=one.name
+                label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name
             )
         else:
             yield map_pictures.scalar_picture(
@@ -213,7 +215,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
                 high=high,
                 valid=mask,
                 unit=one.unit,
-                width=WIDTH_PX,
+                width=IMAGE_WIDTH_PX,
                 of=one.name,
             )
     image, mask = laid(one.difference)
@@ -227,7 +229,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         scale="RdBu_r" if signed else "magma",
         valid=mask,
         unit=one.unit,
-        width=WIDTH_PX,
+        width=IMAGE_WIDTH_PX,
         of=one.name,
     )
     if one.sigmas is not None:
@@ -235,11 +237,11 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         yield map_pictures.scalar_picture(
             "in combined standard errors",
             image,
-            low=-SIGMAS_SHOWN if signed else 0.0,
-            high=SIGMAS_SHOWN,
+            low=-MAX_SHOWN_SIGMAS if signed else 0.0,
+            high=MAX_SHOWN_SIGMAS,
             scale="RdBu_r" if signed else "magma",
             valid=mask,
-            width=WIDTH_PX,
+            width=IMAGE_WIDTH_PX,
             of=f"{one.name}, difference",
         )
 

@@ -10,12 +10,12 @@ from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import SCHEMA
 from skinrig.reporting import page
 
-FAMILY = SCHEMA.split("/")[0]
+SCHEMA_FAMILY = SCHEMA.split("/")[0]
 
 
 def is_bench(document: Mapping[str, Any]) -> bool:
     """Return whether a document is a benchmark's, of whatever version."""
-    return str(document.get("schema", "")).startswith(f"{FAMILY}/")
+    return str(document.get("schema", "")).startswith(f"{SCHEMA_FAMILY}/")
 
 
 def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[page.Block]:

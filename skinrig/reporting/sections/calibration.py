@@ -17,9 +17,9 @@ from skinrig.arrays import Float64Array
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
 
-LONGEST = 12
+MAX_LISTED_NUMBERS = 12
 """Numbers of a quantity up to which a table lists it."""
-MOST_VALUES = 60
+MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
 
@@ -35,7 +35,7 @@ class Figure:
     worst: Callable[[Sequence[float]], float] = max
 
 
-FIGURES: Mapping[str, tuple[Figure, ...]] = {
+QUALITY_FIGURES: Mapping[str, tuple[Figure, ...]] = {
     "sensor": (
         Figure("read_noise_e", "read noise", "e-"),
         Figure("linearity_deviation", "deviation from a straight line", "%", factor=100.0),
@@ -194,7 +194,7 @@ def _left(found: Calibration, day: date) -> int:
 
 def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
     rows: list[tuple[object, ...]] = []
-    for figure in FIGURES.get(found.kind, ()):
+    for figure in QUALITY_FIGURES.get(found.kind, ()):
         told = {
             serial: figure.factor * figure.of(np.asarray(names[figure.quantity].value, float))
             for serial, names in sorted(found.values.items())
@@ -251,10 +251,10 @@ def _values(folder: str, found: Calibration) -> page.Folded:
         (serial, name, _numbers(quantity.value), _numbers(quantity.stderr))
         for serial, names in sorted(found.values.items())
         for name, quantity in sorted(names.items())
-        if np.size(quantity.value) <= LONGEST
+        if np.size(quantity.value) <= MAX_LISTED_NUMBERS
     ]
     listed: page.Block
-    if len(rows) > MOST_VALUES:
+    if len(rows) > MAX_LISTED_QUANTITIES:
         listed = page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
     else:
         listed = page.table(

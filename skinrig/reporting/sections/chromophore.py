@@ -15,11 +15,11 @@ from skinrig.evaluating import flash
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import map_names, page
 
-NOISE_OF_IDENTIFIABILITY = 0.005
+IDENTIFIABILITY_NOISE = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
-SMALL_PX = 200
+SMALL_WIDTH_PX = 200
 """Largest width of maps that stand alone."""
-ROUNDING = 1e-6
+MAX_ROUNDING_ERROR = 1e-6
 """Fractions below this are zero but for rounding."""
 
 
@@ -51,7 +51,9 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-    if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
+    if (
+        max(abs(low), abs(high)) < MAX_ROUNDING_ERROR
+    ):  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
     return map_pictures.scalar_picture(
         map_names.heading(key),
@@ -60,7 +62,7 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
         high=high,
         valid=mask,
         unit=page.short_unit(skin_map.unit),
-        width=SMALL_PX,
+        width=SMALL_WIDTH_PX,
     )
 
 
@@ -192,7 +194,7 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Bloc
     yield page.Heading("Where chromophores can be told", level=2)
     yield page.note(
         "Least relative standard error that any unbiased estimator could have, for "
-        f"{100 * NOISE_OF_IDENTIFIABILITY:g} % of noise in each channel and the model's error."
+        f"{100 * IDENTIFIABILITY_NOISE:g} % of noise in each channel and the model's error."
     )
     for camera, illuminant in sorted(tables):
         yield page.Heading(f"{camera}, {illuminant}")
@@ -215,7 +217,7 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
         found = chromophores.identifiability(
             table,
             shading=shading,
-            variance=lambda rgb: np.square(NOISE_OF_IDENTIFIABILITY * rgb),
+            variance=lambda rgb: np.square(IDENTIFIABILITY_NOISE * rgb),
             model_error=model_error.load(),
             size=48,
         )

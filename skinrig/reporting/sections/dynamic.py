@@ -20,7 +20,7 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 from skinrig.reporting.sections import facial_color
 
-SHOWN = 4
+MAX_SHOWN_EXPRESSIONS = 4
 """States drawn; the tables list all."""
 WIDTH_PX = 240
 ZONE_COLORS = np.array(
@@ -78,7 +78,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     tints = ZONE_COLORS[np.arange(masks.shape[2]) % len(ZONE_COLORS)]
     pictures = [map_pictures.color_picture("zones", masks @ tints, width=WIDTH_PX)]
     shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
-    for name in list(part["expressions"])[:SHOWN]:
+    for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
         shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
     for title, normals in shown.items():
         every = np.ones(normals.shape[:2], bool)

@@ -18,10 +18,10 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band
 
-SHOWN = 4
+MAX_SHOWN_STATES = 4
 """States drawn; the tables list all."""
 WIDTH_PX = 240
-LEAST_PIXELS = 20
+MIN_BAND_PIXELS = 20
 """Of a melanin band that is told."""
 
 
@@ -89,7 +89,7 @@ def section(
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
         banded = errors_by_band(rig, truths)
         yield from _errors(name, states, changes, banded, checks)
-    for state in list(rig.states)[:SHOWN]:
+    for state in list(rig.states)[:MAX_SHOWN_STATES]:
         measured = appearance.maps.get(f"hemoglobin_{state}")
         true = evaluation.true_blood(truths[state]) if state in truths else None
         if measured is None:
@@ -152,7 +152,7 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
         return
     names = list(rig.states)
     asked: dict[str, dict[str, float]] = {"neutral": {"neutral": 1.0}}
-    asked |= {state: {state: 1.0} for state in names[:SHOWN]}
+    asked |= {state: {state: 1.0} for state in names[:MAX_SHOWN_STATES]}
     if len(names) > 1:
         asked[f"{names[0]} + {names[1]}"] = {names[0]: 1.0, names[1]: 1.0, "neutral": -1.0}
     pictures = []
@@ -285,7 +285,7 @@ def errors_by_band(
             good = good & true.valid
         for low, high in BANDS:
             inside = good & (melanin.values >= low) & (melanin.values < high)
-            if np.count_nonzero(inside) < LEAST_PIXELS:
+            if np.count_nonzero(inside) < MIN_BAND_PIXELS:
                 continue
             found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
             relative = (found - real) / real

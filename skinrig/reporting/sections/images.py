@@ -10,17 +10,17 @@ from typing import Any
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 
-DOCUMENTS = ("render.json", "analysis.json")
+DOCUMENT_FILES = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
-SCHEMAS = ("skinrig.render/", "skinrig.analyse")
-LARGEST_BYTES = 600_000
+SCHEMA_PREFIXES = ("skinrig.render/", "skinrig.analyse")
+MAX_IMAGE_BYTES = 600_000
 """Larger pictures stay in their folder: a report is to be sent by mail."""
-FULL = "full model"
+FULL_MODEL = "full model"
 
 
 def folder_document(folder: Path) -> Path | None:
     """Return the document of a folder of renderings or of an analysis, or None."""
-    for name in DOCUMENTS:
+    for name in DOCUMENT_FILES:
         path = folder / name
         if path.is_file():
             return path
@@ -41,10 +41,10 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
     if path is None:
         return
     document = json.loads(path.read_text(encoding="utf-8"))
-    if not str(document.get("schema", "")).startswith(SCHEMAS):
+    if not str(document.get("schema", "")).startswith(SCHEMA_PREFIXES):
         return
     yield page.Heading(f"{_heading(document)}: {folder.name}", level=2)
-    if FULL in document:
+    if FULL_MODEL in document:
         yield from _comparison(folder.name, document, checks)
     elif "view" in document:
         yield page.facts(
@@ -70,7 +70,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
 
 
 def _heading(document: Mapping[str, Any]) -> str:
-    if FULL in document:
+    if FULL_MODEL in document:
         return "Renderings beside photographs"
     return "Rendering" if "view" in document else "Analysis"
 
@@ -78,7 +78,7 @@ def _heading(document: Mapping[str, Any]) -> str:
 def _comparison(
     name: str, document: Mapping[str, Any], checks: list[page.Check]
 ) -> Iterator[page.Block]:
-    full = document[FULL]
+    full = document[FULL_MODEL]
     checks.append(
         page.Check(
             f"{name}: luminance of held-out photographs, median error on lit pixels",
@@ -90,7 +90,7 @@ def _comparison(
         )
     )
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
-    rows = {FULL: full, **kinds, **document["ablation"]}
+    rows = {FULL_MODEL: full, **kinds, **document["ablation"]}
     yield page.table(
         (
             "model",
@@ -145,7 +145,7 @@ def _pictures(folder: Path) -> Iterator[page.Block]:
     kept = []
     for path in sorted(folder.glob("*.png")):
         data = path.read_bytes()
-        if len(data) > LARGEST_BYTES:
+        if len(data) > MAX_IMAGE_BYTES:
             kept.append(path.name)
             continue
         figures.append(map_pictures.stored_picture(path.stem.replace("-", " "), data))

@@ -13,7 +13,7 @@ from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
-_ALPHA_AND_SIGMA = (
+_PARAMETER_KEYS = (
     "alpha",
     "alpha_stderr",
     "alpha_95",
@@ -82,7 +82,7 @@ def section(
             (
                 state_words(fit["name"]),
                 fit["stretch_s"],
-                *(_value(fit.get(key)) for key in _ALPHA_AND_SIGMA),
+                *(_value(fit.get(key)) for key in _PARAMETER_KEYS),
                 _value(fit["distance_before"]),
                 _value(fit["distance"]),
                 _value(fit.get("noise_floor")),

@@ -18,9 +18,9 @@ from skinrig.reporting.map_names import state_words
 from skinrig.reporting.sections import kernel
 
 WIDTH_PX = 200
-SHOWN = 7
+MAX_SHOWN_STATES = 7
 """States shown as pictures, spread evenly over those there are."""
-HISTOGRAM_REACH = 0.75
+SHOWN_HISTOGRAM_FRACTION = 0.75
 """Part of a histogram's side that is shown, from its middle."""
 
 
@@ -60,7 +60,7 @@ def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> Itera
     first = "a000_n0" if "a000_n0" in states else order[0]
     yield from _beside_truth(first, appearance, truth)
     one = [state for state in order if state[:4] == first[:4]]
-    chosen = [one[round(k)] for k in np.linspace(0, len(one) - 1, min(SHOWN, len(one)))]
+    chosen = [one[round(k)] for k in np.linspace(0, len(one) - 1, min(MAX_SHOWN_STATES, len(one)))]
     series = []
     for kind, title in (("normals", "normals"), ("height", "height")):
         row = []
@@ -297,13 +297,16 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
     if document is None:
         return
     states = sorted(document["states"], key=lambda state: _by_step(state["name"]))
-    chosen = [states[round(k)] for k in np.linspace(0, len(states) - 1, min(SHOWN, len(states)))]
+    chosen = [
+        states[round(k)]
+        for k in np.linspace(0, len(states) - 1, min(MAX_SHOWN_STATES, len(states)))
+    ]
     counts = [np.asarray(state["counts"], float) for state in chosen]
     top = max((float(np.sqrt(count).max()) for count in counts), default=1.0)
     panels = []
     for state, count in zip(chosen, counts, strict=True):
         side = len(count)
-        cut = round(side * (1 - HISTOGRAM_REACH) / 2)
+        cut = round(side * (1 - SHOWN_HISTOGRAM_FRACTION) / 2)
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
         panels.append(

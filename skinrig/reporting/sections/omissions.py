@@ -10,10 +10,10 @@ from typing import Any
 from skinrig.reporting import page
 from skinrig.simulating.leaving_out import may_be_left_out
 
-ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
+VERDICT_ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
 """In which verdicts are listed, see `rigsim.needs.effects.MEANING`."""
 
-WORDS = {
+VERDICT_WORDS = {
     "asked": "left out as asked",
     "negligible": "left out, too small",
     "unmodeled": "not modeled",
@@ -76,7 +76,7 @@ def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     over, switch = effect.get("over_noise"), str(effect.get("switch", ""))
     return (
         str(effect["name"]),
-        WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
+        VERDICT_WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
         str(effect["reason"]),
         "" if over is None else f"{over:.3g}",
         switch if may_be_left_out(switch) else "",
@@ -84,5 +84,5 @@ def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
 
 
 def _place(words: str) -> int:
-    told = [WORDS[verdict] for verdict in ORDER]
+    told = [VERDICT_WORDS[verdict] for verdict in VERDICT_ORDER]
     return told.index(words) if words in told else len(told)

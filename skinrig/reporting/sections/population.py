@@ -21,9 +21,9 @@ from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
 from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import page
 
-PEOPLE = 87
+POPULATION_SIZE = 87
 """As many as Weyrich et al. 2005 measured."""
-MEDIA = ("homogeneous:", "anisotropic:")
+MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
 """How simulated subjects that are media are named."""
 
 
@@ -49,7 +49,9 @@ def section(
     if not people:
         return
     published = weyrich_2005()
-    drawn = table(published.sample(PEOPLE, rng=np.random.default_rng(0)), sites=published.sites)
+    drawn = table(
+        published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
+    )
     yield page.Heading("sigma_tr over people, 1/mm", level=2)
     yield page.note(
         "Deviations are over people. The publication heads its second column "
@@ -63,7 +65,7 @@ def section(
         for s in range(len(published.sites)):
             row += [float(published.mean_per_mm[s, c]), float(published.deviation_per_mm[s, c])]
         rows.append(tuple(row))
-    rows += _rows(f"simulated, {PEOPLE} people drawn from it", drawn, published.sites)
+    rows += _rows(f"simulated, {POPULATION_SIZE} people drawn from it", drawn, published.sites)
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]
     if measured:
         found = summarize(measured)
@@ -82,7 +84,7 @@ def _is_medium(appearance: SkinAppearance, truths: Mapping[str, Path]) -> bool:
     if folder is None:
         return False
     subject = str(store.read_document(folder).parameters.get("subject", ""))
-    return subject.startswith(MEDIA)
+    return subject.startswith(MEDIUM_PREFIXES)
 
 
 def _rows(who: str, found: PopulationTable, sites: tuple[str, ...]) -> list[tuple[object, ...]]:

@@ -13,7 +13,7 @@ from reconstruction.pipeline.flash.sequence import CURVES_FILE
 from skinrig.drawing import figures
 from skinrig.reporting import page
 
-COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
+PLACE_COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
 
 
 def is_sequence(appearance: SkinAppearance) -> bool:
@@ -52,7 +52,7 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
                 values[order].tolist(),
                 errors[order].tolist(),
                 line=cycle_s is None,
-                color=COLORS[number % len(COLORS)],
+                color=PLACE_COLORS[number % len(PLACE_COLORS)],
             )
         )
     plot = figures.curves(

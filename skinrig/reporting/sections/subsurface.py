@@ -22,10 +22,10 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 
 WIDTH_PX = 200
-SHOWN = 3
+MAX_PLOTTED_MEASUREMENTS = 3
 """Measurements drawn; the tables list all."""
-COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
-_NAME = re.compile(r"(.+)_r(\d+)_a(\d+\.\d)")
+CHANNEL_COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
+_MEASUREMENT_NAME = re.compile(r"(.+)_r(\d+)_a(\d+\.\d)")
 """Of a measurement in documents: site, repeat, angle in degrees."""
 METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipole": "dipole"}
 
@@ -68,7 +68,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
     by_name = {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
     radius = measured["radius_mm"]
     plots = []
-    for entry in _one_of_each_site(measured["measurements"])[:SHOWN]:
+    for entry in _one_of_each_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
         found = by_name.get(entry["name"])
         series = []
         for channel in CHANNELS:
@@ -82,7 +82,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
                     value.tolist(),
                     stderr.tolist(),
                     line=False,
-                    color=COLORS[channel],
+                    color=CHANNEL_COLORS[channel],
                 )
             )
             for fit in [] if found is None else found["fits"]:
@@ -95,7 +95,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
                         radius,
                         predicted.tolist(),
                         marks=False,
-                        color=COLORS[channel],
+                        color=CHANNEL_COLORS[channel],
                     )
                 )
         plots.append(
@@ -403,7 +403,7 @@ def _words_of_name(name: str) -> str:
     >>> _words_of_name("cheek, as published")
     'cheek, as published'
     """
-    found = _NAME.fullmatch(name)
+    found = _MEASUREMENT_NAME.fullmatch(name)
     if found is None:
         return name
     site, repeat, angle = found.groups()

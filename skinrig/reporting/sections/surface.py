@@ -17,12 +17,12 @@ from skinrig.reporting import page
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign
 
-SMALL_PX = 110
+SMALL_WIDTH_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
-GRAY = 0.5
-RELATIVE = ("r_d",)
+BACKGROUND_CODE = 0.5
+RELATIVE_ERROR_MAPS = ("r_d",)
 """Maps whose standard errors are shown in percent of the estimate."""
-FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
+FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
 def section(
@@ -58,7 +58,7 @@ def section(
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
         true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
-    best = next((key for key in FIRST[1:] if key in appearance.maps), "")
+    best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
     large = {"r_d", best}
     shown_truths: set[str] = set()
     minor = []
@@ -67,7 +67,7 @@ def section(
             continue
         values = skin_map.values[rows, columns]
         good = _valid(skin_map)[rows, columns]
-        width = WIDTH_PX if key in large else SMALL_PX
+        width = WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
         known_truth = truth is not None and true_name in truth.maps
@@ -83,7 +83,7 @@ def section(
         if skin_map.stderr is not None:
             stderr = skin_map.stderr[rows, columns]
             figures.append(_spread(key, skin_map.unit, values, stderr, view, good, width=width))
-        if key in FIRST:
+        if key in FIRST_MAPS:
             yield page.Heading(heading(key))
             yield page.Images(figures, small=key not in large)
         else:
@@ -98,7 +98,7 @@ def section(
 
 def _rank(key: str) -> tuple[int, str]:
     """Order maps: what people look for first, then by name."""
-    return (FIRST.index(key) if key in FIRST else len(FIRST), key)
+    return (FIRST_MAPS.index(key) if key in FIRST_MAPS else len(FIRST_MAPS), key)
 
 
 def _shown(
@@ -113,13 +113,13 @@ def _shown(
     if "normals" in key:
         return map_pictures.normal_picture(title, image, valid=valid, of=key, width=width)
     return map_pictures.color_picture(
-        title, np.where(valid[..., None], image, GRAY**2.2), of=f"{key}, linear sRGB"
+        title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
     )
 
 
 def _title(title: str, key: str) -> str:
     """Return what stands below a picture: of maps that share a heading, which one it is."""
-    return title if key in FIRST else f"{words(key)}, {title}"
+    return title if key in FIRST_MAPS else f"{words(key)}, {title}"
 
 
 def _error(
@@ -172,7 +172,7 @@ def _spread(
     width: int,
 ) -> page.Image:
     stderr, unit = stderr.astype(np.float64), page.short_unit(unit)
-    if key in RELATIVE:  # as errors are told, beside which it stands
+    if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
         size = np.abs(values.astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
         stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"

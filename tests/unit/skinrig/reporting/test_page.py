@@ -139,9 +139,9 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
 def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_value(rng):
     values = rng.random((40, 50))
     values[3, 4] = np.nan
-    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_pictures.LEVELS)
+    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_pictures.SCALE_COLORS)
     seen = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
-    assert seen[3, 4].tolist() == [png.GRAY] * 3
+    assert seen[3, 4].tolist() == [png.INVALID_GRAY] * 3
     fine = png.colorize(values, 0.0, 1.0).astype(int)
     step = np.abs(np.diff(png.palette("viridis", 128).astype(int), axis=0)).max()
     assert np.abs(seen - fine).max() <= step

@@ -60,7 +60,7 @@ def test_a_report_finds_pictures_below_its_folder(tmp_path):
 
 
 def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "LARGEST_BYTES", 10)
+    monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
     body = page.fragment(pictures.section(folder, []))
     assert "Too large for here: radiance.png" in body
