@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,13 +131,16 @@ def judge(found: Findings, checks: list[page.Check]) -> None:
         Judgements are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-    _maps(found, appearances, checks)
-    _documents(found, checks)
     sessions = session.facts_of(found.sessions)
-    calibration.section(found.calibrations, appearances, sessions, checks)
+    for blocks in (
+        _maps(found, appearances, checks),
+        _documents(found, checks),
+        calibration.section(found.calibrations, appearances, sessions, checks),
+    ):
+        deque(blocks, maxlen=0)  # each section judges while its blocks are made
 
 
-def sections(found: Findings, checks: list[page.Check]) -> str:
+def sections(found: Findings, checks: list[page.Check]) -> list[page.Block]:
     """Return the sections on all that was found, and judge it.
 
     Parameters
@@ -148,88 +152,87 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     sessions = session.facts_of(found.sessions)
-    body = _maps(found, appearances, checks)
-    body += chromophore.identifiability(appearances.values())
-    body += population.section(appearances, found.truths)
-    body += _documents(found, checks)
-    body += calibration.section(found.calibrations, appearances, sessions, checks)
-    body += omissions.section(found.sessions)
-    body += consents.section([found])
-    return body + session.section(sessions)
+    return [
+        *_maps(found, appearances, checks),
+        *chromophore.identifiability(appearances.values()),
+        *population.section(appearances, found.truths),
+        *_documents(found, checks),
+        *calibration.section(found.calibrations, appearances, sessions, checks),
+        *omissions.section(found.sessions),
+        *consents.section([found]),
+        *session.section(sessions),
+    ]
 
 
 def _maps(
     found: Findings, appearances: Mapping[str, SkinAppearance], checks: list[page.Check]
-) -> str:
-    body = ""
+) -> Iterator[page.Block]:
     for name, appearance in appearances.items():
         if dynamic.is_dynamic(appearance):
-            body += _dynamic_section(name, appearance, found, checks)
+            yield from _dynamic_section(name, appearance, found, checks)
         else:
-            body += _appearance_section(name, appearance, found.truth_of(appearance), checks)
-    return body + "".join(pictures_section.section(folder, checks) for folder in found.pictures)
+            yield from _appearance_section(name, appearance, found.truth_of(appearance), checks)
+    for folder in found.pictures:
+        yield from pictures_section.section(folder, checks)
 
 
-def _documents(found: Findings, checks: list[page.Check]) -> str:
-    body = ""
+def _documents(found: Findings, checks: list[page.Check]) -> Iterator[page.Block]:
     for path in found.documents:
         document = read_json(path)
         if bench.is_bench(document):
-            body += bench.section(document, checks)
+            yield from bench.section(document, checks)
         elif document["schema"] == extremes.SCHEMA:
-            body += extremes.section(document, checks)
+            yield from extremes.section(document, checks)
         else:
-            body += _document_section(document)
-    return body
+            yield from _document_section(document)
 
 
 def _appearance_section(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> str:
-    body = f"<h2>Maps: {page.escape(name)}</h2>"
+) -> Iterator[page.Block]:
+    yield page.Heading(f"Maps: {name}", level=2)
     pictures = [
         map_pictures.color_picture(f"{label}, linear sRGB", appearance.maps[key].values)
         for key, label in (("picture", "crossed polarizers"), ("specular_picture", "specular"))
         if key in appearance.maps
     ]
     if pictures:
-        body += f'<div class="maps">{"".join(pictures)}</div>'
+        yield page.Images(pictures)
     if "position" in appearance.maps:
-        body += surface_section.section(name, appearance, truth, checks)
+        yield from surface_section.section(name, appearance, truth, checks)
     elif microrelief.is_microrelief(appearance):
-        body += microrelief.section(name, appearance, truth, checks)
+        yield from microrelief.section(name, appearance, truth, checks)
     else:
         if subsurface.is_probe(appearance):
-            body += subsurface.section(name, appearance, truth, checks)
+            yield from subsurface.section(name, appearance, truth, checks)
         elif sequence.is_sequence(appearance):
-            body += sequence.section(appearance)
+            yield from sequence.section(appearance)
         if truth is not None and "melanin" in truth.maps:
-            body += chromophore.errors(name, appearance, truth, checks)
-        body += chromophore.panels(appearance, truth)
+            yield from chromophore.errors(name, appearance, truth, checks)
+        yield from chromophore.panels(appearance, truth)
     if truth is None:
-        body += unjudged.section(appearance)
-    return body + provenance.section(appearance)
+        yield from unjudged.section(appearance)
+    yield from provenance.section(appearance)
 
 
 def _dynamic_section(
     name: str, appearance: SkinAppearance, found: Findings, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     part = parts_of(appearance).get("facial_color", {})
     truths = {
         state: store.read(found.truths[folder])
         for state, folder in part.get("truth", {}).items()
         if folder in found.truths
     }
-    body = f"<h2>Moving face: {page.escape(name)}</h2>"
-    body += dynamic.section(name, appearance, truths, checks)
+    yield page.Heading(f"Moving face: {name}", level=2)
+    yield from dynamic.section(name, appearance, truths, checks)
     if not truths:
-        body += unjudged.section(appearance)
-    return body + provenance.section(appearance)
+        yield from unjudged.section(appearance)
+    yield from provenance.section(appearance)
 
 
-def _document_section(document: Mapping[str, Any]) -> str:
+def _document_section(document: Mapping[str, Any]) -> Iterator[page.Block]:
     heading = document.get("title", document["schema"])
-    body = f"<h2>{page.escape(heading)}</h2>"
+    yield page.Heading(heading, level=2)
     for entry in document.get("tables", ()):
-        body += page.table(entry["head"], entry["rows"], caption=entry["title"])
-    return body
+        yield page.table(entry["head"], entry["rows"], caption=entry["title"])

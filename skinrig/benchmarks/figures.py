@@ -45,7 +45,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     joined = [best for front in fronts if len(best := np.array(front["points"], int)) > 1]
     named = len(fronts) <= MOST_NAMED
     for number, front in enumerate(fronts):
-        color = figures.COLORS[number % len(figures.COLORS)]
+        color = figures.SERIES_COLORS[number % len(figures.SERIES_COLORS)]
         own = np.array([_shares(p, front["condition"]) for p in points])
         best = np.array(front["points"], int)
         beaten = np.setdiff1d(np.flatnonzero(own), best)
@@ -161,7 +161,7 @@ def compared_fronts(
             "os"[number],
             mfc="none" if number else None,
             ms=5,
-            color=figures.COLORS[number],
+            color=figures.SERIES_COLORS[number],
             label=label,
         )
         places.append(

@@ -12,7 +12,7 @@ import numpy as np
 from skinrig.arrays import FloatArray
 from skinrig.drawing import svg
 
-COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
+SERIES_COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
 
 
 def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
@@ -83,10 +83,12 @@ def bars(
             np.asarray(values, float),
             width,
             label=name,
-            color=COLORS[number % len(COLORS)],
+            color=SERIES_COLORS[number % len(SERIES_COLORS)],
         )
         if limits and name in limits:
-            axes.axhline(limits[name], color=COLORS[number % len(COLORS)], ls="--", lw=1)
+            axes.axhline(
+                limits[name], color=SERIES_COLORS[number % len(SERIES_COLORS)], ls="--", lw=1
+            )
     axes.set_xticks(position, labels, fontsize=8)
     axes.set_ylabel(unit)
     axes.set_title(title, fontsize=10)
@@ -129,7 +131,7 @@ def curves(
     """
     figure, axes = canvas(5.2, 3.4)
     for number, curve in enumerate(series):
-        color = curve.color or COLORS[number % len(COLORS)]
+        color = curve.color or SERIES_COLORS[number % len(SERIES_COLORS)]
         style = ("o" if curve.marks else "") + ("-" if curve.line else "")
         x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
         if log_y:

@@ -10,7 +10,7 @@ import numpy as np
 
 from skinrig.arrays import Float64Array, FloatArray
 
-_PLACES = tuple(
+_LABEL_OFFSETS = tuple(
     (dx, dy, across, up)
     for far in (5, 12, 20)
     for dx, dy, across, up in (
@@ -74,7 +74,7 @@ def name_points(
         words = axes.annotate(label, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=6)
         words.set_in_layout(False)  # a long name must not squeeze the axes away
         found = None
-        for place in _PLACES:
+        for place in _LABEL_OFFSETS:
             box = _moved(words, place)
             within = inside.containsx(box.x0) and inside.containsx(box.x1)
             within = within and inside.containsy(box.y0) and inside.containsy(box.y1)
@@ -92,7 +92,7 @@ def name_points(
 
 
 def _moved(words: Any, place: tuple[int, int, str, str]) -> Any:
-    """Put a name at a place of `_PLACES`, and return the box that it then fills, pixels."""
+    """Put a name at a place of `_LABEL_OFFSETS`, and return the box that it then fills, pixels."""
     dx, dy, across, up = place
     words.set_position((dx, dy))
     words.set_ha(across)

@@ -6,13 +6,13 @@ import hashlib
 import html
 import re
 
-DECIMALS = 2
+COORDINATE_DECIMALS = 2
 """Of coordinates, in points: a hundredth of a point is finer than a screen or a printer shows."""
 
-_TAG = re.compile(r"<[^>]+>")
+_TAG_PATTERN = re.compile(r"<[^>]+>")
 _LONG_NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
-_DEFAULTS = {"font-family", "stroke-linejoin"}
-_FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
+_DROPPED_STYLES = {"font-family", "stroke-linejoin"}
+_FONT_FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
 
 
 def simplified(drawn: str, *, alt: str) -> str:
@@ -48,12 +48,12 @@ def simplified(drawn: str, *, alt: str) -> str:
     text = re.sub(r"<path\b[^>]*fill: none; opacity: 0\"/>", "", text)
     text = text.replace("xlink:href", "href").replace("#000000", "currentColor")
     text = re.sub(r' xmlns:xlink="[^"]*"| version="[^"]*"', "", text)
-    text = _TAG.sub(lambda found: _attributes(found[0]), text)
+    text = _TAG_PATTERN.sub(lambda found: _attributes(found[0]), text)
     text = re.sub(r">\s+<", "><", text)
     text = _own_ids(text)
     text = _joined(_unnested(text))
     named = (
-        f'<svg role="img" aria-label="{html.escape(alt, quote=True)}" font-family="{_FAMILY}" '
+        f'<svg role="img" aria-label="{html.escape(alt, quote=True)}" font-family="{_FONT_FAMILY}" '
         'fill="currentColor" stroke-linejoin="round" '
     )
     return text.replace("<svg ", named, 1)
@@ -70,12 +70,12 @@ def _attributes(tag: str) -> str:
         return "".join(
             f' {name}="{value.removesuffix("px")}"'
             for name, value in kept.items()
-            if name not in _DEFAULTS and (name, value) != ("text-anchor", "start")
+            if name not in _DROPPED_STYLES and (name, value) != ("text-anchor", "start")
         )
 
     tag = re.sub(r'\s+style="([^"]*)"', of_style, tag)
     tag = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", tag)
-    tag = _LONG_NUMBER.sub(lambda found: f"{round(float(found[0]), DECIMALS):g}", tag)
+    tag = _LONG_NUMBER.sub(lambda found: f"{round(float(found[0]), COORDINATE_DECIMALS):g}", tag)
     tag = re.sub(r"\s+", " ", tag)
     # letters of a path's commands stand for themselves
     return re.sub(r' d="([^"]*)"', lambda found: f' d="{_path(found[1])}"', tag)

@@ -30,8 +30,8 @@ def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
                 yield folder, dict(record)
 
 
-def section(sides: Sequence[Findings]) -> str:
-    """Return the table of subjects and what they agreed to; empty where nobody was measured.
+def section(sides: Sequence[Findings]) -> Iterator[page.Block]:
+    """Yield the table of subjects and what they agreed to; empty where nobody was measured.
 
     Parameters
     ----------
@@ -46,12 +46,13 @@ def section(sides: Sequence[Findings]) -> str:
             if folder.name not in names:
                 names.append(folder.name)
     if not rows:
-        return ""
+        return
     table = [
         (line.partition(": ")[0], line.partition(": ")[2], ", ".join(names))
         for line, names in sorted(rows.items())
     ]
-    return "<h2>Consent</h2>" + page.table(
+    yield page.Heading("Consent", level=2)
+    yield page.table(
         ("subject", "agreed to", "shown from"),
         table,
         caption="This report shows these people: hand it on for nothing else, and not after",

@@ -130,13 +130,13 @@ def _sort_in(entry: Path, found: Findings) -> None:
         found.calibrations.append(entry)
 
 
-_HEAD_CHARS = 400
+_SCHEMA_SEARCH_CHARS = 400
 """Within which a document names its schema."""
 
 
 def _is_of_a_calibration(file: Path) -> bool:
     with file.open(encoding="utf-8", errors="replace") as text:
-        return f'"{CALIBRATION_SCHEMA}"' in text.read(_HEAD_CHARS)
+        return f'"{CALIBRATION_SCHEMA}"' in text.read(_SCHEMA_SEARCH_CHARS)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
-from skinrig.reporting.page import escape, number
+from skinrig.reporting import page
+from skinrig.reporting.page import number
 from skinrig.written_units import written
 
-LEVELS = 128
+SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
 
 
@@ -34,7 +37,7 @@ def scalar_picture(
     unit: str = "",
     width: int = 280,
     of: str = "",
-) -> str:
+) -> page.Image:
     """Return a figure of a map with its color scale.
 
     Parameters
@@ -46,7 +49,7 @@ def scalar_picture(
     low, high
         Ends of the color scale, in ``unit``.
     scale
-        A key of `skinrig.drawing.png.SCALES`.
+        A key of `skinrig.drawing.png.SCALE_CLASSES`.
     valid
         (H, W); other pixels are gray.
     unit
@@ -58,18 +61,12 @@ def scalar_picture(
     """
     small = shrink(values, width).astype(float)
     mask = None if valid is None else shrink(valid, width).astype(bool)
-    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=LEVELS)
+    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
     named = f"{of}, {title}" if of else title
     scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
     alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
-    of_unit = f"<span>{escape(unit)}</span>" if unit else ""
-    return (
-        f'<figure><img alt="{escape(alt)}" width="{small.shape[1]}" height="{small.shape[0]}" '
-        f'src="{png.address(data)}"><figcaption>{escape(title)}</figcaption>'
-        f'<div class="scale" aria-hidden="true"><span>{number(low)}</span>'
-        f'<span class="bar {png.SCALES[scale]}"></span>'
-        f"<span>{number(high)}</span>{of_unit}</div></figure>"
-    )
+    bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), unit)
+    return _stored(title, data, alt, small.shape, bar)
 
 
 def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
@@ -84,7 +81,7 @@ def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
 
 
-def color_picture(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> str:
+def color_picture(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
     """Return a figure of a linear sRGB image, (H, W, 3)."""
     small = shrink(np.asarray(linear), width).astype(float)
     finite = np.isfinite(small).all(axis=2)
@@ -95,19 +92,19 @@ def color_picture(title: str, linear: FloatArray, *, width: int = 320, of: str =
     return plain_picture(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
 
 
-def plain_picture(title: str, image: UInt8Array, *, alt: str = "") -> str:
+def plain_picture(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
 
 
 def normal_picture(
     title: str, normals: FloatArray, *, valid: BoolArray, width: int = 280, of: str = "normals"
-) -> str:
+) -> page.Image:
     """Return a figure of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
     small = shrink(normals, width).astype(float)
     mask = shrink(valid, width).astype(bool)
     image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
-    image[~mask] = png.GRAY
+    image[~mask] = png.INVALID_GRAY
     alt = f"{of}, {title}: x, y, z as red, green, blue"
     if mask.any():
         length = np.linalg.norm(small[mask], axis=-1)
@@ -118,17 +115,20 @@ def normal_picture(
     return _stored(title, png.encode(image), alt, image.shape[:2])
 
 
-def stored_picture(title: str, data: bytes, *, alt: str = "") -> str:
+def stored_picture(title: str, data: bytes, *, alt: str = "") -> page.Image:
     """Return a figure of a PNG file's bytes, as they are."""
     return _stored(title, data, alt or title, None)
 
 
-def _stored(title: str, data: bytes, alt: str, shape: tuple[int, ...] | None) -> str:
-    size = "" if shape is None else f' width="{shape[1]}" height="{shape[0]}"'
-    return (
-        f'<figure><img alt="{escape(alt)}"{size} src="{png.address(data)}">'
-        f"<figcaption>{escape(title)}</figcaption></figure>"
-    )
+def _stored(
+    title: str,
+    data: bytes,
+    alt: str,
+    shape: tuple[int, ...] | None,
+    scale: page.ColorScale | None = None,
+) -> page.Image:
+    size = None if shape is None else (shape[1], shape[0])
+    return page.Image(title, png.address(data), alt, size, scale)
 
 
 def reach_of(values: FloatArray, shown: BoolArray, percentile: float) -> float:
@@ -146,8 +146,8 @@ def map_panel(
     truth: FloatArray | None = None,
     valid: BoolArray | None = None,
     width: int = 280,
-) -> str:
-    """Return truth | estimate | error | standard error of a map, truth and estimate to one scale.
+) -> Iterator[page.Block]:
+    """Yield truth | estimate | error | standard error of a map, truth and estimate to one scale.
 
     Parameters
     ----------
@@ -194,4 +194,5 @@ def map_panel(
         add("estimate − truth", error, (-reach, reach), "RdBu_r")
     if standard_error is not None:
         add("standard error", standard_error, (0.0, reach_of(standard_error, mask, 98)), "magma")
-    return f'<h3>{escape(name)}</h3><div class="maps">{"".join(parts)}</div>'
+    yield page.Heading(name)
+    yield page.Images(parts)

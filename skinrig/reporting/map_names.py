@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-WORDS: Final = {
+MAP_WORDS: Final = {
     "r_d": "diffuse reflectance R_d",
     "normals_refined": "normals without gloss",
     "half_vector_normals": "normals by half vectors",
@@ -17,9 +17,9 @@ WORDS: Final = {
     "specular_picture": "picture of gloss",
 }
 """Names in files to words; what is not here is a word already."""
-_STATE: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
-_NUMBERED: Final = {"basis_weight_": "share of lobe "}
-_OF: Final = {
+_STATE_NAME: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
+_NUMBERED_PREFIXES: Final = {"basis_weight_": "share of lobe "}
+_PART_PREFIXES: Final = {
     "change_": "change of hemoglobin, ",
     "hemoglobin_": "hemoglobin, ",
     "microrelief_": "microrelief, ",
@@ -39,11 +39,11 @@ def words(name: str) -> str:
     key, _, channel = name.partition(" ")
     if channel:
         return f"{words(key)}, {channel}"
-    if key in WORDS:
-        return WORDS[key]
-    if found := _STATE.fullmatch(key):
+    if key in MAP_WORDS:
+        return MAP_WORDS[key]
+    if found := _STATE_NAME.fullmatch(key):
         return f"{found['map'].replace('_', ' ')}, {state_words(found['state'])}"
-    for head, told in (_NUMBERED | _OF).items():
+    for head, told in (_NUMBERED_PREFIXES | _PART_PREFIXES).items():
         if key.startswith(head):
             return told + key.removeprefix(head).replace("_", " ")
     return key.replace("_", " ")

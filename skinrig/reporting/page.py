@@ -1,30 +1,25 @@
-"""The pieces of the report page: checks, tables, the page itself; text in, HTML out."""
+"""The pieces of the report page: checks, blocks that templates draw, the page itself."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Literal
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 
+from skinrig.drawing import templates
 from skinrig.written_units import written
 
-STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
-SHORT = 22
+PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
+MAX_UNBROKEN_CHARS = 22
 """Characters up to which a cell's text is not broken over lines."""
 BAR_STOPS = 17
 """Colors that a scale's bar runs through; between them it is straight in sRGB."""
-
-
-def escape(value: object) -> str:
-    """Return ``value`` as text that is safe inside HTML."""
-    return html.escape(str(value), quote=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +54,122 @@ class Check:
         return self.got / self.bound
 
 
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A heading; level 2 begins a section of the page and of its contents."""
+
+    macro: ClassVar = "heading"
+    text: str
+    level: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Paragraph:
+    """Plain text."""
+
+    macro: ClassVar = "paragraph"
+    text: str
+    kind: str = ""
+    """Class in the style sheet, such as "note"."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bullets:
+    """A list of sentences."""
+
+    macro: ClassVar = "bullets"
+    items: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of a table."""
+
+    text: str
+    kind: str = ""
+    """Class in the style sheet: "n" a number, "k" kept on one line."""
+    names_row: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table with a caption; a heading without text leaves its cell empty."""
+
+    macro: ClassVar = "table"
+    caption: str
+    head: Sequence[Cell]
+    rows: Sequence[Sequence[Cell]]
+
+
+@dataclass(frozen=True, slots=True)
+class ColorScale:
+    """The bar below an image of a map."""
+
+    name: str
+    low: str
+    high: str
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """An image with its title, for an `Images` row."""
+
+    title: str
+    address: str
+    """The file as a ``data:`` address."""
+    alt: str
+    size: tuple[int, int] | None = None
+    """Width and height, pixels; None: as the file has it."""
+    scale: ColorScale | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """Images side by side."""
+
+    macro: ClassVar = "images"
+    images: Sequence[Image]
+    small: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Plots:
+    """SVG drawings side by side."""
+
+    macro: ClassVar = "plots"
+    drawings: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """Blocks that open when their title is clicked, and are open when printed."""
+
+    macro: ClassVar = "folded"
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """Text that is always the same, marked up in a template of its own."""
+
+    macro: ClassVar = "fixed"
+    template: str
+
+
+Block: TypeAlias = Heading | Paragraph | Bullets | Table | Images | Plots | Folded | Fixed
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Blocks below a heading of level 2; without an anchor, those before the first."""
+
+    anchor: str
+    title: str
+    blocks: list[Block]
+
+
 def number(value: float) -> str:
     """Return a number with four significant digits, or a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
@@ -75,65 +186,46 @@ def short_unit(unit: str) -> str:
     return "" if unit == "1" else unit.split(" of ")[0]
 
 
-def checks_table(checks: Sequence[Check]) -> str:
+def checks_table(checks: Sequence[Check]) -> Table:
     """Return the table of checks, the missed ones first."""
     rows = []
     for check in sorted(checks, key=lambda c: c.passed):
-        word, kind = ("kept", "good") if check.passed else ("missed", "bad")
         sign = "≤" if check.sense == "<=" else "≥"
         rows.append(
-            f'<tr><td class="{kind}">{word}</td><th scope="row">{escape(check.name)}</th>'
-            f'<td class="n">{_with_unit(check.got, check.unit)}</td>'
-            f'<td class="n">{sign} {_with_unit(check.bound, check.unit)}</td>'
-            f'<td class="n">{_percent(check.used)}</td>'
-            f'<td class="n">{_percent(check.coverage)}</td>'
-            f'<td class="n">{_percent(check.masked)}</td><td>{_joined(check.worst)}</td>'
-            f"<td>{_joined(check.note)}</td></tr>"
+            (
+                Cell("kept", "good") if check.passed else Cell("missed", "bad"),
+                Cell(check.name, names_row=True),
+                Cell(written(number(check.got), check.unit), "n"),
+                Cell(f"{sign} {written(number(check.bound), check.unit)}", "n"),
+                *(Cell(_percent(one), "n") for one in (check.used, check.coverage, check.masked)),
+                Cell(_joined(check.worst)),
+                Cell(_joined(check.note)),
+            )
         )
-    head = (
-        ("verdict", ""),
-        ("check", ""),
-        ("measured", "n"),
-        ("limit", "n"),
-        ("of the limit", "n"),
-        ("truths in 68 % intervals", "n"),
-        ("masked", "n"),
-        ("worst", ""),
-        ("remark", ""),
+    numbers = ("measured", "limit", "of the limit", "truths in 68 % intervals", "masked")
+    return Table(
+        "What was promised and what was measured; missed checks stand first",
+        (
+            Cell("verdict"),
+            Cell("check"),
+            *(Cell(title, "n") for title in numbers),
+            Cell("worst"),
+            Cell("remark"),
+        ),
+        rows,
     )
-    caption = "What was promised and what was measured; missed checks stand first"
-    return _scrollable(_head(head, caption) + "".join(rows) + "</tbody></table>", caption)
-
-
-def _with_unit(value: float, unit: str) -> str:
-    return escape(written(number(value), unit))
 
 
 def _joined(text: str) -> str:
     """Return text whose numbers keep their percent signs when a narrow cell breaks it."""
-    return escape(text).replace(" %", "\N{NO-BREAK SPACE}%")
+    return text.replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if np.isfinite(share) else ""
 
 
-def _head(head: Sequence[tuple[str, str]], caption: str) -> str:
-    cells = "".join(
-        f'<th scope="col"{f""" class="{kind}" """.rstrip() if kind else ""}>{escape(title)}</th>'
-        if title
-        else "<td></td>"
-        for title, kind in head
-    )
-    return f"<table><caption>{escape(caption)}</caption><thead><tr>{cells}</tr></thead><tbody>"
-
-
-def _scrollable(body: str, name: str) -> str:
-    """Return what may be wider than the page, so that a keyboard reaches all of it."""
-    return f'<div class="scroll" tabindex="0" role="group" aria-label="{escape(name)}">{body}</div>'
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> Table:
     """Return a table; numbers are set right-aligned with four digits.
 
     Parameters
@@ -146,61 +238,53 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
         What the table tells.
     """
 
-    def cell(value: object, first: bool) -> str:
+    def cell(value: object, first: bool) -> Cell:
         if isinstance(value, (float, np.floating)):
-            kind, text = "n", number(float(value))
-        elif isinstance(value, (int, np.integer)) and not isinstance(value, bool):
-            kind, text = "n", str(value)
-        else:
-            text = escape(value)
-            kind = "k" if len(text) <= SHORT else ""
-        marked = f' class="{kind}"' if kind else ""
-        if first and text:
-            return f'<th scope="row"{marked}>{text}</th>'
-        return f"<td{marked}>{text}</td>"
+            return Cell(number(float(value)), "n", first)
+        if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+            return Cell(str(value), "n", first)
+        text = str(value)
+        return Cell(text, "k" if len(text) <= MAX_UNBROKEN_CHARS else "", first)
 
     numeric = [
         bool(rows) and all(isinstance(row[k], (int, float, np.number)) for row in rows)
         for k in range(len(head))
     ]
-    body = "".join(
-        "<tr>" + "".join(cell(v, k == 0) for k, v in enumerate(row)) + "</tr>" for row in rows
+    return Table(
+        caption,
+        [Cell(title, "n" if right else "") for title, right in zip(head, numeric, strict=True)],
+        [[cell(value, k == 0) for k, value in enumerate(row)] for row in rows],
     )
-    titles = [(title, "n" if right else "") for title, right in zip(head, numeric, strict=True)]
-    return _scrollable(_head(titles, caption) + body + "</tbody></table>", caption)
 
 
-def folded(title: str, body: str) -> str:
-    """Return HTML that opens when its title is clicked, and is open when printed."""
-    return f"<details><summary>{escape(title)}</summary>{body}</details>"
-
-
-def facts(values: Mapping[str, object], *, caption: str) -> str:
+def facts(values: Mapping[str, object], *, caption: str) -> Table:
     """Return a two-column table of names and values."""
     return table(("what", "value"), list(values.items()), caption=caption)
 
 
-def note(text: str) -> str:
+def note(text: str) -> Paragraph:
     """Return a remark of plain text."""
-    return f'<p class="note">{escape(text)}</p>'
+    return Paragraph(text, "note")
 
 
-def one_skin(parameters: Mapping[str, object]) -> str:
+def one_skin(parameters: Mapping[str, object]) -> Paragraph:
     """Return a remark on whom errors are of, where a session holds one subject and has no bands.
 
     Examples
     --------
-    >>> one_skin({"preset": "III"})
-    '<p class="note">Errors are of one subject, III: there are no bands to tell apart.</p>'
+    >>> one_skin({"preset": "III"}).text
+    'Errors are of one subject, III: there are no bands to tell apart.'
     """
-    for key in ("subject", "preset"):
-        if parameters.get(key):
-            subject = parameters[key]
-            return note(f"Errors are of one subject, {subject}: there are no bands to tell apart.")
-    return note("Errors are of one subject: there are no bands to tell apart.")
+    subject = next((f", {parameters[k]}" for k in ("subject", "preset") if parameters.get(k)), "")
+    return note(f"Errors are of one subject{subject}: there are no bands to tell apart.")
 
 
-def document(title: str, lead: str, sections: str) -> str:
+def fragment(blocks: Iterable[Block]) -> str:
+    """Return blocks as HTML, without a page around them."""
+    return templates.render("reporting/templates/fragment.html", blocks=list(blocks))
+
+
+def document(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> str:
     """Return the whole page; it makes no request and runs no script.
 
     Parameters
@@ -208,51 +292,35 @@ def document(title: str, lead: str, sections: str) -> str:
     title
         Of the page.
     lead
-        HTML of what stands first: the verdict.
+        What stands first: the verdict.
     sections
-        HTML of the rest; each ``<h2>`` begins a section of the table of contents.
+        The rest, below the contents.
     """
-    head, contents, body = _in_sections(lead, sections)
-    style = STYLE + _bars()
+    style = PAGE_STYLE + _bars()
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
-    policy = (
-        f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; "
-        "form-action 'none'"
-    )
-    return (
-        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head>"
-        '<body><a class="skip" href="#content">Skip to the verdict</a>'
-        f'<header><h1>{escape(title)}</h1></header><main id="content">{head}{contents}{body}'
-        "</main></body></html>\n"
+    taken = {"content", "contents"}
+    head, body = _parts(lead, taken), _parts(sections, taken)
+    return templates.render(
+        "reporting/templates/page.html",
+        title=title,
+        style=style,
+        policy=f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
+        "base-uri 'none'; form-action 'none'",
+        lead=head,
+        body=body,
+        titled=[part for part in head + body if part.anchor],
     )
 
 
-def _in_sections(lead: str, sections: str) -> tuple[str, str, str]:
-    """Return lead, contents and body, with an id and a landmark for each second heading."""
-    taken: set[str] = {"content", "contents"}
-    entries: list[tuple[str, str]] = []
-
-    def wrapped(text: str) -> str:
-        pieces = re.split(r"<h2>(.*?)</h2>", text)
-        out = pieces[0]
-        for heading, body in zip(pieces[1::2], pieces[2::2], strict=True):
-            name = _anchor(heading, taken)
-            entries.append((name, heading))
-            out += (
-                f'<section aria-labelledby="{name}"><h2 id="{name}">{heading}</h2>{body}</section>'
-            )
-        return out
-
-    head, body = wrapped(lead), wrapped(sections)
-    links = "".join(f'<li><a href="#{name}">{heading}</a></li>' for name, heading in entries)
-    contents = (
-        f'<nav aria-labelledby="contents"><h2 id="contents">Contents</h2><ul>{links}</ul></nav>'
-    )
-    return head, contents if entries else "", body
+def _parts(blocks: Iterable[Block], taken: set[str]) -> list[Part]:
+    """Return blocks by section, each section with an id that no other has."""
+    parts = [Part("", "", [])]
+    for block in blocks:
+        if isinstance(block, Heading) and block.level == 2:
+            parts.append(Part(_anchor(block.text, taken), block.text, []))
+        else:
+            parts[-1].blocks.append(block)
+    return parts
 
 
 def _anchor(heading: str, taken: set[str]) -> str:
@@ -264,8 +332,7 @@ def _anchor(heading: str, taken: set[str]) -> str:
     >>> _anchor("Maps: flash II", taken), _anchor("Maps: flash-II", taken)
     ('maps-flash-ii', 'maps-flash-ii-2')
     """
-    plain = html.unescape(heading).casefold()
-    name = re.sub(r"[^a-z0-9]+", "-", plain).strip("-") or "section"
+    name = re.sub(r"[^a-z0-9]+", "-", heading.casefold()).strip("-") or "section"
     number_, free = 2, name
     while free in taken:
         free, number_ = f"{name}-{number_}", number_ + 1
@@ -278,7 +345,7 @@ def _bars() -> str:
     from skinrig.drawing import png
 
     rules = []
-    for scale, name in png.SCALES.items():
+    for scale, name in png.SCALE_CLASSES.items():
         stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))
         rules.append(f".bar.{name}{{background:linear-gradient(90deg,{stops})}}")
     return "\n".join(rules)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from model.skin import SkinAppearance
 from skinrig.reporting import page
 
-DIGEST_SHOWN = 16
+DIGEST_CHARS = 16
 """Characters of a digest that a table shows."""
 
 
@@ -33,23 +33,23 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def section(appearance: SkinAppearance) -> str:
-    """Return what was assumed and left out, and where an appearance comes from."""
-    body = ""
+def section(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield what was assumed and left out, and where an appearance comes from."""
     assumed = appearance.parameters.get("assumed")
     if isinstance(assumed, (list, tuple)) and assumed:
-        body += "<h3>Assumed</h3>" + page.table(
+        yield page.Heading("Assumed")
+        yield page.table(
             ("assumption",), [[text] for text in assumed], caption="Taken for granted, not measured"
         )
     if appearance.left_out:
-        body += "<h3>Left out</h3>" + page.table(
-            ("what", "why"), appearance.left_out, caption="Stages that were not run"
-        )
-    origin = page.facts(
+        yield page.Heading("Left out")
+        yield page.table(("what", "why"), appearance.left_out, caption="Stages that were not run")
+    yield page.Heading("Provenance")
+    yield page.facts(
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": short(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
-        caption=f"Inputs by the first {DIGEST_SHOWN} digits of their SHA-256",
+        caption=f"Inputs by the first {DIGEST_CHARS} digits of their SHA-256",
     )
     settings = {
         name: value
@@ -57,7 +57,7 @@ def section(appearance: SkinAppearance) -> str:
         if not name.startswith(("stages.", "assumed"))
     }
     told = page.facts(settings, caption="Parameters that the folder records")
-    return body + "<h3>Provenance</h3>" + origin + page.folded(f"{len(settings)} parameters", told)
+    yield page.Folded(f"{len(settings)} parameters", [told])
 
 
 def short(digest: str) -> str:
@@ -68,4 +68,4 @@ def short(digest: str) -> str:
     >>> short("sha256:0123456789abcdef0123")
     '0123456789abcdef'
     """
-    return digest.removeprefix("sha256:")[:DIGEST_SHOWN]
+    return digest.removeprefix("sha256:")[:DIGEST_CHARS]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
@@ -10,12 +12,12 @@ from skinrig.evaluating import flash
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band, words
 
-RESIDUALS = ("residual", "misfit", "gamut_distance")
+RESIDUAL_WORDS = ("residual", "misfit", "gamut_distance")
 """Words in the names of maps that tell how badly a model fits."""
-BANDED = ("melanin", "hemoglobin")
+BANDED_MAPS = ("melanin", "hemoglobin")
 
 
-MOST_NAMED = 3
+MAX_NAMED_MAPS = 3
 """Maps of an appearance that are named first: those that know least."""
 
 
@@ -51,12 +53,12 @@ def weaknesses(name: str, appearance: SkinAppearance) -> list[str]:
         elif np.isfinite(percent := float(str(row[5]))):
             text = f"{of} {page.number(percent)} % of its value"
             told.append((percent, text + missing))
-    first = sorted(told, reverse=True)[:MOST_NAMED] + sorted(angles, reverse=True)[:1]
+    first = sorted(told, reverse=True)[:MAX_NAMED_MAPS] + sorted(angles, reverse=True)[:1]
     return [text for _, text in first]
 
 
-def section(appearance: SkinAppearance) -> str:
-    """Return standard errors and residuals of maps, by melanin band where melanin is among them.
+def section(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield standard errors and residuals of maps, by melanin band where melanin is among them.
 
     Parameters
     ----------
@@ -71,15 +73,17 @@ def section(appearance: SkinAppearance) -> str:
     residuals = [
         row
         for name, one in sorted(appearance.maps.items())
-        if any(word in name for word in RESIDUALS) and (row := _residual(name, one)) is not None
+        if any(word in name for word in RESIDUAL_WORDS)
+        and (row := _residual(name, one)) is not None
     ]
-    body = "<h3>Without a truth</h3>" + page.note(
+    yield page.Heading("Without a truth")
+    yield page.note(
         "No truth lies beside these maps: standard errors and residuals are all there is to judge "
         "them by. Whether 68 % intervals hold 68 % of truths is not claimed here; a simulated "
         "session of the same rig and plan shows how well they do."
     )
     if spreads:
-        body += page.table(
+        yield page.table(
             (
                 "map",
                 "unit",
@@ -93,12 +97,12 @@ def section(appearance: SkinAppearance) -> str:
             caption="Standard errors, of all pixels that have a value",
         )
     if residuals:
-        body += page.table(
+        yield page.table(
             ("map", "unit", "median", "68th percentile", "95th percentile"),
             residuals,
             caption="Residuals: what models leave of the images",
         )
-    return body + _by_band(appearance)
+    yield from _by_band(appearance)
 
 
 def _values(one: SkinMap) -> tuple[Float64Array, BoolArray]:
@@ -145,13 +149,13 @@ def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
     return (words(name), page.short_unit(one.unit), float(low), float(middle), float(high))
 
 
-def _by_band(appearance: SkinAppearance) -> str:
+def _by_band(appearance: SkinAppearance) -> Iterator[page.Block]:
     melanin = appearance.maps.get("melanin")
     if melanin is None:
-        return ""
+        return
     levels, known = _values(melanin)
     rows: list[tuple[object, ...]] = []
-    for name in BANDED:
+    for name in BANDED_MAPS:
         one = appearance.maps.get(name)
         if one is None or one.stderr is None or one.values.shape != levels.shape:
             continue
@@ -172,8 +176,8 @@ def _by_band(appearance: SkinAppearance) -> str:
                 )
             )
     if not rows:
-        return ""
-    return page.table(
+        return
+    yield page.table(
         ("map", "band", "pixels", "median standard error, %", "95th percentile"),
         rows,
         caption="Relative standard errors by band of the estimated melanin fraction C_m",

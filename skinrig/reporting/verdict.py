@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from skinrig.reporting import page
 from skinrig.written_units import written
 
-NAMED = 3
+MAX_NAMED_CLOSE = 3
 """Checks named that come closest to their limit."""
-MISSED_NAMED = 8
-OVERCONFIDENT, UNDERCONFIDENT = 0.5, 0.9
+MAX_NAMED_MISSED = 8
+MIN_COVERAGE, MAX_COVERAGE = 0.5, 0.9
 """Share of truths inside 68 % intervals beyond which intervals are called too small or large."""
-MUCH_MASKED = 0.2
+MAX_UNREMARKED_MASK = 0.2
 """Share of pixels without a value that is worth a sentence."""
 
 
@@ -41,8 +41,10 @@ def headline(checks: Sequence[page.Check]) -> str:
     return f"All {len(checks)} checks kept their limits."
 
 
-def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()) -> str:
-    """Return the verdict, where it is worst, and all checks.
+def section(
+    checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()
+) -> Iterator[page.Block]:
+    """Yield the verdict, where it is worst, and all checks.
 
     Parameters
     ----------
@@ -54,22 +56,22 @@ def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[st
         What maps without a truth know least of, in sentences.
     """
     kind = "bad" if any(not check.passed for check in checks) else "good"
-    body = f'<p class="verdict {kind if checks else ""}">{page.escape(headline(checks))}</p>'
+    yield page.Paragraph(headline(checks), f"verdict {kind if checks else ''}")
     if about:
-        body += f"<p>{page.escape(about)}</p>"
+        yield page.Paragraph(about)
     weak = weaknesses(checks)
     if weak:
-        items = "".join(f"<li>{page.escape(text)}</li>" for text in weak)
-        body += f'<h2>Where it is worst</h2><ul class="worst">{items}</ul>'
+        yield page.Heading("Where it is worst", level=2)
+        yield page.Bullets(weak)
     if unjudged:
-        items = "".join(f"<li>{page.escape(text)}</li>" for text in unjudged)
-        body += "<h2>Without a truth: least known</h2>" + page.note(
+        yield page.Heading("Without a truth: least known", level=2)
+        yield page.note(
             "By their own standard errors; how far they are from the truth is not known."
         )
-        body += f'<ul class="worst">{items}</ul>'
+        yield page.Bullets(unjudged)
     if checks:
-        body += "<h2>Checks</h2>" + page.checks_table(checks)
-    return body
+        yield page.Heading("Checks", level=2)
+        yield page.checks_table(checks)
 
 
 def weaknesses(checks: Sequence[page.Check]) -> list[str]:
@@ -88,11 +90,11 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
     """
     out = []
     missed = [check for check in checks if not check.passed]
-    for check in missed[:MISSED_NAMED]:
+    for check in missed[:MAX_NAMED_MISSED]:
         sign = "at most" if check.sense == "<=" else "at least"
         out.append(f"missed: {check.name}, {_measured(check)}, {sign} {_bound(check)}{_at(check)}")
-    if len(missed) > MISSED_NAMED:
-        out.append(f"missed: {len(missed) - MISSED_NAMED} more, in the table below")
+    if len(missed) > MAX_NAMED_MISSED:
+        out.append(f"missed: {len(missed) - MAX_NAMED_MISSED} more, in the table below")
     told: set[str] = set()
     for check in checks:
         beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
@@ -106,18 +108,18 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
         (check for check in checks if check.passed and np.isfinite(check.used)),
         key=lambda check: -check.used,
     )
-    for check in close[:NAMED]:
+    for check in close[:MAX_NAMED_CLOSE]:
         out.append(
             f"closest to its limit: {check.name}, {_measured(check)} of at most {_bound(check)} "
             f"({100 * check.used:.0f} % of it used){_at(check)}"
         )
     for check in checks:
-        if check.coverage < OVERCONFIDENT:
+        if check.coverage < MIN_COVERAGE:
             out.append(f"intervals too small: {_covered(check)}")
-        elif check.coverage > UNDERCONFIDENT:
+        elif check.coverage > MAX_COVERAGE:
             out.append(f"intervals too large: {_covered(check)}")
     for check in checks:
-        if check.masked > MUCH_MASKED:
+        if check.masked > MAX_UNREMARKED_MASK:
             of_what = check.name.rsplit(",", 1)[0]  # without what is measured, such as the median
             out.append(f"masked: {of_what}: {100 * check.masked:.0f} % of pixels have no value")
     return out

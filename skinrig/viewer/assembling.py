@@ -14,7 +14,7 @@ from skinrig.viewer.assets import wrinkles as wrinkle_assets
 from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
 
-BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
+ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
     facial_color_assets.assets,
     scattering_assets.assets,
     surface_assets.assets,
@@ -28,6 +28,6 @@ BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
 def assemble(source: SceneSource, *, provenance: dict[str, Any] | None = None) -> ViewerScene:
     """Return the scene of a source."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance or {})
-    for build in BUILDERS:
+    for build in ASSET_BUILDERS:
         scene = scene.with_assets(build(source))
     return scene.with_assets(presets.assets(scene))

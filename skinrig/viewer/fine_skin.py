@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rigsim.subject import Subject
 
 
-PERSON_SIZE: Final = 512
+PERSON_PX: Final = 512
 """Most texels a side of the person that everything else comes from: half a millimeter of a face."""
 
 

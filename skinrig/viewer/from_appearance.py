@@ -20,8 +20,8 @@ from skinrig.viewer.holes import patch_charts
 from skinrig.viewer.holes.patch_charts import ClosedMesh
 from skinrig.viewer.scene import Kind, SceneError, SceneSource, ViewerScene
 
-MESH: Final = "mesh.obj"
-ALBEDO: Final = "r_d"
+MESH_FILE: Final = "mesh.obj"
+ALBEDO_MAP: Final = "r_d"
 
 
 def scene(
@@ -69,7 +69,7 @@ def scene(
     surface = None if whole is None else whole.mesh
     first = next(iter(appearances.values()))
     seed = first.seed if isinstance(first.seed, int) and first.seed >= 0 else 0
-    subject = procedural.simulated(surface, preset=procedural.PRESET, size=size, seed=seed)
+    subject = procedural.simulated(surface, preset=procedural.DEFAULT_PRESET, size=size, seed=seed)
     kinds: tuple[Kind, ...] = ("model", "dome", "dynamic")
     kind = next(name for name in kinds if name in appearances)
     source = SceneSource(
@@ -123,12 +123,12 @@ def kind_of(path: Path, appearance: SkinAppearance) -> str:
         appearance.parameters
     ):
         return "model"
-    if MESH in appearance.files and ALBEDO in appearance.maps:
+    if MESH_FILE in appearance.files and ALBEDO_MAP in appearance.maps:
         return "dome"
     raise SceneError(
         f"{path}: holds {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
         "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), or a dome's maps with "
-        f"{ALBEDO} and {MESH}"
+        f"{ALBEDO_MAP} and {MESH_FILE}"
     )
 
 
@@ -143,11 +143,11 @@ def _mesh(
         return ClosedMesh(procedural.load_mesh(asked), (), ()), asked.name
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
-        if appearance is not None and MESH in appearance.files:
+        if appearance is not None and MESH_FILE in appearance.files:
             from rigsim.geometry.mesh import load_mesh
 
             with tempfile.TemporaryDirectory() as folder:
-                copy = Path(folder) / MESH
-                copy.write_bytes(appearance.files[MESH])
-                return patch_charts.closed(load_mesh(copy)), f"{MESH} of the {kind}"
+                copy = Path(folder) / MESH_FILE
+                copy.write_bytes(appearance.files[MESH_FILE])
+                return patch_charts.closed(load_mesh(copy)), f"{MESH_FILE} of the {kind}"
     return None, "the procedural head stands for the face"

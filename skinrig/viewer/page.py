@@ -10,11 +10,12 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Final
 
+from skinrig.drawing import templates
 from skinrig.viewer.packing.arrays import Packed, pack
 from skinrig.viewer.packing.page_text import as_text
 from skinrig.viewer.scene import ViewerScene
 
-SCRIPTS: Final = (
+SCRIPT_FILES: Final = (
     "graph.js",
     "gl.js",
     "load.js",
@@ -42,11 +43,11 @@ SCRIPTS: Final = (
 )
 """Scripts in the order in which they run, all in one function; `main.js` comes last."""
 
-_CHUNK = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
+_CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
 class PageError(ValueError):
-    """A part of the page that is missing or named twice."""
+    """A piece of the page that is named twice."""
 
 
 def chunks() -> dict[str, str]:
@@ -59,7 +60,7 @@ def chunks() -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for entry in sorted(_files("glsl", ".glsl"), key=lambda one: one.name):
-        parts = _CHUNK.split(entry.read_text(encoding="utf-8"))
+        parts = _CHUNK_LINE.split(entry.read_text(encoding="utf-8"))
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
                 raise PageError(f"glsl/{entry.name}: chunk {name!r} is there twice")
@@ -70,7 +71,9 @@ def chunks() -> dict[str, str]:
 def script() -> str:
     """Return all scripts as one strict function that shares an object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
-    body = "\n".join(_bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPTS)
+    body = "\n".join(
+        _bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPT_FILES
+    )
     glsl = json.dumps(chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 
@@ -96,7 +99,6 @@ def build(scene: ViewerScene, *, connect: bool = False) -> str:
 def render(packed: Packed, *, connect: bool = False) -> str:
     """Return the page of a packed scene."""
     here = resources.files("skinrig.viewer")
-    page = here.joinpath("page.html").read_text(encoding="utf-8")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
     code = script().replace("</", "<\\/")
     policy = "; ".join(
@@ -110,17 +112,14 @@ def render(packed: Packed, *, connect: bool = False) -> str:
             "form-action 'none'",
         ]
     )
-    parts = {
-        "POLICY": policy,
-        "STYLE": style,
-        "HEADER": packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
-        "PAYLOAD": as_text(packed.payload),
-        "SCRIPT": code,
-    }
-    for name in parts:
-        if page.count("{{" + name + "}}") != 1:
-            raise PageError(f"page.html: expected {{{{{name}}}}} once")
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+    return templates.render(
+        "viewer/page.html",
+        policy=policy,
+        style=style,
+        header=packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
+        payload=as_text(packed.payload),
+        script=code,
+    )
 
 
 def _bare(text: str) -> str:

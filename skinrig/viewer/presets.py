@@ -19,10 +19,10 @@ from skinrig.viewer.scene import Assets, ViewerScene
 
 Weights = Mapping[str, float]
 
-EMOTIONS: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
+EMOTION_STATES: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
 """Ekman's six."""
 
-COMBINED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "sad smile": ("sadness", "smile"),
         "anger and surprise": ("anger", "surprise"),
@@ -31,7 +31,7 @@ COMBINED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 )
 """Of Jimenez et al.: figure 1's sad smile, and the row of figure 11, each at full weight."""
 
-GLOBAL: Final = ("exercise", "alcohol")
+GLOBAL_STATES: Final = ("exercise", "alcohol")
 """States of the whole face that no muscle makes."""
 
 ACTION_UNITS: Final[Mapping[str, tuple[tuple[str, float], ...]]] = MappingProxyType(
@@ -89,15 +89,15 @@ def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     """
     known = tuple(dict.fromkeys(names))
     found: dict[str, dict[str, float]] = {"neutral": {}}
-    basic = {name: _weights(name, known) for name in (*EMOTIONS, "smile", *GLOBAL)}
-    for name in (*EMOTIONS, "smile"):
+    basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
+    for name in (*EMOTION_STATES, "smile"):
         if basic[name]:
             found[name] = basic[name]
-    for name, parts in COMBINED.items():
+    for name, parts in COMBINED_STATES.items():
         # a combination of which a part is missing would be another one's
         if all(basic[part] for part in parts):
             found[name] = _joined(basic[part] for part in parts)
-    for name in GLOBAL:
+    for name in GLOBAL_STATES:
         if basic[name]:
             found[name] = basic[name]
     return found

@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skinrig.viewer.assembling import assemble
-from skinrig.viewer.fine_skin import PERSON_SIZE, FineSkin
-from skinrig.viewer.scene import LARGEST_TEXTURE, SceneError, SceneSource, ViewerMesh, ViewerScene
+from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
+from skinrig.viewer.scene import MAX_TEXTURE_PX, SceneError, SceneSource, ViewerMesh, ViewerScene
 
 if TYPE_CHECKING:
     from rigsim.geometry.mesh import Mesh
     from rigsim.subject import Subject
 
-PRESET = "III"
+DEFAULT_PRESET = "III"
 """Skin type of faces of whom nothing else is known."""
-SMALLEST = 64
-POSITION_STEPS = np.float32(1024.0)
+MIN_TEXTURE_PX = 64
+POSITION_STEPS_PER_MM = np.float32(1024.0)
 """Steps of a millimetre that positions are rounded to; strain is of the rounded mesh throughout."""
 
 
 def scene(
-    *, preset: str = PRESET, size: int = 2048, seed: int = 0, mesh: Path | None = None
+    *, preset: str = DEFAULT_PRESET, size: int = 2048, seed: int = 0, mesh: Path | None = None
 ) -> ViewerScene:
     """Return the scene of a simulated person.
 
@@ -65,15 +65,15 @@ def scene(
 
 def check_size(size: int) -> None:
     """Refuse a texture size that no page can hold."""
-    if not SMALLEST <= size <= LARGEST_TEXTURE:
-        raise SceneError(f"size: got {size}, expected {SMALLEST} to {LARGEST_TEXTURE} texels")
+    if not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
+        raise SceneError(f"size: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX} texels")
 
 
 def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> Subject:
     """Return the simulated person that wears a mesh, or the procedural head, coarsely."""
     from rigsim.subject import make_subject
 
-    return make_subject(preset, seed=seed, size=min(size, PERSON_SIZE), mesh=mesh)
+    return make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=mesh)
 
 
 def load_mesh(path: Path) -> Mesh:
@@ -99,7 +99,7 @@ def load_mesh(path: Path) -> Mesh:
 
 def viewer_mesh(subject: Subject) -> ViewerMesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
-    rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS) / POSITION_STEPS
+    rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
     return ViewerMesh(
         positions=np.asarray(rounded, np.float32),

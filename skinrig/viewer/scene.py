@@ -26,7 +26,7 @@ Storage = Literal["u8", "u16", "f16", "f32"]
 Filter = Literal["linear", "mipmap", "nearest"]
 Kind = Literal["procedural", "mesh", "dynamic", "dome", "model"]
 
-LARGEST_TEXTURE: Final = 4096
+MAX_TEXTURE_PX: Final = 4096
 """Texels a side that any WebGL2 device of the last ten years takes."""
 
 
@@ -64,9 +64,9 @@ class Texture:
             raise SceneError(
                 f"texture: got shape {shape}, expected (H, W, C) or (L, H, W, C) with C from 1 to 4"
             )
-        if max(shape[-3:-1]) > LARGEST_TEXTURE:
+        if max(shape[-3:-1]) > MAX_TEXTURE_PX:
             raise SceneError(
-                f"texture: got {shape}, expected at most {LARGEST_TEXTURE} texels a side; "
+                f"texture: got {shape}, expected at most {MAX_TEXTURE_PX} texels a side; "
                 "choose a smaller --size"
             )
         if self.values.dtype != np.float32 or not np.isfinite(self.values).all():

@@ -19,9 +19,9 @@ from typing import Final
 
 from skinrig.viewer.microstructure.tiles import Pyramid, TileError
 
-LOOPBACK: Final = "127.0.0.1"
-PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")
-TIMEOUT_S: Final = 30.0
+LOOPBACK_HOST: Final = "127.0.0.1"
+TILE_PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")
+CONNECTION_TIMEOUT_S: Final = 30.0
 """A connection that says nothing for so long is closed."""
 
 
@@ -80,19 +80,19 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
 
     Handler.html, Handler.pyramid, Handler.requests = html, pyramid, requests
     try:
-        server = ThreadingHTTPServer((LOOPBACK, port), Handler)
+        server = ThreadingHTTPServer((LOOPBACK_HOST, port), Handler)
     except OSError as error:
         raise ServerError(
             f"port: {port} cannot be used ({error.strerror}); choose another, or 0 for a free one"
         ) from error
     server.daemon_threads = True
     number = int(server.server_address[1])
-    Handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK, "localhost"))
+    Handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK_HOST, "localhost"))
     ended = threading.Event()
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1})
     thread.start()
     try:
-        yield Served(f"http://{LOOPBACK}:{number}/", number, requests, ended)
+        yield Served(f"http://{LOOPBACK_HOST}:{number}/", number, requests, ended)
     finally:
         server.shutdown()
         server.server_close()
@@ -110,7 +110,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "skinrig"
     sys_version = ""
-    timeout = TIMEOUT_S
+    timeout = CONNECTION_TIMEOUT_S
 
     def do_GET(self) -> None:
         """Answer with the body."""
@@ -142,7 +142,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path == "/":
             self.requests.append(self.path)
             return HTTPStatus.OK, "text/html; charset=utf-8", self.html
-        found = PATH.fullmatch(self.path)
+        found = TILE_PATH.fullmatch(self.path)
         if found is not None and self.pyramid is not None:
             try:
                 tile = self.pyramid.tile(*(int(part) for part in found.groups()))

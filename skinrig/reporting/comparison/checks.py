@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from skinrig.reporting import page
@@ -49,10 +49,10 @@ def _common_name(check: page.Check, run: Run, other: Run) -> str:
     return name
 
 
-def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> str:
-    """Return the section on checks of both; empty without any."""
+def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
+    """Yield the section on checks of both; empty without any."""
     if not rows:
-        return ""
+        return
 
     def told(check: page.Check | None) -> str:
         if check is None:
@@ -69,7 +69,8 @@ def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> str:
         ]
         return " and ".join(dict.fromkeys(bounds))
 
-    return "<h2>Checks of both</h2>" + page.table(
+    yield page.Heading("Checks of both", level=2)
+    yield page.table(
         ("check", a.label, b.label, "difference", "limit", "changed"),
         [
             (

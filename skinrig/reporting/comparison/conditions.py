@@ -14,12 +14,12 @@ from skinrig.reporting import folders as report_folders
 from skinrig.reporting import page, provenance
 from skinrig.reporting.comparison.runs import Pair, Run
 
-MOST_DRIFTS = 3
+MAX_LISTED_DRIFTS = 3
 """Quantities told of each kind of calibration."""
 
 
-def settings(a: Run, b: Run, pair: Pair) -> str:
-    """Return what the two were made with, as far as it differs."""
+def settings(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+    """Yield what the two were made with, as far as it differs."""
     sides = []
     for side in (pair.a, pair.b):
         told = {f"parameter {k}": v for k, v in provenance.flattened(side.parameters).items()}
@@ -31,15 +31,15 @@ def settings(a: Run, b: Run, pair: Pair) -> str:
     rows = _unequal(*sides)
     stages = [row for row in rows if row[0].startswith("parameter stages.")]
     rest = [row for row in rows if not row[0].startswith("parameter stages.")]
-    body = "<h3>What differs in the making</h3>"
+    yield page.Heading("What differs in the making")
     if not rows:
-        return body + page.note("Parameters, inputs, versions and seeds are the same.")
+        yield page.note("Parameters, inputs, versions and seeds are the same.")
+        return
     if rest:
-        body += page.table(("what", a.label, b.label), rest, caption="Settings that are not equal")
+        yield page.table(("what", a.label, b.label), rest, caption="Settings that are not equal")
     if stages:
         names = ", ".join(row[0].removeprefix("parameter stages.") for row in stages)
-        body += page.note(f"Stages whose code, settings or inputs differ: {names}.")
-    return body
+        yield page.note(f"Stages whose code, settings or inputs differ: {names}.")
 
 
 def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
@@ -50,32 +50,33 @@ def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str,
     ]
 
 
-def benchmarks(a: Run, b: Run) -> str:
-    """Return seconds and errors of settings that both measured, and a plot a stage."""
+def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
+    """Yield seconds and errors of settings that both measured, and a plot a stage."""
     documents = [_bench_of(run) for run in (a, b)]
     if documents[0] is None or documents[1] is None:
-        return ""
-    rows, plots = [], ""
+        return
+    rows, plots = [], []
     for name, stage in documents[0]["stages"].items():
         other = documents[1]["stages"].get(name)
         if other is None or stage.get("size") != other.get("size"):
             continue
         rows += _settings_of_stage(name, stage, other)
         if stage["points"] and other["points"]:
-            plots += bench_figures.compared_fronts(name, (a.label, stage), (b.label, other))
+            plots.append(bench_figures.compared_fronts(name, (a.label, stage), (b.label, other)))
     if not rows:
-        return ""
+        return
     machines = _unequal(
         *(provenance.flattened(document.get("machine", {})) for document in documents if document)
     )
-    body = f"<h2>Error against run time</h2><div class='plots'>{plots}</div>"
+    yield page.Heading("Error against run time", level=2)
+    yield page.Plots(plots)
     if machines:
-        body += page.table(
+        yield page.table(
             ("machine", a.label, b.label),
             machines,
             caption="Measured on different machines: seconds compare those, too",
         )
-    return body + page.table(
+    yield page.table(
         (
             "stage",
             "setting",
@@ -128,18 +129,19 @@ def _settings_of_stage(
     return rows
 
 
-def seconds(a: Run, b: Run) -> str:
-    """Return the seconds that documents of both, such as a demo's, tell by step."""
+def seconds(a: Run, b: Run) -> Iterator[page.Block]:
+    """Yield the seconds that documents of both, such as a demo's, tell by step."""
     sides = [dict(_steps(run)) for run in (a, b)]
     common = [step for step in sides[0] if step in sides[1]]
     if not common:
-        return ""
+        return
     rows: list[tuple[object, ...]] = [
         (step, sides[0][step], sides[1][step], sides[1][step] - sides[0][step]) for step in common
     ]
     total = [sum(side[step] for step in common) for side in sides]
     rows.append(("all of these", total[0], total[1], total[1] - total[0]))
-    return "<h2>Seconds</h2>" + page.table(
+    yield page.Heading("Seconds", level=2)
+    yield page.table(
         ("step", a.label, b.label, "difference"),
         rows,
         caption="Wall-clock seconds of steps that both tell; other work of the machine is in them",
@@ -153,8 +155,8 @@ def _steps(run: Run) -> Iterator[tuple[str, float]]:
                 yield from ((str(step), float(seconds)) for step, seconds in entry["rows"])
 
 
-def moved_calibrations(a: Run, b: Run) -> str:
-    """Return what moved most between calibrations of the same folder and kind."""
+def moved_calibrations(a: Run, b: Run) -> Iterator[page.Block]:
+    """Yield what moved most between calibrations of the same folder and kind."""
     folders: dict[str, Path] = {path.name: path for path in b.found.calibrations}
     rows: list[tuple[object, ...]] = []
     for folder in a.found.calibrations:
@@ -178,11 +180,12 @@ def moved_calibrations(a: Run, b: Run) -> str:
                     float("nan") if one.sigmas is None else one.sigmas,
                     f"{len(moved)} moved",
                 )
-                for one in moved[:MOST_DRIFTS]
+                for one in moved[:MAX_LISTED_DRIFTS]
             ]
     if not rows:
-        return ""
-    return "<h2>Calibrations that moved</h2>" + page.table(
+        return
+    yield page.Heading("Calibrations that moved", level=2)
+    yield page.table(
         ("calibration", "device", "quantity", "A", "B", "in combined standard errors", "remark"),
         rows,
         caption="The farthest of each kind",

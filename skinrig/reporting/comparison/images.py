@@ -23,12 +23,12 @@ from skinrig.reporting import page, provenance
 from skinrig.reporting.comparison.runs import Run
 from skinrig.reporting.sections import images as pictures_section
 
-MOST_DRAWN = 4
+MAX_DRAWN_IMAGES = 4
 """Pictures of a folder that are drawn: those that differ most."""
-UNTOLD = ("seconds", "out", "files", "schema", "consent")
+IGNORED_ENTRIES = ("seconds", "out", "files", "schema", "consent")
 """Entries of a record that two equal renderings may differ in, or that stand elsewhere."""
-CODES = 255.0
-PERCENTILE = 98.0
+MAX_CODE = 255.0
+SCALE_PERCENTILE = 98.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,15 +132,14 @@ def sentence(a: Run, b: Run) -> str:
     return f"{differ} of {len(both)} pictures of both differ."
 
 
-def section(a: Run, b: Run) -> str:
-    """Return the pictures of two runs with their differences, and what their records differ in."""
-    body = ""
+def section(a: Run, b: Run) -> Iterator[page.Block]:
+    """Yield the pictures of two runs with their differences, and what their records differ in."""
     for name, path_a, path_b in pairs(a, b):
         found, refused = compared(path_a, path_b)
-        body += f"<h2>Pictures: {page.escape(name)}</h2>"
+        yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            body += page.table(
+            yield page.table(
                 (
                     "picture",
                     "values",
@@ -164,16 +163,15 @@ def section(a: Run, b: Run) -> str:
                 "the brightness that each picture was shown with",
             )
             drawn = [one for one in order if not one.equal]
-            for one in drawn[:MOST_DRAWN]:
-                body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"
-                body += "".join(_drawn(a, b, one)) + "</div>"
-            if drawn[MOST_DRAWN:]:
-                rest = ", ".join(one.name for one in drawn[MOST_DRAWN:])
-                body += page.note(f"Not drawn, since they differ less: {rest}.")
+            for one in drawn[:MAX_DRAWN_IMAGES]:
+                yield page.Heading(one.name)
+                yield page.Images(list(_drawn(a, b, one)))
+            if drawn[MAX_DRAWN_IMAGES:]:
+                rest = ", ".join(one.name for one in drawn[MAX_DRAWN_IMAGES:])
+                yield page.note(f"Not drawn, since they differ less: {rest}.")
         if refused:
-            body += page.table(("picture", "why"), refused, caption="Pictures not subtracted")
-        body += _records(a, b, path_a, path_b)
-    return body
+            yield page.table(("picture", "why"), refused, caption="Pictures not subtracted")
+        yield _records(a, b, path_a, path_b)
 
 
 def alone(a: Run, b: Run) -> list[tuple[str, str]]:
@@ -184,21 +182,21 @@ def alone(a: Run, b: Run) -> list[tuple[str, str]]:
     return [(n, a.label) for n in sorted(one - other)] + [(n, b.label) for n in sorted(other - one)]
 
 
-def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
+def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[page.Image]:
     """Draw A | B | B − A: linear ones at one brightness for both."""
-    bright = float(np.percentile(np.concatenate([one.a, one.b]), PERCENTILE)) or 1.0
+    bright = float(np.percentile(np.concatenate([one.a, one.b]), SCALE_PERCENTILE)) or 1.0
     for label, values in ((a.label, one.a), (b.label, one.b)):
         shown = np.broadcast_to(values, (*values.shape[:2], 3))
         if one.kind == "linear":
             shown = np.clip(shown / bright, 0.0, 1.0)
             yield map_pictures.color_picture(label, shown, width=200, of=one.name)
         else:
-            small = map_pictures.shrink(np.rint(CODES * shown).astype(np.uint8), 200)
+            small = map_pictures.shrink(np.rint(MAX_CODE * shown).astype(np.uint8), 200)
             yield map_pictures.plain_picture(
                 label, np.ascontiguousarray(small), alt=f"{one.name}, {label}"
             )
     every = np.ones(one.difference.shape, bool)
-    reach = map_pictures.reach_of(one.difference, every, PERCENTILE) or one.largest or 1.0
+    reach = map_pictures.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
     yield map_pictures.scalar_picture(
         "B − A, mean of the channels",
         one.difference,
@@ -210,7 +208,7 @@ def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[str]:
     )
 
 
-def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> str:
+def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
     rows = [
         (key, sides[0].get(key, "–"), sides[1].get(key, "–"))
@@ -227,7 +225,7 @@ def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> str:
 def _document(folder: Path) -> Mapping[str, Any]:
     path = pictures_section.folder_document(folder)
     told = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
-    return {key: value for key, value in told.items() if key not in UNTOLD}
+    return {key: value for key, value in told.items() if key not in IGNORED_ENTRIES}
 
 
 def _linear(path: Path) -> Float64Array:

@@ -10,11 +10,11 @@ from model.skin import SkinMap
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.reporting.page import short_unit
 
-LEVELS = (1.0, 2.0, 3.0)
+SIGMA_LEVELS = (1.0, 2.0, 3.0)
 """Combined standard errors that shares of pixels beyond are told for."""
-BY_CHANCE = (0.3173, 0.0455, 0.0027)
+CHANCE_FRACTIONS = (0.3173, 0.0455, 0.0027)
 """Shares beyond them of two estimates with independent normal errors of the stated size."""
-FARTHEST = 35.0
+MAX_SIGMAS = 35.0
 """Differences of more standard errors are told as this many: tails beyond are no numbers."""
 
 
@@ -35,7 +35,8 @@ class MapDifference:
     combined
         Median of the two standard errors' root sum of squares, in ``unit``; NaN without them.
     beyond
-        Shares of pixels farther apart than `LEVELS` combined standard errors; empty without them.
+        Shares of pixels farther apart than `SIGMA_LEVELS` combined standard errors; empty without
+        them.
     difference, sigmas
         (H, W): signed difference and difference over the combined standard error, NaN where one
         has no value; of several channels the mean and the farthest one.
@@ -59,10 +60,10 @@ class MapDifference:
     @property
     def disagree(self) -> bool:
         """Whether more pixels lie beyond three combined standard errors than chance leaves."""
-        return bool(self.beyond) and self.beyond[-1] > MOST_BEYOND
+        return bool(self.beyond) and self.beyond[-1] > MAX_FRACTION_BEYOND
 
 
-MOST_BEYOND = 0.01
+MAX_FRACTION_BEYOND = 0.01
 """Share of pixels beyond three combined standard errors up to which two estimates agree: chance
 leaves 0.27 %, and as neighbors share errors, that share itself scatters."""
 
@@ -125,7 +126,7 @@ def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         if sigmas.ndim == 3:
             farthest = np.argmax(np.abs(np.nan_to_num(sigmas)), axis=2)[..., None]
             sigmas = np.take_along_axis(sigmas, farthest, axis=2)[..., 0]
-        sigmas = np.where(both, np.clip(sigmas, -FARTHEST, FARTHEST), np.nan)
+        sigmas = np.where(both, np.clip(sigmas, -MAX_SIGMAS, MAX_SIGMAS), np.nan)
     told = difference[both]
     return MapDifference(
         name,
@@ -166,7 +167,7 @@ def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         with np.errstate(divide="ignore", invalid="ignore", under="ignore"):
             chance = np.exp(-0.5 * np.square(angle / spread))
         chance = np.where(angle == 0.0, 1.0, chance)
-        sigmas = np.fmin(-ndtri(np.maximum(0.5 * chance, 1e-300)), FARTHEST)
+        sigmas = np.fmin(-ndtri(np.maximum(0.5 * chance, 1e-300)), MAX_SIGMAS)
         sigmas = np.where(both, sigmas, np.nan)
         combined = float(np.degrees(_median(spread[both])))
         beyond = _beyond(sigmas[both])
@@ -199,7 +200,7 @@ def _beyond(sigmas: Float64Array) -> tuple[float, ...]:
     told = np.abs(sigmas[~np.isnan(sigmas)])
     if not told.size:
         return ()
-    return tuple(float(np.mean(told > level)) for level in LEVELS)
+    return tuple(float(np.mean(told > level)) for level in SIGMA_LEVELS)
 
 
 def _median(values: Float64Array) -> float:

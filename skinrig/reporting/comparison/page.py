@@ -19,17 +19,17 @@ from skinrig.reporting.comparison.runs import Pair, Run, alone
 from skinrig.reporting.map_names import heading, melanin_band, words
 from skinrig.written_units import written
 
-WIDTH_PX = 200
-MOST_NAMED = 10
+IMAGE_WIDTH_PX = 200
+MAX_NAMED_MAPS = 10
 """Maps that are named first."""
-MOST_SHOWN = 4
+MAX_DRAWN_MAPS = 4
 """Maps of a pair that are drawn: of those with standard errors the ones that disagree most."""
-SIGMAS_SHOWN = 5.0
+MAX_SHOWN_SIGMAS = 5.0
 """End of the scale of differences in combined standard errors."""
 
 
-def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
-    """Return what changed in sentences, and the checks of both."""
+def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
+    """Yield what changed in sentences, and the checks of both."""
     rows = check_comparison.rows_of(a, b)
     changed = [row for row in rows if row.changed]
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
@@ -55,23 +55,19 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
     if not sentences:
         sentences.append("Nothing that both have can be judged; see the tables.")
     bad = any(row.changed == "worse" for row in changed)
-    body = (
-        f'<p class="verdict {"bad" if bad else ""}">{page.escape(" ".join(sentences))}</p>'
-        f"<p>{page.escape(a.label)} is {page.escape(_where(a))}; {page.escape(b.label)} is "
-        f"{page.escape(_where(b))}. Differences are B less A.</p>"
+    yield page.Paragraph(" ".join(sentences), f"verdict {'bad' if bad else ''}")
+    yield page.Paragraph(
+        f"{a.label} is {_where(a)}; {b.label} is {_where(b)}. Differences are B less A."
     )
     worst = sorted(disagree, key=lambda item: -item[1].beyond[-1])
     if worst:
-        items = "".join(
-            f"<li>{page.escape(f'{name}: {_in_words(one)}')}</li>"
-            for name, one in worst[:MOST_NAMED]
-        )
-        body += "<h2>Where they disagree</h2>" + page.note(
+        yield page.Heading("Where they disagree", level=2)
+        yield page.note(
             "Shares of pixels that lie more than three combined standard errors apart; chance "
-            f"leaves 0.27 %. The {min(len(worst), MOST_NAMED)} farthest of {len(worst)}."
+            f"leaves 0.27 %. The {min(len(worst), MAX_NAMED_MAPS)} farthest of {len(worst)}."
         )
-        body += f'<ul class="worst">{items}</ul>'
-    return body + check_comparison.table(a, b, rows)
+        yield page.Bullets([f"{name}: {_in_words(one)}" for name, one in worst[:MAX_NAMED_MAPS]])
+    yield from check_comparison.table(a, b, rows)
 
 
 def _in_words(one: MapDifference) -> str:
@@ -87,31 +83,34 @@ def _where(run: Run) -> str:
     return "/".join(run.path.resolve().parts[-2:])
 
 
-def sections(a: Run, b: Run, found: Sequence[Pair]) -> str:
-    """Return maps, errors against the truths, settings and times of both."""
-    body = "".join(_pair(a, b, pair) for pair in found)
-    body += conditions.benchmarks(a, b) + conditions.seconds(a, b)
-    body += conditions.moved_calibrations(a, b)
-    body += picture_comparison.section(a, b)
+def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
+    """Yield maps, errors against the truths, settings and times of both."""
+    for pair in found:
+        yield from _pair(a, b, pair)
+    yield from conditions.benchmarks(a, b)
+    yield from conditions.seconds(a, b)
+    yield from conditions.moved_calibrations(a, b)
+    yield from picture_comparison.section(a, b)
     missing = [*alone(a, b), *picture_comparison.alone(a, b)]
     if missing:
-        body += "<h2>Only in one</h2>" + page.table(
+        yield page.Heading("Only in one", level=2)
+        yield page.table(
             ("folder", "in"),
             missing,
             caption="Folders of maps or pictures without one of the same name",
         )
-    return body + consents.section([a.found, b.found])
+    yield from consents.section([a.found, b.found])
 
 
-def _pair(a: Run, b: Run, pair: Pair) -> str:
-    body = f"<h2>Maps: {page.escape(pair.name)}</h2>"
+def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+    yield page.Heading(f"Maps: {pair.name}", level=2)
     common = pair.a.inputs.get("session") == pair.b.inputs.get("session")
     if common and "session" in pair.a.inputs:
-        body += page.note(
+        yield page.note(
             "Both were made of the same frames: they share the frames' noise, so that every "
             "difference is the processing's, and combined standard errors are too large for it."
         )
-    body += page.table(
+    yield page.table(
         (
             "map",
             "verdict",
@@ -135,9 +134,11 @@ def _pair(a: Run, b: Run, pair: Pair) -> str:
     )
     if pair.refused:
         table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
-        body += page.folded(f"{len(pair.refused)} maps not subtracted", table)
-    body += _pictures(a, b, pair) + _by_band(pair) + _errors(a, b, pair)
-    return body + conditions.settings(a, b, pair)
+        yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
+    yield from _pictures(a, b, pair)
+    yield from _by_band(pair)
+    yield from _errors(a, b, pair)
+    yield from conditions.settings(a, b, pair)
 
 
 def _farthest_first(one: MapDifference) -> tuple[float, str]:
@@ -166,21 +167,19 @@ def _difference_row(one: MapDifference) -> tuple[object, ...]:
     )
 
 
-def _pictures(a: Run, b: Run, pair: Pair) -> str:
-    """Draw A | B | difference | difference over the combined standard error."""
+def _pictures(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+    """Yield A | B | difference | difference over the combined standard error."""
     told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
     order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
-    body = ""
-    for one in order[:MOST_SHOWN]:
-        body += f"<h3>{page.escape(heading(one.name))}</h3><div class='maps'>"
-        body += "".join(_four(a, b, pair, one)) + "</div>"
-    if len(order) > MOST_SHOWN:
-        names = "; ".join(words(one.name) for one in order[MOST_SHOWN:])
-        body += page.note(f"Not drawn, since they disagree less: {names}.")
-    return body
+    for one in order[:MAX_DRAWN_MAPS]:
+        yield page.Heading(heading(one.name))
+        yield page.Images(list(_four(a, b, pair, one)))
+    if len(order) > MAX_DRAWN_MAPS:
+        names = "; ".join(words(one.name) for one in order[MAX_DRAWN_MAPS:])
+        yield page.note(f"Not drawn, since they disagree less: {names}.")
 
 
-def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
+def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image]:
     maps = pair.a.maps[one.name], pair.b.maps[one.name]
     both = ~np.isnan(one.difference)
     place = pair.a.maps.get("position")
@@ -201,10 +200,12 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
         if one.unit == "°":
-            yield map_pictures.normal_picture(label, image, valid=mask, width=WIDTH_PX, of=one.name)
+            yield map_pictures.normal_picture(
+                label, image, valid=mask, width=IMAGE_WIDTH_PX, of=one.name
+            )
         elif image.ndim == 3:
             yield map_pictures.color_picture(
-                label, np.where(mask[..., None], image, 0.2), width=WIDTH_PX, of=one.name
+                label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name
             )
         else:
             yield map_pictures.scalar_picture(
@@ -214,7 +215,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
                 high=high,
                 valid=mask,
                 unit=one.unit,
-                width=WIDTH_PX,
+                width=IMAGE_WIDTH_PX,
                 of=one.name,
             )
     image, mask = laid(one.difference)
@@ -228,7 +229,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
         scale="RdBu_r" if signed else "magma",
         valid=mask,
         unit=one.unit,
-        width=WIDTH_PX,
+        width=IMAGE_WIDTH_PX,
         of=one.name,
     )
     if one.sigmas is not None:
@@ -236,24 +237,24 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
         yield map_pictures.scalar_picture(
             "in combined standard errors",
             image,
-            low=-SIGMAS_SHOWN if signed else 0.0,
-            high=SIGMAS_SHOWN,
+            low=-MAX_SHOWN_SIGMAS if signed else 0.0,
+            high=MAX_SHOWN_SIGMAS,
             scale="RdBu_r" if signed else "magma",
             valid=mask,
-            width=WIDTH_PX,
+            width=IMAGE_WIDTH_PX,
             of=f"{one.name}, difference",
         )
 
 
-def _by_band(pair: Pair) -> str:
-    """Return differences of chromophores by band of the melanin that both find on average."""
+def _by_band(pair: Pair) -> Iterator[page.Block]:
+    """Yield differences of chromophores by band of the melanin that both find on average."""
     from skinrig.evaluating.flash import BANDS
 
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
-        return ""
+        return
     if melanin[0].values.shape != melanin[1].values.shape:
-        return ""
+        return
     level = 0.5 * (melanin[0].values + melanin[1].values)
     rows: list[tuple[object, ...]] = []
     for one in pair.differences:
@@ -278,8 +279,9 @@ def _by_band(pair: Pair) -> str:
                 )
             )
     if not rows:
-        return ""
-    table = page.table(
+        return
+    yield page.Heading("By melanin band")
+    yield page.table(
         (
             "map",
             "band",
@@ -293,19 +295,19 @@ def _by_band(pair: Pair) -> str:
         rows,
         caption="By band of the melanin fraction C_m that both find on average",
     )
-    return "<h3>By melanin band</h3>" + table
 
 
-def _errors(a: Run, b: Run, pair: Pair) -> str:
-    """Return errors of both against their truths, where both truths are known."""
+def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+    """Yield errors of both against their truths, where both truths are known."""
     truths = a.found.truth_of(pair.a), b.found.truth_of(pair.b)
     if truths[0] is None or truths[1] is None:
         lacking = " and ".join(
             run.label for run, truth in zip((a, b), truths, strict=True) if truth is None
         )
-        return page.note(
+        yield page.note(
             f"No truth lies beside {lacking}: what differs can be told, what is right cannot."
         )
+        return
     found_a, found_b = (
         {(row.quantity, row.skin): row for row in truth_errors.of(side, truth)}
         for side, truth in ((pair.a, truths[0]), (pair.b, truths[1]))
@@ -331,17 +333,17 @@ def _errors(a: Run, b: Run, pair: Pair) -> str:
             )
         )
     if not rows:
-        return ""
-    body = "<h3>Errors against the truths</h3>"
+        return
+    yield page.Heading("Errors against the truths")
     if any(
         not np.array_equal(one.values, truths[1].maps[key].values)
         for key, one in truths[0].maps.items()
         if key in truths[1].maps
     ):
-        body += page.note(
+        yield page.note(
             "The truths differ, too: part of what differs between the maps is the skin's own."
         )
-    return body + page.table(
+    yield page.table(
         (
             "error",
             "skin",

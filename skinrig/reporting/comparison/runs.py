@@ -18,8 +18,8 @@ from skinrig.reporting.folders import Findings, ReportError
 from skinrig.reporting.sections import images as pictures
 
 Kind = Literal["maps", "benchmark", "pictures", "run", "truth", "other"]
-COMPARABLE: tuple[Kind, ...] = ("maps", "benchmark", "pictures", "run")
-SAME_PLACE_MM = 1.0
+COMPARABLE_KINDS: tuple[Kind, ...] = ("maps", "benchmark", "pictures", "run")
+MAX_SAME_POINT_MM = 1.0
 """Texels of two meshes whose median distance is larger are not the same places."""
 
 
@@ -104,7 +104,9 @@ def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Ru
     kinds = {path: kind_of(path) for path in paths}
     truths = [path for path in paths if kinds[path] == "truth"]
     runs = [path for path in paths if kinds[path] != "truth"]
-    fits = len(runs) == 2 and kinds[runs[0]] == kinds[runs[1]] and kinds[runs[0]] in COMPARABLE
+    fits = (
+        len(runs) == 2 and kinds[runs[0]] == kinds[runs[1]] and kinds[runs[0]] in COMPARABLE_KINDS
+    )
     if not fits:
         if insist:
             told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
@@ -176,7 +178,7 @@ def compared(a: Run, b: Run) -> list[Pair]:
             if key not in one.maps or key not in other.maps:
                 refused.append((key, f"only in {a.label if key in one.maps else b.label}"))
                 continue
-            if apart > SAME_PLACE_MM:
+            if apart > MAX_SAME_POINT_MM:
                 refused.append((key, f"texels of the two meshes lie {apart:.1f} mm apart"))
                 continue
             try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from skinrig.benchmarks import figures as bench_figures
@@ -10,16 +10,16 @@ from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import SCHEMA
 from skinrig.reporting import page
 
-FAMILY = SCHEMA.split("/")[0]
+SCHEMA_FAMILY = SCHEMA.split("/")[0]
 
 
 def is_bench(document: Mapping[str, Any]) -> bool:
     """Return whether a document is a benchmark's, of whatever version."""
-    return str(document.get("schema", "")).startswith(f"{FAMILY}/")
+    return str(document.get("schema", "")).startswith(f"{SCHEMA_FAMILY}/")
 
 
-def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
-    """Return plots and tables of a benchmark, and add its limits to the checks.
+def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[page.Block]:
+    """Yield plots and tables of a benchmark, and add its limits to the checks.
 
     Parameters
     ----------
@@ -28,12 +28,13 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     checks
         The report's.
     """
-    body = "<h2>Error against run time</h2>"
+    yield page.Heading("Error against run time", level=2)
     if document["schema"] != SCHEMA:
-        return body + page.note(
+        yield page.note(
             f"Measured by another version ({document['schema']}, this one reads {SCHEMA}): "
             "`skinrig bench` measures anew."
         )
+        return
     for name, stage in document["stages"].items():
         for limit in stage["limits"]:
             got = float("nan") if limit["got"] is None else limit["got"]
@@ -52,8 +53,8 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
         for name, stage in document["stages"].items()
         if stage["points"]
     ]
-    body += f'<div class="plots">{"".join(plots)}</div>'
-    body += page.table(
+    yield page.Plots(plots)
+    yield page.table(
         (
             "stage",
             "setting",
@@ -85,12 +86,12 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     )
     bands = bench_table.bands(document)
     if bands:
-        body += page.table(
+        yield page.table(
             bench_table.BAND_COLUMNS,
             bands,
             caption="Error of the usual setting by melanin band; of light: over the lightest one",
         )
-    return body + _left_out(document)
+    yield from _left_out(document)
 
 
 def _worst(stage: Mapping[str, Any]) -> str:
@@ -101,23 +102,21 @@ def _worst(stage: Mapping[str, Any]) -> str:
     return f"{worst['band']}: {float(worst['error']):.3g}"
 
 
-def _left_out(document: Mapping[str, Any]) -> str:
+def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
     rows = [(f"{what}, all of it", why) for what, why in document.get("left_out", ())]
     rows += [
         (f"{name}: {what}", why)
         for name, stage in document["stages"].items()
         for what, why in stage.get("left_out", ())
     ]
-    body = ""
     if rows:
         table = page.table(("what", "why"), rows, caption="What was not measured")
-        body += page.folded(f"{len(rows)} left out", table)
+        yield page.Folded(f"{len(rows)} left out", [table])
     if document.get("not_judged"):
-        body += page.note(
+        yield page.note(
             "Measured at small size, so that limits were not judged: "
             f"{', '.join(document['not_judged'])}."
         )
-    return body
 
 
 def _cell(value: float | None) -> float | str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -17,9 +17,9 @@ from skinrig.arrays import Float64Array
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
 
-LONGEST = 12
+MAX_LISTED_NUMBERS = 12
 """Numbers of a quantity up to which a table lists it."""
-MOST_VALUES = 60
+MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
 
@@ -35,7 +35,7 @@ class Figure:
     worst: Callable[[Sequence[float]], float] = max
 
 
-FIGURES: Mapping[str, tuple[Figure, ...]] = {
+QUALITY_FIGURES: Mapping[str, tuple[Figure, ...]] = {
     "sensor": (
         Figure("read_noise_e", "read noise", "e-"),
         Figure("linearity_deviation", "deviation from a straight line", "%", factor=100.0),
@@ -72,8 +72,8 @@ def section(
     appearances: Mapping[str, SkinAppearance],
     sessions: Mapping[str, SessionFacts],
     checks: list[page.Check],
-) -> str:
-    """Return quality, age at capture and values of calibrations.
+) -> Iterator[page.Block]:
+    """Yield quality, age at capture and values of calibrations.
 
     Parameters
     ----------
@@ -92,10 +92,10 @@ def section(
     report of the same input is the same on any day.
     """
     if not folders:
-        return ""
+        return
     ages: list[tuple[object, ...]] = []
     figures: list[tuple[object, ...]] = []
-    values = ""
+    values: list[page.Folded] = []
     for folder in folders:
         left: list[float] = []
         for path in sorted(folder.glob("*.json")):
@@ -109,7 +109,7 @@ def section(
             ages.append(row)
             left += days
             figures += _figures(folder.name, found)
-            values += _values(folder.name, found)
+            values.append(_values(folder.name, found))
         if left:
             checks.append(
                 page.Check(
@@ -120,13 +120,14 @@ def section(
                     "d",
                 )
             )
-    body = "<h2>Calibration: quality and age</h2>" + page.table(
+    yield page.Heading("Calibration: quality and age", level=2)
+    yield page.table(
         ("calibration", "made", "valid until", "used for", "captured", "age then, days", "verdict"),
         ages,
         caption="Age at the day of capture against validity; used for: maps here that name this "
         "very file among their inputs",
     )
-    body += page.table(
+    yield page.table(
         (
             "calibration",
             "figure",
@@ -140,7 +141,7 @@ def section(
         figures,
         caption="Quality; standard errors are of the figure itself where the calibration has them",
     )
-    return body + values
+    yield from values
 
 
 def _age(
@@ -193,7 +194,7 @@ def _left(found: Calibration, day: date) -> int:
 
 def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
     rows: list[tuple[object, ...]] = []
-    for figure in FIGURES.get(found.kind, ()):
+    for figure in QUALITY_FIGURES.get(found.kind, ()):
         told = {
             serial: figure.factor * figure.of(np.asarray(names[figure.quantity].value, float))
             for serial, names in sorted(found.values.items())
@@ -245,23 +246,24 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
     return rows
 
 
-def _values(folder: str, found: Calibration) -> str:
+def _values(folder: str, found: Calibration) -> page.Folded:
     rows = [
         (serial, name, _numbers(quantity.value), _numbers(quantity.stderr))
         for serial, names in sorted(found.values.items())
         for name, quantity in sorted(names.items())
-        if np.size(quantity.value) <= LONGEST
+        if np.size(quantity.value) <= MAX_LISTED_NUMBERS
     ]
-    body = page.facts(dict(sorted(found.notes.items())), caption="What its makers noted")
-    if len(rows) > MOST_VALUES:
-        body += page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
+    listed: page.Block
+    if len(rows) > MAX_LISTED_QUANTITIES:
+        listed = page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
     else:
-        body += page.table(
+        listed = page.table(
             ("device", "quantity", "value", "standard error"),
             rows,
             caption=f"Values of {folder}, {found.kind}, made {found.created}",
         )
-    return page.folded(f"{folder}, {found.kind}: notes and values", body)
+    noted = page.facts(dict(sorted(found.notes.items())), caption="What its makers noted")
+    return page.Folded(f"{folder}, {found.kind}: notes and values", [noted, listed])
 
 
 def _numbers(values: object) -> str:

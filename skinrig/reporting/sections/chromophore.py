@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
 
 import numpy as np
@@ -15,25 +15,25 @@ from skinrig.evaluating import flash
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import map_names, page
 
-NOISE_OF_IDENTIFIABILITY = 0.005
+IDENTIFIABILITY_NOISE = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
-SMALL_PX = 200
+SMALL_WIDTH_PX = 200
 """Largest width of maps that stand alone."""
-ROUNDING = 1e-6
+MAX_ROUNDING_ERROR = 1e-6
 """Fractions below this are zero but for rounding."""
 
 
-def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
-    """Return each map of a single channel beside its truth, to one scale."""
-    body, alone = "", ""
+def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
+    """Yield each map of a single channel beside its truth, to one scale."""
+    alone = []
     for key, skin_map in sorted(appearance.maps.items()):
         if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR):
             continue
         true_map = truth.maps.get(key) if truth is not None else None
         if true_map is None and skin_map.stderr is None:
-            alone += _alone(key, skin_map)
+            alone.append(_alone(key, skin_map))
             continue
-        body += map_pictures.map_panel(
+        yield from map_pictures.map_panel(
             map_names.heading(key),
             page.short_unit(skin_map.unit),
             estimate=skin_map.values,
@@ -42,16 +42,18 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
             valid=_shown(skin_map, true_map),
         )
     if alone:
-        body += f"<h3>Maps without standard errors</h3><div class='maps small'>{alone}</div>"
-    return body
+        yield page.Heading("Maps without standard errors")
+        yield page.Images(alone, small=True)
 
 
-def _alone(key: str, skin_map: SkinMap) -> str:
+def _alone(key: str, skin_map: SkinMap) -> page.Image:
     """Return the picture of a map that there is nothing to set beside."""
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-    if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
+    if (
+        max(abs(low), abs(high)) < MAX_ROUNDING_ERROR
+    ):  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
     return map_pictures.scalar_picture(
         map_names.heading(key),
@@ -60,7 +62,7 @@ def _alone(key: str, skin_map: SkinMap) -> str:
         high=high,
         valid=mask,
         unit=page.short_unit(skin_map.unit),
-        width=SMALL_PX,
+        width=SMALL_WIDTH_PX,
     )
 
 
@@ -71,8 +73,8 @@ def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
 
 def errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> str:
-    """Return the errors of melanin and hemoglobin against their truth, by melanin band.
+) -> Iterator[page.Block]:
+    """Yield the errors of melanin and hemoglobin against their truth, by melanin band.
 
     Parameters
     ----------
@@ -103,7 +105,8 @@ def errors(
                     worst_got=worst_got,
                 )
             )
-    body = "<h3>Errors by melanin band</h3>" + page.table(
+    yield page.Heading("Errors by melanin band")
+    yield page.table(
         (
             "map",
             "truth",
@@ -139,7 +142,7 @@ def errors(
         "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
     )
     limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
-    return body + _bars([row for row in blurred if row.band is not None], limits)
+    yield from _bars([row for row in blurred if row.band is not None], limits)
 
 
 def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
@@ -153,10 +156,10 @@ def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
     return text, low
 
 
-def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> str:
+def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> Iterator[page.Block]:
     labels = list(dict.fromkeys(row.band_name for row in banded))
     if not labels:
-        return ""
+        return
     found = {(row.name, row.band_name): 100 * row.median_relative for row in banded}
     series = {
         key: [found.get((key, label), float("nan")) for label in labels]
@@ -169,10 +172,10 @@ def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> str:
         unit="%",
         limits=limits,
     )
-    return f'<div class="plots">{plot}</div>'
+    yield page.Plots([plot])
 
 
-def identifiability(appearances: Iterable[SkinAppearance]) -> str:
+def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Block]:
     """Draw where the Cramer-Rao bound says that a chromophore can be seen at all.
 
     Parameters
@@ -186,20 +189,19 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> str:
         if "melanin" in appearance.maps
         and isinstance(built := appearance.parameters.get("color_table"), dict)
     }
-    body = ""
-    for camera, illuminant in sorted(tables):
-        body += f"<h3>{page.escape(camera)}, {page.escape(illuminant)}</h3>"
-        body += _of_table(camera, illuminant)
-    if not body:
-        return ""
-    told = page.note(
+    if not tables:
+        return
+    yield page.Heading("Where chromophores can be told", level=2)
+    yield page.note(
         "Least relative standard error that any unbiased estimator could have, for "
-        f"{100 * NOISE_OF_IDENTIFIABILITY:g} % of noise in each channel and the model's error."
+        f"{100 * IDENTIFIABILITY_NOISE:g} % of noise in each channel and the model's error."
     )
-    return f"<h2>Where chromophores can be told</h2>{told}{body}"
+    for camera, illuminant in sorted(tables):
+        yield page.Heading(f"{camera}, {illuminant}")
+        yield page.Plots(_plots_of_table(camera, illuminant))
 
 
-def _of_table(camera: str, illuminant: str) -> str:
+def _plots_of_table(camera: str, illuminant: str) -> list[str]:
     from model import color_table
     from model.tissue_optics.layers import ANISOTROPY_SKIN
     from reconstruction import chromophores
@@ -215,7 +217,7 @@ def _of_table(camera: str, illuminant: str) -> str:
         found = chromophores.identifiability(
             table,
             shading=shading,
-            variance=lambda rgb: np.square(NOISE_OF_IDENTIFIABILITY * rgb),
+            variance=lambda rgb: np.square(IDENTIFIABILITY_NOISE * rgb),
             model_error=model_error.load(),
             size=48,
         )
@@ -226,4 +228,4 @@ def _of_table(camera: str, illuminant: str) -> str:
             plots.append(
                 figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
             )
-    return f'<div class="plots">{"".join(plots)}</div>'
+    return plots

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,13 @@ from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.appearances.dynamic import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
-from skinrig.arrays import BoolArray, Float64Array
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 from skinrig.reporting.sections import facial_color
 
-SHOWN = 4
+MAX_SHOWN_EXPRESSIONS = 4
 """States drawn; the tables list all."""
 WIDTH_PX = 240
 ZONE_COLORS = np.array(
@@ -48,8 +48,8 @@ def section(
     appearance: SkinAppearance,
     truths: Mapping[str, SkinAppearance],
     checks: list[page.Check],
-) -> str:
-    """Return what was fitted, and how far it is from the truth.
+) -> Iterator[page.Block]:
+    """Yield what was fitted, and how far it is from the truth.
 
     Parameters
     ----------
@@ -63,31 +63,26 @@ def section(
         Judgements are added to it.
     """
     parts = parts_of(appearance)
-    body = ""
     if FACIAL_COLOR in parts:
-        body += facial_color.section(name, appearance, parts[FACIAL_COLOR], truths, checks)
+        yield from facial_color.section(name, appearance, parts[FACIAL_COLOR], truths, checks)
     if WRINKLES in parts:
-        body += _wrinkles(appearance, parts[WRINKLES])
+        yield from _wrinkles(appearance, parts[WRINKLES])
     if MICROSTRUCTURE in parts:
-        body += _microstructure(appearance, parts[MICROSTRUCTURE])
-    return body
+        yield from _microstructure(appearance, parts[MICROSTRUCTURE])
 
 
-def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
+def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[page.Block]:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     layer = model.layers[0]
     masks = np.moveaxis(np.asarray(layer.masks, float), 0, 2)
     tints = ZONE_COLORS[np.arange(masks.shape[2]) % len(ZONE_COLORS)]
-    pictures = map_pictures.color_picture("zones", masks @ tints, width=WIDTH_PX)
-    relief = _normals(layer.wrinkle)
-    pictures += map_pictures.normal_picture(
-        "wrinkle map", relief, valid=np.ones(relief.shape[:2], bool), width=WIDTH_PX
-    )
-    for name in list(part["expressions"])[:SHOWN]:
-        shown = model.evaluate({name: 1.0}).normals
-        pictures += map_pictures.normal_picture(
-            f"normals, {name}", shown, valid=np.ones(shown.shape[:2], bool), width=WIDTH_PX
-        )
+    pictures = [map_pictures.color_picture("zones", masks @ tints, width=WIDTH_PX)]
+    shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
+    for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
+        shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
+    for title, normals in shown.items():
+        every = np.ones(normals.shape[:2], bool)
+        pictures.append(map_pictures.normal_picture(title, normals, valid=every, width=WIDTH_PX))
     table: Any = layer.table
     rows = []
     for name, row in table.rows.items():
@@ -104,14 +99,15 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     together = dict.fromkeys(list(table.rows)[:2], 1.0)
     sums = zone_sums(together, table)
     clamps = [(clamp, *(float(v) for v in clamped(sums, clamp))) for clamp in ("unit", "signed")]
-    return (
-        f"<h3>Wrinkles</h3><div class='maps'>{pictures}</div>"
-        + page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
-        + page.table(
-            ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
-        )
-        + f"<p class='note'>Map and zones explain {100 * part['explained']:.0f} % of the "
-        "differences between expressions and neutral.</p>"
+    yield page.Heading("Wrinkles")
+    yield page.Images(pictures)
+    yield page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
+    yield page.table(
+        ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
+    )
+    yield page.note(
+        f"Map and zones explain {100 * part['explained']:.0f} % of the differences between "
+        "expressions and neutral."
     )
 
 
@@ -121,8 +117,8 @@ def _normals(derivatives: Any) -> Float64Array:
     return np.asarray(small / np.linalg.norm(small, axis=2, keepdims=True))
 
 
-def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
-    rows, alphas, sigmas, pictures = [], [], [], ""
+def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[page.Block]:
+    rows, alphas, sigmas, pictures = [], [], [], []
     for site, entry in part["sites"].items():
         table = KernelTable.from_json(appearance.files[entry["table"]].decode())
         low, high = table.stretch_range
@@ -132,15 +128,17 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
         sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
         spread = 2.5 * float(np.std(relief.values[_valid(relief)]))
-        pictures += map_pictures.scalar_picture(
-            f"{site}: neutral relief",
-            relief.values,
-            low=-spread,
-            high=spread,
-            scale="gray",
-            valid=relief.valid,
-            unit="um",
-            width=WIDTH_PX,
+        pictures.append(
+            map_pictures.scalar_picture(
+                f"{site}: neutral relief",
+                relief.values,
+                low=-spread,
+                high=spread,
+                scale="gray",
+                valid=relief.valid,
+                unit="um",
+                width=WIDTH_PX,
+            )
         )
         rows.append(
             (
@@ -151,15 +149,18 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
                 table.source,
             )
         )
-    plots = figures.curves("strength", "stretch ratio", "alpha", alphas)
-    plots += figures.curves("width", "stretch ratio", "sigma, um", sigmas)
-    return (
-        f"<h3>Microstructure</h3><div class='maps'>{pictures}</div><div class='plots'>{plots}</div>"
-        + page.table(
-            ("site", "pixel, um", "kernels fitted", "stretch", "table from"),
-            rows,
-            caption="Sites with microstructure",
-        )
+    yield page.Heading("Microstructure")
+    yield page.Images(pictures)
+    yield page.Plots(
+        [
+            figures.curves("strength", "stretch ratio", "alpha", alphas),
+            figures.curves("width", "stretch ratio", "sigma, um", sigmas),
+        ]
+    )
+    yield page.table(
+        ("site", "pixel, um", "kernels fitted", "stretch", "table from"),
+        rows,
+        caption="Sites with microstructure",
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,8 @@ def run_extremes(
     return document
 
 
-def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
-    """Return the report's table of extremes, and add to its checks that they held."""
+def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[page.Block]:
+    """Yield the report's table of extremes, and add to its checks that they held."""
     cases = document["cases"]
     failed = sum(not case["passed"] for case in cases)
     checks.append(page.Check("extremes that failed", failed, 0, "<=", "", f"of {len(cases)}"))
@@ -74,7 +74,8 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
         )
         for case in cases
     ]
-    return "<h2>Stiff and extreme cases</h2>" + page.table(
+    yield page.Heading("Stiff and extreme cases", level=2)
+    yield page.table(
         ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS),
         rows,
         caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",

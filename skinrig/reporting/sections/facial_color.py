@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band
 
-SHOWN = 4
+MAX_SHOWN_STATES = 4
 """States drawn; the tables list all."""
 WIDTH_PX = 240
-LEAST_PIXELS = 20
+MIN_BAND_PIXELS = 20
 """Of a melanin band that is told."""
 
 
@@ -31,8 +31,8 @@ def section(
     part: Mapping[str, Any],
     truths: Mapping[str, SkinAppearance],
     checks: list[page.Check],
-) -> str:
-    """Return the states of a face's blood, how they repeat, and how far off they are.
+) -> Iterator[page.Block]:
+    """Yield the states of a face's blood, how they repeat, and how far off they are.
 
     Parameters
     ----------
@@ -48,11 +48,12 @@ def section(
         Judgements are added to it.
     """
     rig = hemoglobin_rig(appearance)
-    body = (
-        "<h3>Hemoglobin rig</h3><p class='note'>Each state is a scale and a bias of the neutral "
-        f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination.</p>"
+    yield page.Heading("Hemoglobin rig")
+    yield page.note(
+        "Each state is a scale and a bias of the neutral "
+        f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination."
     )
-    body += _blends(appearance, rig)
+    yield from _blends(appearance, rig)
     rows = []
     for state, maps in rig.states.items():
         placed = [row for row in part["alignment"] if row["state"] == state]
@@ -69,7 +70,7 @@ def section(
                 placed[0]["by"] if placed else "",
             )
         )
-    body += page.table(
+    yield page.table(
         (
             "state",
             "mean change of blood, points",
@@ -83,19 +84,19 @@ def section(
         caption="States; points are percent of the dermis' volume, the mean change is over all "
         "pixels whose change was found",
     )
-    body += _repeats(part.get("repeatability"))
+    yield from _repeats(part.get("repeatability"))
     if truths:
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
         banded = errors_by_band(rig, truths)
-        body += _errors(name, states, changes, banded, checks)
-    for state in list(rig.states)[:SHOWN]:
+        yield from _errors(name, states, changes, banded, checks)
+    for state in list(rig.states)[:MAX_SHOWN_STATES]:
         measured = appearance.maps.get(f"hemoglobin_{state}")
         true = evaluation.true_blood(truths[state]) if state in truths else None
         if measured is None:
             continue
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
-        body += map_pictures.map_panel(
+        yield from map_pictures.map_panel(
             f"blood of {state}, by the rig",
             "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
@@ -103,13 +104,12 @@ def section(
             truth=None if true is None else true.values,
             valid=seen,
         )
-    return body
 
 
-def _repeats(told: Mapping[str, Any] | None) -> str:
-    """Return how far states repeat, and whether melanin drifts."""
+def _repeats(told: Mapping[str, Any] | None) -> Iterator[page.Block]:
+    """Yield how far states repeat, and whether melanin drifts."""
     if not told:
-        return ""
+        return
     drifts = {row["region"]: row for row in told["melanin_drift"]}
     rows = []
     for row in told["hemoglobin"]:
@@ -130,7 +130,7 @@ def _repeats(told: Mapping[str, Any] | None) -> str:
                 "" if drift is None else f"{drift['p_value']:.2g}",
             )
         )
-    return page.table(
+    yield page.table(
         (
             "region",
             "between repeats, points",
@@ -145,26 +145,24 @@ def _repeats(told: Mapping[str, Any] | None) -> str:
     )
 
 
-def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:
+def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Block]:
     """Draw the face's color in each state and in the first two together."""
     melanin = appearance.maps.get("melanin")
     if melanin is None:
-        return ""
+        return
     names = list(rig.states)
     asked: dict[str, dict[str, float]] = {"neutral": {"neutral": 1.0}}
-    asked |= {state: {state: 1.0} for state in names[:SHOWN]}
+    asked |= {state: {state: 1.0} for state in names[:MAX_SHOWN_STATES]}
     if len(names) > 1:
         asked[f"{names[0]} + {names[1]}"] = {names[0]: 1.0, names[1]: 1.0, "neutral": -1.0}
-    pictures = ""
+    pictures = []
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
         seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
         color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        pictures += map_pictures.color_picture(title, color, width=WIDTH_PX)
-    return (
-        f"<div class='maps'>{pictures}</div><p class='note'>Diffuse color without shading, linear "
-        "sRGB under D65.</p>"
-    )
+        pictures.append(map_pictures.color_picture(title, color, width=WIDTH_PX))
+    yield page.Images(pictures)
+    yield page.note("Diffuse color without shading, linear sRGB under D65.")
 
 
 def _errors(
@@ -173,9 +171,9 @@ def _errors(
     changes: list[evaluation.ChangeError],
     banded: list[tuple[object, ...]],
     checks: list[page.Check],
-) -> str:
+) -> Iterator[page.Block]:
     if not states:
-        return ""
+        return
     by_rig = [row for row in states if row.way == evaluation.WAYS[1]]
     for row in by_rig:
         worst = _worst(row.state, banded)
@@ -190,7 +188,8 @@ def _errors(
                 worst=worst,
             )
         )
-    body = "<h3>Blood of each state: error by way</h3>" + page.table(
+    yield page.Heading("Blood of each state: error by way")
+    yield page.table(
         (
             "state",
             "way",
@@ -217,7 +216,7 @@ def _errors(
         caption="Against the true blood of each state, by way of getting it; pixels that every "
         "way tells",
     )
-    body += page.table(
+    yield page.table(
         (
             "state",
             "true change, points",
@@ -233,7 +232,7 @@ def _errors(
         "these pixels whose change was found",
     )
     if banded:
-        body += page.table(
+        yield page.table(
             ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"),
             banded,
             caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
@@ -250,8 +249,7 @@ def _errors(
         ]
         for way in evaluation.WAYS
     }
-    plot = figures.bars("median error of a state's blood", labels, series, unit="%")
-    return body + f"<div class='plots'>{plot}</div>"
+    yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
 
 
 def errors_by_band(
@@ -287,7 +285,7 @@ def errors_by_band(
             good = good & true.valid
         for low, high in BANDS:
             inside = good & (melanin.values >= low) & (melanin.values < high)
-            if np.count_nonzero(inside) < LEAST_PIXELS:
+            if np.count_nonzero(inside) < MIN_BAND_PIXELS:
                 continue
             found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
             relative = (found - real) / real

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 
-DOCUMENTS = ("render.json", "analysis.json")
+DOCUMENT_FILES = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
-SCHEMAS = ("skinrig.render/", "skinrig.analyse")
-LARGEST_BYTES = 600_000
+SCHEMA_PREFIXES = ("skinrig.render/", "skinrig.analyse")
+MAX_IMAGE_BYTES = 600_000
 """Larger pictures stay in their folder: a report is to be sent by mail."""
-FULL = "full model"
+FULL_MODEL = "full model"
 
 
 def folder_document(folder: Path) -> Path | None:
     """Return the document of a folder of renderings or of an analysis, or None."""
-    for name in DOCUMENTS:
+    for name in DOCUMENT_FILES:
         path = folder / name
         if path.is_file():
             return path
     return None
 
 
-def section(folder: Path, checks: list[page.Check]) -> str:
-    """Return what lies in a folder that `skinrig render` or `skinrig analyse` wrote.
+def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
+    """Yield what lies in a folder that `skinrig render` or `skinrig analyse` wrote.
 
     Parameters
     ----------
@@ -39,15 +39,15 @@ def section(folder: Path, checks: list[page.Check]) -> str:
     """
     path = folder_document(folder)
     if path is None:
-        return ""
+        return
     document = json.loads(path.read_text(encoding="utf-8"))
-    if not str(document.get("schema", "")).startswith(SCHEMAS):
-        return ""
-    body = f"<h2>{page.escape(_heading(document))}: {page.escape(folder.name)}</h2>"
-    if FULL in document:
-        body += _comparison(folder.name, document, checks)
+    if not str(document.get("schema", "")).startswith(SCHEMA_PREFIXES):
+        return
+    yield page.Heading(f"{_heading(document)}: {folder.name}", level=2)
+    if FULL_MODEL in document:
+        yield from _comparison(folder.name, document, checks)
     elif "view" in document:
-        body += page.facts(
+        yield page.facts(
             {
                 "view": document["view"].get("name", ""),
                 "lights": ", ".join(document.get("lights", {})),
@@ -58,25 +58,27 @@ def section(folder: Path, checks: list[page.Check]) -> str:
             caption="What was asked for",
         )
     for one in document.get("datasets", ()):
-        body += _data_set(one)
-    body += _pictures(folder)
+        yield from _data_set(one)
+    yield from _pictures(folder)
     if document.get("assumed"):
-        body += "<h3>Assumed</h3>" + page.table(
+        yield page.Heading("Assumed")
+        yield page.table(
             ("assumption",),
             [[t] for t in document["assumed"]],
             caption="Taken for granted, not measured",
         )
-    return body
 
 
 def _heading(document: Mapping[str, Any]) -> str:
-    if FULL in document:
+    if FULL_MODEL in document:
         return "Renderings beside photographs"
     return "Rendering" if "view" in document else "Analysis"
 
 
-def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]) -> str:
-    full = document[FULL]
+def _comparison(
+    name: str, document: Mapping[str, Any], checks: list[page.Check]
+) -> Iterator[page.Block]:
+    full = document[FULL_MODEL]
     checks.append(
         page.Check(
             f"{name}: luminance of held-out photographs, median error on lit pixels",
@@ -88,8 +90,8 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
         )
     )
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
-    rows = {FULL: full, **kinds, **document["ablation"]}
-    body = page.table(
+    rows = {FULL_MODEL: full, **kinds, **document["ablation"]}
+    yield page.table(
         (
             "model",
             "photographs",
@@ -114,38 +116,39 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
     bands = [
         (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
     ]
-    return body + page.table(
+    yield page.table(
         ("skin", "pixels", "median error, %"),
         bands,
         caption="The full model by skin color, from the individual typology angle",
     )
 
 
-def _data_set(one: Mapping[str, Any]) -> str:
+def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
     ranks: Sequence[float] = one.get("ranks", ())
     if not ranks:
-        return ""
+        return
     head = [name for name in ("error", "normalized", "held_out_error") if name in one]
     rows = [
         (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
         for k, rank in enumerate(ranks)
     ]
     name = one.get("name", "")
-    return page.table(
+    yield page.table(
         ("lobes", *(n.replace("_", " ") for n in head)),
         rows,
         caption=f"Errors by number of lobes: {name}",
     )
 
 
-def _pictures(folder: Path) -> str:
+def _pictures(folder: Path) -> Iterator[page.Block]:
     figures = []
     kept = []
     for path in sorted(folder.glob("*.png")):
         data = path.read_bytes()
-        if len(data) > LARGEST_BYTES:
+        if len(data) > MAX_IMAGE_BYTES:
             kept.append(path.name)
             continue
         figures.append(map_pictures.stored_picture(path.stem.replace("-", " "), data))
-    note = page.note(f"Too large for here: {', '.join(kept)}.") if kept else ""
-    return f"<div class='maps'>{''.join(figures)}</div>" + note
+    yield page.Images(figures)
+    if kept:
+        yield page.note(f"Too large for here: {', '.join(kept)}.")

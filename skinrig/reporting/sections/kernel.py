@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from model.skin import SkinAppearance
@@ -13,7 +13,7 @@ from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
-_ALPHA_AND_SIGMA = (
+_PARAMETER_KEYS = (
     "alpha",
     "alpha_stderr",
     "alpha_95",
@@ -23,8 +23,10 @@ _ALPHA_AND_SIGMA = (
 )
 
 
-def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
-    """Return kernels by state and direction, and judge the distances that they leave.
+def section(
+    name: str, appearance: SkinAppearance, checks: list[page.Check]
+) -> Iterator[page.Block]:
+    """Yield kernels by state and direction, and judge the distances that they leave.
 
     Parameters
     ----------
@@ -37,7 +39,7 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
     """
     document = evaluation.document_of(appearance, KERNEL_FILE)
     if document is None or not document["fits"]:
-        return ""
+        return
     fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])
     judged = [fit for fit in fits if fit["valid"] and _told(fit)]
     if judged:
@@ -53,52 +55,46 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
             )
         )
     untold = [state_words(fit["name"]) for fit in fits if fit["valid"] and not _told(fit)]
-    note = (
-        page.note(
+    yield page.Heading("Convolution kernels")
+    if untold:
+        yield page.note(
             f"The patch is too small for {'; '.join(untold)}: two histograms of one skin of this "
             "size differ by more than half of what the strain changes, so that the distance left "
             "by the kernel is not judged."
         )
-        if untold
-        else ""
-    )
-    body = (
-        "<h3>Convolution kernels</h3>"
-        + note
-        + page.table(
+    yield page.table(
+        (
+            "state",
+            "r",
+            "alpha",
+            "standard error",
+            "95 % half width",
+            "sigma, um",
+            "standard error, um",
+            "95 % half width, um",
+            "distance before",
+            "after",
+            "other skin of this size",
+            "nearly as good",
+            "fitted",
+        ),
+        [
             (
-                "state",
-                "r",
-                "alpha",
-                "standard error",
-                "95 % half width",
-                "sigma, um",
-                "standard error, um",
-                "95 % half width, um",
-                "distance before",
-                "after",
-                "other skin of this size",
-                "nearly as good",
-                "fitted",
-            ),
-            [
-                (
-                    state_words(fit["name"]),
-                    fit["stretch_s"],
-                    *(_value(fit.get(key)) for key in _ALPHA_AND_SIGMA),
-                    _value(fit["distance_before"]),
-                    _value(fit["distance"]),
-                    _value(fit.get("noise_floor")),
-                    fit.get("near_best_count", 0),
-                    "yes" if fit["valid"] else "no",
-                )
-                for fit in fits
-            ],
-            caption="Kernels fitted to histograms of normals; distances before and after each. "
-            "Kernel errors are not Gaussian: 95 % half widths differ from 1.96 standard errors",
-        )
+                state_words(fit["name"]),
+                fit["stretch_s"],
+                *(_value(fit.get(key)) for key in _PARAMETER_KEYS),
+                _value(fit["distance_before"]),
+                _value(fit["distance"]),
+                _value(fit.get("noise_floor")),
+                fit.get("near_best_count", 0),
+                "yes" if fit["valid"] else "no",
+            )
+            for fit in fits
+        ],
+        caption="Kernels fitted to histograms of normals; distances before and after each. "
+        "Kernel errors are not Gaussian: 95 % half widths differ from 1.96 standard errors",
     )
-    plots = ""
+    plots = []
     for key, error, title in (
         ("alpha", "alpha_stderr", "kernel strength alpha"),
         ("sigma_um", "sigma_stderr_um", "kernel width sigma, um"),
@@ -130,13 +126,14 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
                 )
             )
         if series:
-            plots += figures.curves(title, "stretch ratio r of the skin", title, series)
-    return body + f"<div class='plots'>{plots}</div>" + _direction(document.get("direction"))
+            plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
+    yield page.Plots(plots)
+    yield from _direction(document.get("direction"))
 
 
-def _direction(found: Mapping[str, Any] | None) -> str:
+def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:
     if not found:
-        return ""
+        return
     rows = [
         (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
         for angle, alpha, alpha_error, sigma, sigma_error in zip(
@@ -148,16 +145,15 @@ def _direction(found: Mapping[str, Any] | None) -> str:
             strict=True,
         )
     ]
-    return (
-        "<h3>Kernels by the direction of stretch, less one table of all</h3>"
-        + page.table(
-            ("jaws at, °", "alpha", "standard error", "sigma, um", "standard error, um"),
-            rows,
-            caption="Offsets of each direction",
-        )
-        + "<p class='note'>Chance of such differences where the direction does not matter: alpha "
+    yield page.Heading("Kernels by the direction of stretch, less one table of all")
+    yield page.table(
+        ("jaws at, °", "alpha", "standard error", "sigma, um", "standard error, um"),
+        rows,
+        caption="Offsets of each direction",
+    )
+    yield page.note(
+        "Chance of such differences where the direction does not matter: alpha "
         f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
-        "</p>"
     )
 
 

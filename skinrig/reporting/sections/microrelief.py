@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from skinrig.reporting.map_names import state_words
 from skinrig.reporting.sections import kernel
 
 WIDTH_PX = 200
-SHOWN = 7
+MAX_SHOWN_STATES = 7
 """States shown as pictures, spread evenly over those there are."""
-HISTOGRAM_REACH = 0.75
+SHOWN_HISTOGRAM_FRACTION = 0.75
 """Part of a histogram's side that is shown, from its middle."""
 
 
@@ -31,8 +31,8 @@ def is_microrelief(appearance: SkinAppearance) -> bool:
 
 def section(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> str:
-    """Return the states of stretched skin, their histograms, kernels and errors.
+) -> Iterator[page.Block]:
+    """Yield the states of stretched skin, their histograms, kernels and errors.
 
     Parameters
     ----------
@@ -45,40 +45,40 @@ def section(
     checks
         Judgements are added to it.
     """
-    body = _pictures(appearance, truth)
+    yield from _pictures(appearance, truth)
     if truth is not None:
-        body += _relief_errors(name, appearance, truth, checks)
-    body += _strain(name, appearance, truth, checks)
-    body += _histograms(appearance)
-    body += _variances(appearance)
-    body += kernel.section(name, appearance, checks)
-    return body
+        yield from _relief_errors(name, appearance, truth, checks)
+    yield from _strain(name, appearance, truth, checks)
+    yield from _histograms(appearance)
+    yield from _variances(appearance)
+    yield from kernel.section(name, appearance, checks)
 
 
-def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
     states = evaluation.states_of(appearance)
     order = sorted(states, key=_by_step)
     first = "a000_n0" if "a000_n0" in states else order[0]
-    body = _beside_truth(first, appearance, truth)
+    yield from _beside_truth(first, appearance, truth)
     one = [state for state in order if state[:4] == first[:4]]
-    chosen = [one[round(k)] for k in np.linspace(0, len(one) - 1, min(SHOWN, len(one)))]
+    chosen = [one[round(k)] for k in np.linspace(0, len(one) - 1, min(MAX_SHOWN_STATES, len(one)))]
     series = []
     for kind, title in (("normals", "normals"), ("height", "height")):
-        row = ""
+        row = []
         for state in chosen:
             skin_map = appearance.maps.get(f"{kind}_{state}")
             if skin_map is not None:
-                row += _shown(f"{title}, {state_words(state)}", skin_map, appearance)
+                row.append(_shown(f"{title}, {state_words(state)}", skin_map, appearance))
         if row:
-            series.append(f"<div class='maps small'>{row}</div>")
+            series.append(page.Images(row, small=True))
     if len(one) > 1:
-        body += "<h3>From compressed to stretched</h3>" + "".join(series)
-    return body
+        yield page.Heading("From compressed to stretched")
+        yield from series
 
 
-def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
-    """Return truth | estimate | error | standard error of one state's normals and height."""
-    body = ""
+def _beside_truth(
+    state: str, appearance: SkinAppearance, truth: SkinAppearance | None
+) -> Iterator[page.Block]:
+    """Yield truth | estimate | error | standard error of one state's normals and height."""
     normals = appearance.maps.get(f"normals_{state}")
     true = None if truth is None else truth.maps.get(f"normals_{state}")
     if normals is not None:
@@ -96,13 +96,14 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
             parts.append(_angle_picture("standard error", spread, _valid(normals), state))
-        body += f"<h3>normals, {state_words(state)}</h3><div class='maps'>{''.join(parts)}</div>"
+        yield page.Heading(f"normals, {state_words(state)}")
+        yield page.Images(parts)
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
         relief = None
         if truth is not None:
             relief = evaluation.true_relief(appearance, truth, state)
-        body += map_pictures.map_panel(
+        yield from map_pictures.map_panel(
             f"height, {state_words(state)}",
             "um",
             estimate=height.values,
@@ -111,10 +112,9 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
             valid=_valid(height),
             width=280,
         )
-    return body
 
 
-def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
+def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> page.Image:
     if skin_map.values.ndim == 3:
         return map_pictures.normal_picture(
             title, skin_map.values, valid=_valid(skin_map), width=WIDTH_PX
@@ -133,13 +133,13 @@ def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
     )
 
 
-def _normal_picture(title: str, skin_map: SkinMap, state: str) -> str:
+def _normal_picture(title: str, skin_map: SkinMap, state: str) -> page.Image:
     return map_pictures.normal_picture(
         title, skin_map.values, valid=_valid(skin_map), of=f"normals, {state_words(state)}"
     )
 
 
-def _angle_picture(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> str:
+def _angle_picture(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> page.Image:
     return map_pictures.scalar_picture(
         title,
         degrees,
@@ -154,10 +154,10 @@ def _angle_picture(title: str, degrees: FloatArray, valid: BoolArray, state: str
 
 def _relief_errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     rows = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     if not rows:
-        return ""
+        return
     neutral = [row for row in rows if row.state.endswith("_n0")]
     where, worst_got = _worst(rows)
     for row in neutral:
@@ -175,51 +175,48 @@ def _relief_errors(
                 worst_got=worst_got,
             )
         )
-    note = (
-        "<p class='note'>Errors are told at the lens's resolution; the unblurred truth has detail "
+    yield page.Heading("Errors of normals and height")
+    yield page.note(
+        "Errors are told at the lens's resolution; the unblurred truth has detail "
         "that this aperture does not show. Heights have the lens's blur undone and are told "
         f"against the unblurred relief: {100 * evaluation.HEIGHT_LIMIT:g} % is kept on smooth "
         "relief; on skin, steep walls of furrows hide light from themselves, which is not "
-        "corrected, and standard errors, which know noise alone, are then too small.</p>"
+        "corrected, and standard errors, which know noise alone, are then too small."
     )
-    note += page.one_skin(truth.parameters)
-    return (
-        "<h3>Errors of normals and height</h3>"
-        + note
-        + page.table(
+    yield page.one_skin(truth.parameters)
+    yield page.table(
+        (
+            "state",
+            "pixels",
+            "masked, %",
+            "mean error, °",
+            "median, °",
+            "68 % interval",
+            "unblurred truth, °",
+            "median standard error, °",
+            "68 % coverage, %",
+            "height rms, um",
+            "relief rms, um",
+            "of relief, %",
+        ),
+        [
             (
-                "state",
-                "pixels",
-                "masked, %",
-                "mean error, °",
-                "median, °",
-                "68 % interval",
-                "unblurred truth, °",
-                "median standard error, °",
-                "68 % coverage, %",
-                "height rms, um",
-                "relief rms, um",
-                "of relief, %",
-            ),
-            [
-                (
-                    state_words(row.state),
-                    row.pixels,
-                    100 * row.masked,
-                    row.mean_deg,
-                    row.median_deg,
-                    f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}",
-                    row.unblurred_deg,
-                    row.stderr_deg,
-                    100 * row.coverage,
-                    row.height_um,
-                    row.relief_um,
-                    100 * row.height_relative,
-                )
-                for row in rows
-            ],
-            caption="Every state against its truth; angles of normals in degrees",
-        )
+                state_words(row.state),
+                row.pixels,
+                100 * row.masked,
+                row.mean_deg,
+                row.median_deg,
+                f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}",
+                row.unblurred_deg,
+                row.stderr_deg,
+                100 * row.coverage,
+                row.height_um,
+                row.relief_um,
+                100 * row.height_relative,
+            )
+            for row in rows
+        ],
+        caption="Every state against its truth; angles of normals in degrees",
     )
 
 
@@ -234,10 +231,10 @@ def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
 
 def _strain(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     document = evaluation.document_of(appearance, STRAIN_FILE)
     if document is None:
-        return ""
+        return
     true = (
         {}
         if truth is None
@@ -273,7 +270,8 @@ def _strain(
         )
         for state in document["states"]
     ]
-    return "<h3>Strain of the skin, from its pigment</h3>" + page.table(
+    yield page.Heading("Strain of the skin, from its pigment")
+    yield page.table(
         (
             "state",
             "jaws, mm",
@@ -294,48 +292,49 @@ def _strain(
     )
 
 
-def _histograms(appearance: SkinAppearance) -> str:
+def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
     document = evaluation.document_of(appearance, HISTOGRAM_FILE)
     if document is None:
-        return ""
+        return
     states = sorted(document["states"], key=lambda state: _by_step(state["name"]))
-    chosen = [states[round(k)] for k in np.linspace(0, len(states) - 1, min(SHOWN, len(states)))]
+    chosen = [
+        states[round(k)]
+        for k in np.linspace(0, len(states) - 1, min(MAX_SHOWN_STATES, len(states)))
+    ]
     counts = [np.asarray(state["counts"], float) for state in chosen]
     top = max((float(np.sqrt(count).max()) for count in counts), default=1.0)
-    panels = ""
+    panels = []
     for state, count in zip(chosen, counts, strict=True):
         side = len(count)
-        cut = round(side * (1 - HISTOGRAM_REACH) / 2)
+        cut = round(side * (1 - SHOWN_HISTOGRAM_FRACTION) / 2)
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
-        panels += map_pictures.scalar_picture(
-            state_words(state["name"]),
-            shown,
-            low=0.0,
-            high=top,
-            scale="magma",
-            width=WIDTH_PX,
-            of="histogram of normals",
+        panels.append(
+            map_pictures.scalar_picture(
+                state_words(state["name"]),
+                shown,
+                low=0.0,
+                high=top,
+                scale="magma",
+                width=WIDTH_PX,
+                of="histogram of normals",
+            )
         )
     aliased = [state_words(state["name"]) for state in states if state["aliased"]]
-    note = (
-        page.note(
+    yield page.Heading("Histograms of normals, root of share")
+    yield page.note("Along the jaws to the right, across them up.")
+    yield page.Images(panels, small=True)
+    if aliased:
+        yield page.note(
             f"Too few samples a bucket in {'; '.join(aliased)}: distances between these "
             "histograms show chance."
         )
-        if aliased
-        else ""
-    )
-    return (
-        "<h3>Histograms of normals, root of share</h3><p class='note'>Along the jaws to the right, "
-        f"across them up.</p><div class='maps small'>{panels}</div>{note}"
-    )
 
 
-def _variances(appearance: SkinAppearance) -> str:
+def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
     by_angle = evaluation.variances(appearance)
     if not by_angle:
-        return ""
+        return
     series = [
         figures.Curve(
             f"jaws at {angle:.0f}°",
@@ -348,7 +347,7 @@ def _variances(appearance: SkinAppearance) -> str:
     plot = figures.curves(
         "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
     )
-    return f"<div class='plots'>{plot}</div>"
+    yield page.Plots([plot])
 
 
 def _by_step(state: str) -> tuple[str, int]:

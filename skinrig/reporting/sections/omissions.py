@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from skinrig.reporting import page
 from skinrig.simulating.leaving_out import may_be_left_out
 
-ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
+VERDICT_ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
 """In which verdicts are listed, see `rigsim.needs.effects.MEANING`."""
 
-WORDS = {
+VERDICT_WORDS = {
     "asked": "left out as asked",
     "negligible": "left out, too small",
     "unmodeled": "not modeled",
@@ -40,17 +40,17 @@ def effects_of(session: Path) -> list[Mapping[str, Any]]:
     return [entry for entry in found if isinstance(entry, dict)]
 
 
-def section(sessions: Sequence[Path]) -> str:
-    """Return what the scenes of simulated sessions hold; empty where no session tells.
+def section(sessions: Sequence[Path]) -> Iterator[page.Block]:
+    """Yield what the scenes of simulated sessions hold; empty where no session tells.
 
     Parameters
     ----------
     sessions
         SESSION/ folders. Those whose scenes are alike share a table.
 
-    Returns
-    -------
-    str
+    Yields
+    ------
+    Block
         HTML, the same for the same sessions in any order.
     """
     alike: dict[str, list[str]] = {}
@@ -59,30 +59,24 @@ def section(sessions: Sequence[Path]) -> str:
         if found:
             alike.setdefault(json.dumps(found, sort_keys=True), []).append(session.name)
     if not alike:
-        return ""
-    body = (
-        "<h2>What simulated scenes leave out</h2><p class=note>A scene builds what changes a pixel "
-        "by a tenth of its noise or more. The number is the largest change that its rule tells, "
-        "over the noise; <code>skinrig bench --stage omissions</code> renders scenes with "
-        "and without. <code>skinrig simulate --leave-out</code> leaves out all the same what has "
-        "a name beside. What is not modeled may change pixels: real photographs hold it and "
-        "simulated ones do not.</p>"
-    )
+        return
+    yield page.Heading("What simulated scenes leave out", level=2)
+    yield page.Fixed("reporting/templates/omissions.html")
     for text, names in alike.items():
         effects = json.loads(text)
         rows = sorted((_row(effect) for effect in effects), key=lambda row: _place(row[1]))
         out = sum(not effect["verdict"] == "built" for effect in effects)
         title = f"{', '.join(names)}: of {len(effects)} effects {len(effects) - out} built"
         head = ("effect", "what became of it", "why", "change over noise", "--leave-out")
-        body += page.folded(title, page.table(head, rows, caption="Effects of light in the scene"))
-    return body
+        table = page.table(head, rows, caption="Effects of light in the scene")
+        yield page.Folded(title, [table])
 
 
 def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     over, switch = effect.get("over_noise"), str(effect.get("switch", ""))
     return (
         str(effect["name"]),
-        WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
+        VERDICT_WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
         str(effect["reason"]),
         "" if over is None else f"{over:.3g}",
         switch if may_be_left_out(switch) else "",
@@ -90,5 +84,5 @@ def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
 
 
 def _place(words: str) -> int:
-    told = [WORDS[verdict] for verdict in ORDER]
+    told = [VERDICT_WORDS[verdict] for verdict in VERDICT_ORDER]
     return told.index(words) if words in told else len(told)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,16 @@ from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
 from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import page
 
-PEOPLE = 87
+POPULATION_SIZE = 87
 """As many as Weyrich et al. 2005 measured."""
-MEDIA = ("homogeneous:", "anisotropic:")
+MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
 """How simulated subjects that are media are named."""
 
 
 def section(
     appearances: Mapping[str, SkinAppearance], truths: Mapping[str, Path] | None = None
-) -> str:
-    """Return the tables of sigma_tr over people; empty where nobody's skin was probed.
+) -> Iterator[page.Block]:
+    """Yield the tables of sigma_tr over people; empty where nobody's skin was probed.
 
     Parameters
     ----------
@@ -47,14 +47,17 @@ def section(
         and not _is_medium(appearance, truths or {})
     }
     if not people:
-        return ""
+        return
     published = weyrich_2005()
-    drawn = table(published.sample(PEOPLE, rng=np.random.default_rng(0)), sites=published.sites)
-    body = "<h2>sigma_tr over people, 1/mm</h2>" + (
-        "<p class='note'>Deviations are over people. The publication heads its second column "
+    drawn = table(
+        published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
+    )
+    yield page.Heading("sigma_tr over people, 1/mm", level=2)
+    yield page.note(
+        "Deviations are over people. The publication heads its second column "
         "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
         "they are read as standard deviations. The smallest sigma_tr is the most translucent "
-        "skin.</p>"
+        "skin."
     )
     rows: list[tuple[object, ...]] = []
     for c, channel in enumerate(CHANNELS):
@@ -62,7 +65,7 @@ def section(
         for s in range(len(published.sites)):
             row += [float(published.mean_per_mm[s, c]), float(published.deviation_per_mm[s, c])]
         rows.append(tuple(row))
-    rows += _rows(f"simulated, {PEOPLE} people drawn from it", drawn, published.sites)
+    rows += _rows(f"simulated, {POPULATION_SIZE} people drawn from it", drawn, published.sites)
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]
     if measured:
         found = summarize(measured)
@@ -70,7 +73,7 @@ def section(
         rows += _rows(f"measured here, {len(people)} {many}", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
     head = ("who", "channel", *columns)
-    return body + page.table(
+    yield page.table(
         head, rows, caption="Mean and standard deviation over people, red, green and blue light"
     )
 
@@ -81,7 +84,7 @@ def _is_medium(appearance: SkinAppearance, truths: Mapping[str, Path]) -> bool:
     if folder is None:
         return False
     subject = str(store.read_document(folder).parameters.get("subject", ""))
-    return subject.startswith(MEDIA)
+    return subject.startswith(MEDIUM_PREFIXES)
 
 
 def _rows(who: str, found: PopulationTable, sites: tuple[str, ...]) -> list[tuple[object, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from reconstruction.pipeline.flash.sequence import CURVES_FILE
 from skinrig.drawing import figures
 from skinrig.reporting import page
 
-COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
+PLACE_COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
 
 
 def is_sequence(appearance: SkinAppearance) -> bool:
@@ -21,24 +21,23 @@ def is_sequence(appearance: SkinAppearance) -> bool:
     return CURVES_FILE in appearance.files
 
 
-def section(appearance: SkinAppearance) -> str:
-    """Return the curves of all places, their levels and time constants, and what is covered."""
+def section(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield the curves of all places, their levels and time constants, and what is covered."""
     told = json.loads(appearance.files[CURVES_FILE])
     cycle_s = told.get("cycle_s")
-    body = f"<h3>Blood in time: {page.escape(told['state'])}</h3>"
+    yield page.Heading(f"Blood in time: {told['state']}")
     if cycle_s is not None:
         phases = told["phases"]
-        body += (
-            f"<p class='note'>{phases['captures']} images meet {phases['distinct']} phases of a "
+        yield page.note(
+            f"{phases['captures']} images meet {phases['distinct']} phases of a "
             f"cycle of {cycle_s:g} s, {phases['interval_s']:g} s apart, one every "
-            f"{told['shot_period_s']:g} s; ordered by the flash's true time.</p>"
+            f"{told['shot_period_s']:g} s; ordered by the flash's true time."
         )
-    body += _curves(told, cycle_s)
-    body += _table(told)
-    return body
+    yield _curves(told, cycle_s)
+    yield from _table(told)
 
 
-def _curves(told: Mapping[str, Any], cycle_s: float | None) -> str:
+def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
     key, axis = ("phase_s", "phase, s") if cycle_s is not None else ("time_s", "time, s")
     when = np.array([_number(frame[key]) for frame in told["frames"]])
     order = np.argsort(when)
@@ -53,16 +52,16 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> str:
                 values[order].tolist(),
                 errors[order].tolist(),
                 line=cycle_s is None,
-                color=COLORS[number % len(COLORS)],
+                color=PLACE_COLORS[number % len(PLACE_COLORS)],
             )
         )
     plot = figures.curves(
         f"blood in {told['state']}", axis, "blood, % of the dermis' volume", curves
     )
-    return f"<div class='plots'>{plot}</div>"
+    return page.Plots([plot])
 
 
-def _table(told: Mapping[str, Any]) -> str:
+def _table(told: Mapping[str, Any]) -> Iterator[page.Block]:
     rows = []
     transitions, repeats = told.get("transition", {}), told.get("reproducibility", {})
     for place, fit in told["fits"].items():
@@ -78,7 +77,7 @@ def _table(told: Mapping[str, Any]) -> str:
                 float("nan") if repeat is None else 100 * _number(repeat["sd"]),
             )
         )
-    body = page.table(
+    yield page.table(
         (
             "place",
             "level at the start, %",
@@ -90,8 +89,7 @@ def _table(told: Mapping[str, Any]) -> str:
         rows,
         caption="Levels and time constants by place; points are percent of the dermis' volume",
     )
-    together = page.escape(told["fit_of_all"]["text"])
-    return body + f"<p class='note'>Time constant, all places together: {together}.</p>"
+    yield page.note(f"Time constant, all places together: {told['fit_of_all']['text']}.")
 
 
 def _words(transition: Mapping[str, Any]) -> str:

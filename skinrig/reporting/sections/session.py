@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
@@ -40,11 +40,12 @@ def facts_of(folders: Sequence[Path]) -> dict[str, SessionFacts]:
     return found
 
 
-def section(sessions: Mapping[str, SessionFacts]) -> str:
-    """Return the table of sessions; empty without any."""
+def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
+    """Yield the table of sessions; empty without any."""
     if not sessions:
-        return ""
-    return "<h2>Sessions</h2>" + page.table(
+        return
+    yield page.Heading("Sessions", level=2)
+    yield page.table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
         [
             (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,10 @@ from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 
 WIDTH_PX = 200
-SHOWN = 3
+MAX_PLOTTED_MEASUREMENTS = 3
 """Measurements drawn; the tables list all."""
-COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
-_NAME = re.compile(r"(.+)_r(\d+)_a(\d+\.\d)")
+CHANNEL_COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
+_MEASUREMENT_NAME = re.compile(r"(.+)_r(\d+)_a(\d+\.\d)")
 """Of a measurement in documents: site, repeat, angle in degrees."""
 METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipole": "dipole"}
 
@@ -37,8 +37,8 @@ def is_probe(appearance: SkinAppearance) -> bool:
 
 def section(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> str:
-    """Return profiles with fits and residuals, sigma_tr by method, and their errors.
+) -> Iterator[page.Block]:
+    """Yield profiles with fits and residuals, sigma_tr by method, and their errors.
 
     Parameters
     ----------
@@ -51,25 +51,24 @@ def section(
     checks
         Judgements are added to it.
     """
-    body = _plots(appearance)
-    body += _fits(appearance, truth)
+    yield from _plots(appearance)
+    yield from _fits(appearance, truth)
     if truth is not None:
-        body += _errors(name, appearance, truth, checks)
-    body += _anisotropy(appearance)
-    body += _sites(appearance)
-    body += _map(appearance)
-    return body
+        yield from _errors(name, appearance, truth, checks)
+    yield from _anisotropy(appearance)
+    yield from _sites(appearance)
+    yield from _map(appearance)
 
 
-def _plots(appearance: SkinAppearance) -> str:
+def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
     measured = evaluation.document_of(appearance, PROFILE_FILE)
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if measured is None:
-        return ""
+        return
     by_name = {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
     radius = measured["radius_mm"]
-    plots = ""
-    for entry in _one_of_each_site(measured["measurements"])[:SHOWN]:
+    plots = []
+    for entry in _one_of_each_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
         found = by_name.get(entry["name"])
         series = []
         for channel in CHANNELS:
@@ -83,7 +82,7 @@ def _plots(appearance: SkinAppearance) -> str:
                     value.tolist(),
                     stderr.tolist(),
                     line=False,
-                    color=COLORS[channel],
+                    color=CHANNEL_COLORS[channel],
                 )
             )
             for fit in [] if found is None else found["fits"]:
@@ -96,23 +95,26 @@ def _plots(appearance: SkinAppearance) -> str:
                         radius,
                         predicted.tolist(),
                         marks=False,
-                        color=COLORS[channel],
+                        color=CHANNEL_COLORS[channel],
                     )
                 )
-        plots += figures.curves(
-            f"{_words(entry)}: profile and photon-table fit",
-            "distance from the source, mm",
-            "reflectance, 1/mm²",
-            series,
-            log_y=True,
+        plots.append(
+            figures.curves(
+                f"{_words(entry)}: profile and photon-table fit",
+                "distance from the source, mm",
+                "reflectance, 1/mm²",
+                series,
+                log_y=True,
+            )
         )
         plots += _residuals(entry, found, radius)
-    return f"<h3>Radial profiles</h3><div class='plots'>{plots}</div>"
+    yield page.Heading("Radial profiles")
+    yield page.Plots(plots)
 
 
 def _residuals(
     entry: Mapping[str, Any], found: Mapping[str, Any] | None, radius: Sequence[float]
-) -> str:
+) -> list[str]:
     """Draw what each method leaves of the green channel, in percent of the reading."""
     channel = "green"
     one = entry["channels"][channel]
@@ -131,19 +133,15 @@ def _residuals(
                 )
             )
     if not series:
-        return ""
-    return figures.curves(
-        f"{_words(entry)}, {channel}: measured less fitted",
-        "distance from the source, mm",
-        "% of the fit",
-        series,
-    )
+        return []
+    title = f"{_words(entry)}, {channel}: measured less fitted"
+    return [figures.curves(title, "distance from the source, mm", "% of the fit", series)]
 
 
-def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if fitted is None:
-        return ""
+        return
     known = evaluation.true_profiles(truth)
     rows = []
     for entry in fitted["measurements"]:
@@ -192,22 +190,23 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
         rows,
         caption="Every fit, with what it says of itself",
     )
-    note = page.note(
+    yield page.Heading("sigma_tr by method")
+    yield page.note(
         "1/sigma_tr is the translucency: the smallest sigma_tr is the most translucent skin. The "
         "true sigma_tr of layers is that of the homogeneous medium whose profile fits best."
     )
-    return f"<h3>sigma_tr by method</h3>{note}" + page.folded(f"{len(rows)} fits", table)
+    yield page.Folded(f"{len(rows)} fits", [table])
 
 
 def _errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     rows = evaluation.compare_fits(appearance, truth)
-    body = page.one_skin(truth.parameters)
+    yield page.one_skin(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.by_method([row for row in rows if row.kind == kind])
-        body += f"<h3>Error of sigma_tr against the truth, {page.escape(kind)} tissue</h3>"
-        body += page.table(
+        yield page.Heading(f"Error of sigma_tr against the truth, {kind} tissue")
+        yield page.table(
             (
                 "method",
                 "fits",
@@ -229,7 +228,7 @@ def _errors(
             ],
             caption=f"By method, {kind} tissue",
         )
-        body += _by_channel([row for row in rows if row.kind == kind])
+        yield from _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED), None)
         if kind == "homogeneous" and best is not None:
             for word, got, bound in (
@@ -241,7 +240,8 @@ def _errors(
                 )
     profiles = evaluation.compare_profiles(appearance, truth)
     if profiles:
-        body += "<h3>Profiles against the truth</h3>" + page.table(
+        yield page.Heading("Profiles against the truth")
+        yield page.table(
             (
                 "measurement",
                 "channel",
@@ -263,26 +263,25 @@ def _errors(
             ],
             caption="Over fibres whose signal is ten times its standard error",
         )
-    return body
 
 
-def _by_channel(rows: Sequence[evaluation.FitError]) -> str:
+def _by_channel(rows: Sequence[evaluation.FitError]) -> Iterator[page.Block]:
     labels = [f"{name}, {c}" for name in dict.fromkeys(r.name for r in rows) for c in CHANNELS]
     if len(labels) > 4 * len(CHANNELS):
-        return ""
+        return
     series = {}
     for method, words in METHOD_NAMES.items():
         errors = {f"{r.name}, {r.channel}": r.relative for r in rows if r.method == method}
         series[words] = [100.0 * errors.get(label, float("nan")) for label in labels]
     parts = [label.rpartition(", ") for label in labels]
     short = [f"{_words_of_name(name)}\n{channel}" for name, _, channel in parts]
-    return f"<div class='plots'>{figures.bars('error of sigma_tr', short, series, unit='%')}</div>"
+    yield page.Plots([figures.bars("error of sigma_tr", short, series, unit="%")])
 
 
-def _anisotropy(appearance: SkinAppearance) -> str:
+def _anisotropy(appearance: SkinAppearance) -> Iterator[page.Block]:
     document = evaluation.document_of(appearance, ANISOTROPY_FILE)
     if document is None or not document["sites"]:
-        return ""
+        return
     rows = [
         (
             entry["site"],
@@ -299,7 +298,8 @@ def _anisotropy(appearance: SkinAppearance) -> str:
         )
         for entry in document["sites"]
     ]
-    return "<h3>Dependence on direction</h3>" + page.table(
+    yield page.Heading("Dependence on direction")
+    yield page.table(
         (
             "site",
             "repeat",
@@ -318,10 +318,10 @@ def _anisotropy(appearance: SkinAppearance) -> str:
     )
 
 
-def _sites(appearance: SkinAppearance) -> str:
+def _sites(appearance: SkinAppearance) -> Iterator[page.Block]:
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if fitted is None or not fitted.get("sites"):
-        return ""
+        return
     rows = [
         (
             entry["site"],
@@ -334,7 +334,8 @@ def _sites(appearance: SkinAppearance) -> str:
         )
         for entry in fitted["sites"]
     ]
-    return "<h3>Sites</h3>" + page.table(
+    yield page.Heading("Sites")
+    yield page.table(
         (
             "site",
             "channel",
@@ -349,43 +350,40 @@ def _sites(appearance: SkinAppearance) -> str:
     )
 
 
-def _map(appearance: SkinAppearance) -> str:
-    """Show 1/sigma_tr over the face's texture, each channel beside its standard error."""
+def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield 1/sigma_tr over the face's texture, each channel beside its standard error."""
     found = appearance.maps.get("translucency")
     if found is None:
-        return ""
-    pictures = ""
+        return
+    pictures = []
     for c, channel in enumerate(CHANNELS):
         values = found.values[..., c]
         inside = values if found.valid is None else values[found.valid]
         if not inside.size:
             continue
-        pictures += map_pictures.scalar_picture(
-            f"translucency, {channel}",
-            values,
-            low=float(inside.min()),
-            high=float(inside.max()),
-            valid=found.valid,
-            unit="mm",
-            width=WIDTH_PX,
-        )
+        shown = [(f"translucency, {channel}", values, inside.min(), inside.max(), "viridis")]
         if found.stderr is not None:
             spread = found.stderr[..., c]
-            pictures += map_pictures.scalar_picture(
-                "standard error",
-                spread,
-                low=0.0,
-                high=float(spread.max()),
-                scale="magma",
+            shown.append(("standard error", spread, 0.0, spread.max(), "magma"))
+        pictures += [
+            map_pictures.scalar_picture(
+                title,
+                drawn,
+                low=float(low),
+                high=float(high),
+                scale=scale,
                 valid=found.valid,
                 unit="mm",
                 width=WIDTH_PX,
             )
-    note = page.note(
+            for title, drawn, low, high, scale in shown
+        ]
+    yield page.Heading("Translucency map")
+    yield page.note(
         "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
         "them the error grows to what people differ by."
     )
-    return f"<h3>Translucency map</h3>{note}<div class='maps'>{pictures}</div>"
+    yield page.Images(pictures)
 
 
 def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -405,7 +403,7 @@ def _words_of_name(name: str) -> str:
     >>> _words_of_name("cheek, as published")
     'cheek, as published'
     """
-    found = _NAME.fullmatch(name)
+    found = _MEASUREMENT_NAME.fullmatch(name)
     if found is None:
         return name
     site, repeat, angle = found.groups()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.front_view import WIDTH_PX, FrontView
@@ -16,18 +17,18 @@ from skinrig.reporting import page
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign
 
-SMALL_PX = 110
+SMALL_WIDTH_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
-GRAY = 0.5
-RELATIVE = ("r_d",)
+BACKGROUND_CODE = 0.5
+RELATIVE_ERROR_MAPS = ("r_d",)
 """Maps whose standard errors are shown in percent of the estimate."""
-FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
+FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
 def section(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> str:
-    """Return the maps of an appearance on a mesh, beside their truth where there is one.
+) -> Iterator[page.Block]:
+    """Yield the maps of an appearance on a mesh, beside their truth where there is one.
 
     Parameters
     ----------
@@ -40,12 +41,12 @@ def section(
     checks
         Judgements are added to it.
     """
-    body = ""
     place = appearance.maps["position"]
     rows, columns = np.nonzero(_valid(place))
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
-        return "<p class='note'>No texel of these maps is valid.</p>"
+        yield page.note("No texel of these maps is valid.")
+        return
     box = points.min(axis=0), points.max(axis=0)
     view = FrontView.of(points, box)
     true_view, known = None, np.zeros(0, np.intp)
@@ -57,16 +58,16 @@ def section(
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
         true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
-    best = next((key for key in FIRST[1:] if key in appearance.maps), "")
+    best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
     large = {"r_d", best}
     shown_truths: set[str] = set()
-    minor = ""
+    minor = []
     for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
         good = _valid(skin_map)[rows, columns]
-        width = WIDTH_PX if key in large else SMALL_PX
+        width = WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
         known_truth = truth is not None and true_name in truth.maps
@@ -80,28 +81,29 @@ def section(
         if truth is not None and known_truth:
             figures.append(_error(key, appearance, truth, pairs, box, width=width))
         if skin_map.stderr is not None:
-            figures.append(_spread(key, skin_map, rows, columns, view, good, width=width))
-        if key in FIRST:
-            size = "maps" if key in large else "maps small"
-            body += (
-                f"<h3>{page.escape(heading(key))}</h3><div class='{size}'>{''.join(figures)}</div>"
-            )
+            stderr = skin_map.stderr[rows, columns]
+            figures.append(_spread(key, skin_map.unit, values, stderr, view, good, width=width))
+        if key in FIRST_MAPS:
+            yield page.Heading(heading(key))
+            yield page.Images(figures, small=key not in large)
         else:
-            minor += "".join(figures)
+            minor += figures
     if minor:
-        body += f"<h3>Lobes, samples and residuals</h3><div class='maps small'>{minor}</div>"
+        yield page.Heading("Lobes, samples and residuals")
+        yield page.Images(minor, small=True)
     if truth is not None:
-        body += _errors(name, appearance, truth, checks)
-        body += _reflection(name, appearance, truth, checks)
-    return body
+        yield from _errors(name, appearance, truth, checks)
+        yield from _reflection(name, appearance, truth, checks)
 
 
 def _rank(key: str) -> tuple[int, str]:
     """Order maps: what people look for first, then by name."""
-    return (FIRST.index(key) if key in FIRST else len(FIRST), key)
+    return (FIRST_MAPS.index(key) if key in FIRST_MAPS else len(FIRST_MAPS), key)
 
 
-def _shown(title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int) -> str:
+def _shown(
+    title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int
+) -> page.Image:
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
@@ -111,13 +113,13 @@ def _shown(title: str, key: str, image: Float64Array, valid: BoolArray, *, width
     if "normals" in key:
         return map_pictures.normal_picture(title, image, valid=valid, of=key, width=width)
     return map_pictures.color_picture(
-        title, np.where(valid[..., None], image, GRAY**2.2), of=f"{key}, linear sRGB"
+        title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
     )
 
 
 def _title(title: str, key: str) -> str:
     """Return what stands below a picture: of maps that share a heading, which one it is."""
-    return title if key in FIRST else f"{words(key)}, {title}"
+    return title if key in FIRST_MAPS else f"{words(key)}, {title}"
 
 
 def _error(
@@ -128,7 +130,7 @@ def _error(
     box: tuple[FloatArray, FloatArray],
     *,
     width: int,
-) -> str:
+) -> page.Image:
     error = evaluation.errors_at(key, appearance, truth, pairs)
     points = appearance.maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
@@ -161,20 +163,17 @@ def _error(
 
 def _spread(
     key: str,
-    skin_map: SkinMap,
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
+    unit: str,
+    values: FloatArray,
+    stderr: FloatArray,
     view: FrontView,
     good: BoolArray,
     *,
     width: int,
-) -> str:
-    if skin_map.stderr is None:
-        return ""
-    stderr = skin_map.stderr[rows, columns].astype(np.float64)
-    unit = page.short_unit(skin_map.unit)
-    if key in RELATIVE:  # as errors are told, beside which it stands
-        size = np.abs(skin_map.values[rows, columns].astype(np.float64))
+) -> page.Image:
+    stderr, unit = stderr.astype(np.float64), page.short_unit(unit)
+    if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
+        size = np.abs(values.astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
         stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
     if stderr.ndim == 2:
@@ -198,7 +197,7 @@ def _spread(
 
 def _errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     found = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     banded = errors_by_band(appearance, truth)
     registration = appearance.parameters.get("registration")
@@ -225,55 +224,50 @@ def _errors(
                 worst_got=worst_got,
             )
         )
-    note = ""
+    yield page.Heading("Errors on the surface")
     if coarse:
-        note = (
-            f"<p class='note'>A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
+        yield page.note(
+            f"A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
             f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
             f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
-            "</p>"
         )
-    return (
-        "<h3>Errors on the surface</h3>"
-        + note
-        + page.table(
+    yield page.table(
+        (
+            "map",
+            "unit",
+            "points",
+            "masked, %",
+            "mean |error|",
+            "median",
+            "68 % interval",
+            "95th percentile",
+            "bias",
+            "68 % coverage, %",
+            "median standard error",
+        ),
+        [
             (
-                "map",
-                "unit",
-                "points",
-                "masked, %",
-                "mean |error|",
-                "median",
-                "68 % interval",
-                "95th percentile",
-                "bias",
-                "68 % coverage, %",
-                "median standard error",
-            ),
-            [
-                (
-                    words(row.name),
-                    unit_sign(row.unit),
-                    row.points,
-                    100 * row.masked,
-                    row.mean,
-                    row.median,
-                    f"{row.interval[0]:.3g} – {row.interval[1]:.3g}",
-                    row.high,
-                    row.bias,
-                    100 * row.coverage.share,
-                    row.median_stderr,
-                )
-                for row in found
-            ],
-            caption="Texel by texel against the nearest true point; angles in degrees",
-        )
-        + page.table(
-            ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
-            [(words(row[0]), *row[1:]) for row in banded],
-            caption="By skin color: the individual typology angle of the true reflectance "
-            "(Chardon et al. 1991)",
-        )
+                words(row.name),
+                unit_sign(row.unit),
+                row.points,
+                100 * row.masked,
+                row.mean,
+                row.median,
+                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}",
+                row.high,
+                row.bias,
+                100 * row.coverage.share,
+                row.median_stderr,
+            )
+            for row in found
+        ],
+        caption="Texel by texel against the nearest true point; angles in degrees",
+    )
+    yield page.table(
+        ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
+        [(words(row[0]), *row[1:]) for row in banded],
+        caption="By skin color: the individual typology angle of the true reflectance "
+        "(Chardon et al. 1991)",
     )
 
 
@@ -288,11 +282,11 @@ def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
 
 def _reflection(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> str:
+) -> Iterator[page.Block]:
     """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
     held_out = reflection.compare(appearance, truth, rng=np.random.default_rng(0))
     if held_out is None:
-        return ""
+        return
     checks.append(
         page.Check(
             f"{name}: reflection in held-out directions, median error",
@@ -304,7 +298,8 @@ def _reflection(
         )
     )
     low, high = held_out.interval
-    body = "<h3>Reflection in directions that no light of the capture had</h3>" + page.table(
+    yield page.Heading("Reflection in directions that no light of the capture had")
+    yield page.table(
         ("points", "directions", "median error, %", "68 % interval", "in highlights, %"),
         [
             (
@@ -324,8 +319,8 @@ def _reflection(
         if image is not None:
             figures.append(map_pictures.color_picture(f"{site}: estimate", image / bright))
     if figures:
-        body += f"<h3>Reflection on spheres</h3><div class='maps'>{''.join(figures)}</div>"
-    return body
+        yield page.Heading("Reflection on spheres")
+        yield page.Images(figures)
 
 
 def _valid(skin_map: SkinMap) -> BoolArray:

@@ -26,12 +26,12 @@ from skinrig.viewer.assets.reflectance import filled
 from skinrig.viewer.assets.traits import told_from_chance
 from skinrig.viewer.scene import SceneSource, Texture
 
-SIZE: Final = 128
+MAX_FACTOR_PX: Final = 128
 """Most texels a side of a factor's map; the common map that edits are made on has no more detail
 over a face than this."""
-ENDS: Final = (-1, 1)
-HALF: Final = 0.5
-ITERATIONS: Final = 1
+END_AMOUNTS: Final = (-1, 1)
+CHECKED_AMOUNT: Final = 0.5
+MATCHING_ITERATIONS: Final = 1
 """Of matching. `skinrig edit` makes five: one is off those by 0.2 % of R_d for an edit by 24 %
 (tan, the demo's dome), and takes a third of the time."""
 
@@ -72,7 +72,7 @@ class AlbedoTraits:
     def facts(self) -> dict[str, Any]:
         """Return what the page says of them."""
         return {
-            "layers": [{"name": name, "end": end} for name in self.names for end in ENDS],
+            "layers": [{"name": name, "end": end} for name in self.names for end in END_AMOUNTS],
             "traits": {
                 name: {"change": self.change[name], "between_error": self.between_error[name]}
                 for name in self.names
@@ -112,24 +112,24 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
             {name: amount},
             region=region > 0.0,
             share=region,
-            iterations=ITERATIONS,
+            iterations=MATCHING_ITERATIONS,
             rng=np.random.default_rng([0, names.index(name)]),
         )
         return np.log(found.factor).astype(np.float32)
 
     layers, change, between = [], {}, {}
     for name in names:
-        less, more = (log_factor(name, float(end)) for end in ENDS)
-        half = np.exp(log_factor(name, HALF))
+        less, more = (log_factor(name, float(end)) for end in END_AMOUNTS)
+        half = np.exp(log_factor(name, CHECKED_AMOUNT))
         layers += [_coarse(less, valid), _coarse(more, valid)]
         change[name] = _rms(np.exp(more[valid]) - 1.0)
-        shown = _refined(np.exp(HALF * layers[-1]), valid.shape)
+        shown = _refined(np.exp(CHECKED_AMOUNT * layers[-1]), valid.shape)
         between[name] = _rms((shown - half)[valid])
     return AlbedoTraits(names, np.stack(layers), change, between)
 
 
 def _coarse(values: Float32Array, valid: BoolArray) -> Float32Array:
-    return filled(values, valid, SIZE)
+    return filled(values, valid, MAX_FACTOR_PX)
 
 
 def _refined(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from skinrig.viewer.scene import SceneSource
 
 
-COLOR: Final = "color"
-HASHED: Final = "calibration "
+COLOR_KIND: Final = "color"
+CALIBRATION_INPUT_PREFIX: Final = "calibration "
 """Inputs of an appearance that are files of a calibration begin like this."""
-TABLE: Final = 24
+TABLE_NODES: Final = 24
 """Nodes a side of the table of skin colors that a matrix is fitted to."""
 
 
@@ -72,12 +72,12 @@ def of(source: SceneSource) -> CameraColor:
 def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
     """Return the calibration that an appearance was made with, if it lies beside and has color."""
     digests = {
-        name.removeprefix(HASHED): digest
+        name.removeprefix(CALIBRATION_INPUT_PREFIX): digest
         for name, digest in appearance.inputs.items()
-        if name.startswith(HASHED)
+        if name.startswith(CALIBRATION_INPUT_PREFIX)
     }
     for folder in sorted(path.resolve().parent.iterdir()):
-        if not (folder / f"{COLOR}.json").is_file():
+        if not (folder / f"{COLOR_KIND}.json").is_file():
             continue
         for kind, digest in digests.items():
             file = folder / f"{kind}.json"
@@ -90,7 +90,7 @@ def _calibrated(folder: Path) -> CameraColor:
     from capture.calibration import store
     from capture.calibration.color import matrix as color
 
-    found = store.load(folder, COLOR)
+    found = store.load(folder, COLOR_KIND)
     cameras = [
         (color.from_calibration(found, serial), found.quantity(serial, "white_rgb").value)
         for serial in found.serials
@@ -105,7 +105,7 @@ def _calibrated(folder: Path) -> CameraColor:
 
     several = f" of {len(cameras)} cameras" if len(cameras) > 1 else ""
     return CameraColor(
-        convert, f"{folder.name}/{COLOR}.json{several}, {error:.1f} dE2000 on held-out patches"
+        convert, f"{folder.name}/{COLOR_KIND}.json{several}, {error:.1f} dE2000 on held-out patches"
     )
 
 
@@ -127,7 +127,7 @@ def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:
     if camera not in spectra.camera_names() or light not in spectra.illuminant_names():
         return None
     measured, shown = (
-        color_table.build(*pair, size=TABLE, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
+        color_table.build(*pair, size=TABLE_NODES, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
         for pair in ((camera, light), (spectra.LINEAR_SRGB, "D65"))
     )
     matrix = np.linalg.lstsq(measured, shown, rcond=None)[0]

@@ -26,15 +26,15 @@ from skinrig.arrays import Float32Array, Float64Array
 
 Form = Literal["table", "factors", "log factors"]
 
-SLABS: Final = (1, 2, 3, 4, 6, 12)
-RANKS: Final = (1, 2, 3, 4, 6, 8)
-STRONG: Final = 0.01
+TRIED_SLABS: Final = (1, 2, 3, 4, 6, 12)
+TRIED_RANKS: Final = (1, 2, 3, 4, 6, 8)
+MIN_STRONG_FRACTION: Final = 0.01
 """Values above this share of a lobe's peak count for the error of single values."""
-GOOD_ENOUGH: Final = 0.01
+MAX_FORM_ERROR: Final = 0.01
 """Bound on both errors of a form that is chosen, relative."""
-LANES: Final = 4
+LOBES_PER_LOOKUP: Final = 4
 """Lobes that one look-up reads."""
-_LEAST: Final = 1e-6  # 1/sr, below which a logarithm is of no use
+_MIN_LOG_VALUE: Final = 1e-6  # 1/sr, below which a logarithm is of no use
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,8 +56,8 @@ class CompactBrdf:
         RMS difference over that of the lobe, nodes counting by solid angle and both cosines; of
         the worst lobe.
     strong_error : float
-        95th percentile of the relative difference where a lobe exceeds `STRONG` of its peak; of
-        the worst lobe.
+        95th percentile of the relative difference where a lobe exceeds `MIN_STRONG_FRACTION` of
+        its peak; of the worst lobe.
     """
 
     form: Form
@@ -90,32 +90,32 @@ def measured(lobes: BrdfBasis) -> tuple[CompactBrdf, ...]:
     """
     table = lobes.table[..., : lobes.size].astype(np.float64)
     weight = _solid_weight()
-    groups = -(-lobes.size // LANES)
+    groups = -(-lobes.size // LOBES_PER_LOOKUP)
     found = []
-    for slabs in SLABS:
-        numbers = slabs * NODES_D * NODES_H * groups * LANES
+    for slabs in TRIED_SLABS:
+        numbers = slabs * NODES_D * NODES_H * groups * LOBES_PER_LOOKUP
         found.append(_judged("table", slabs, in_slabs(table, slabs), numbers, groups, table))
     for form in ("factors", "log factors"):
-        for rank in RANKS:
+        for rank in TRIED_RANKS:
             back = np.stack(
                 [_separated(one, weight, rank, form) for one in np.moveaxis(table, -1, 0)], -1
             )
             numbers = lobes.size * rank * (NODES_D * NODES_PHI + NODES_H)
-            lookups = 2 * lobes.size * -(-rank // LANES)
+            lookups = 2 * lobes.size * -(-rank // LOBES_PER_LOOKUP)
             found.append(_judged(form, rank, back, numbers, lookups, table))
     return tuple(sorted(found, key=lambda one: one.numbers))
 
 
-def chosen(lobes: BrdfBasis, bound: float = GOOD_ENOUGH) -> CompactBrdf:
+def chosen(lobes: BrdfBasis, bound: float = MAX_FORM_ERROR) -> CompactBrdf:
     """Return the table with the fewest slabs whose errors are within a bound.
 
     `measured` shows that factors of that error need more look-ups, and no fewer numbers where the
     bound is tight; the finest table is off by its 16 bits only, so that one always fits.
     """
     table = lobes.table[..., : lobes.size].astype(np.float64)
-    groups = -(-lobes.size // LANES)
-    for slabs in SLABS:
-        numbers = slabs * NODES_D * NODES_H * groups * LANES
+    groups = -(-lobes.size // LOBES_PER_LOOKUP)
+    for slabs in TRIED_SLABS:
+        numbers = slabs * NODES_D * NODES_H * groups * LOBES_PER_LOOKUP
         found = _judged("table", slabs, in_slabs(table, slabs), numbers, groups, table)
         if max(found.rms_error, found.strong_error) <= bound:
             return found
@@ -124,8 +124,8 @@ def chosen(lobes: BrdfBasis, bound: float = GOOD_ENOUGH) -> CompactBrdf:
 
 def in_slabs(table: Float64Array, slabs: int) -> Float64Array:
     """Return (32, 12, 90, K) with runs of phi_d nodes at their mean over the visible half-space."""
-    if slabs not in SLABS:
-        raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, SLABS))}")
+    if slabs not in TRIED_SLABS:
+        raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, TRIED_SLABS))}")
     weight = _cosines()[..., None] + 1e-9
     width = NODES_PHI // slabs
     parts = table.reshape(NODES_D, slabs, width, NODES_H, -1)
@@ -144,11 +144,13 @@ def atlas(found: CompactBrdf) -> Float32Array:
     if found.form != "table":
         raise ValueError(f"form: got {found.form!r}, expected 'table'")
     size = found.table.shape[-1]
-    groups = -(-size // LANES)
-    padded = np.zeros((NODES_D, found.detail, NODES_H, groups * LANES), np.float32)
+    groups = -(-size // LOBES_PER_LOOKUP)
+    padded = np.zeros((NODES_D, found.detail, NODES_H, groups * LOBES_PER_LOOKUP), np.float32)
     padded[..., :size] = found.table[:, :: NODES_PHI // found.detail]
-    split = padded.reshape(NODES_D, found.detail, NODES_H, groups, LANES)
-    return np.ascontiguousarray(split.transpose(3, 1, 0, 2, 4)).reshape(-1, NODES_H, LANES)
+    split = padded.reshape(NODES_D, found.detail, NODES_H, groups, LOBES_PER_LOOKUP)
+    return np.ascontiguousarray(split.transpose(3, 1, 0, 2, 4)).reshape(
+        -1, NODES_H, LOBES_PER_LOOKUP
+    )
 
 
 def _judged(
@@ -162,7 +164,7 @@ def _judged(
     worst = 0.0
     for k in range(table.shape[-1]):
         one = table[..., k]
-        strong = (one > STRONG * one.max()) & (_cosines() > 0.0)
+        strong = (one > MIN_STRONG_FRACTION * one.max()) & (_cosines() > 0.0)
         if strong.any():
             relative = np.abs(back[..., k] - one)[strong] / one[strong]
             worst = max(worst, float(np.percentile(relative, 95.0)))
@@ -173,7 +175,9 @@ def _separated(one: Float64Array, weight: Float64Array, rank: int, form: str) ->
     """Return (32, 12, 90) of a lobe's first products."""
     shape = (NODES_D * NODES_PHI, NODES_H)
     if form == "log factors":
-        u, s, v = np.linalg.svd(np.log(np.maximum(one, _LEAST)).reshape(shape), full_matrices=False)
+        u, s, v = np.linalg.svd(
+            np.log(np.maximum(one, _MIN_LOG_VALUE)).reshape(shape), full_matrices=False
+        )
         return np.asarray(np.exp((u[:, :rank] * s[:rank]) @ v[:rank]).reshape(one.shape))
     # products stay products when rows and columns are weighted, each by its own
     rows = np.sqrt(weight.reshape(shape).mean(axis=1, keepdims=True)) + 1e-6

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from skinrig.arrays import Float64Array
 
-RIG_SIZE: Final = 256
+RIG_PX: Final = 256
 """Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
 
 

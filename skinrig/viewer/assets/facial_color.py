@@ -15,7 +15,7 @@ from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.viewer.assets import camera_color
 from skinrig.viewer.assets.camera_color import CameraColor
-from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor
+from skinrig.viewer.assets.face_color import RIG_PX, FaceColor
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from rigsim.subject import Subject
 
 
-TABLE_SIZE: Final = 128
+TABLE_NODES: Final = 128
 """Nodes along each axis of the color table."""
-RADIUS_OF_SIZE: Final = 24.0 / 512.0
+RADIUS_PER_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
-FINE: Final = 8
+FINEST_STEP_WORDS: Final = 8
 """Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
-ALBEDO: Final = "r_d"
+ALBEDO_MAP: Final = "r_d"
 
 
 def assets(source: SceneSource) -> Assets:
@@ -38,7 +38,7 @@ def assets(source: SceneSource) -> Assets:
     albedo = _albedo(source)
     found = _face(source, measured=albedo is not None)
     table = color_table.build(
-        spectra.LINEAR_SRGB, "D65", size=TABLE_SIZE, anisotropy=ANISOTROPY_SKIN
+        spectra.LINEAR_SRGB, "D65", size=TABLE_NODES, anisotropy=ANISOTROPY_SKIN
     )
     roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
     textures = {
@@ -47,7 +47,7 @@ def assets(source: SceneSource) -> Assets:
     }
     names = list(found.states)
     facts: dict[str, Any] = {
-        "color_table": {"c_m_max": C_M_MAX, "c_hd_max": C_HD_MAX, "size": TABLE_SIZE},
+        "color_table": {"c_m_max": C_M_MAX, "c_hd_max": C_HD_MAX, "size": TABLE_NODES},
         "facial_color": {
             "states": names,
             "gains": {n: g for n, g in GLOBAL_GAINS.items() if n in names},
@@ -79,7 +79,7 @@ def assets(source: SceneSource) -> Assets:
 
 def _fine(size: int) -> int:
     """Return how coarsely the finest octave is kept: texels below 0.2 mm hold noise."""
-    return FINE if size >= 2048 else 1
+    return FINEST_STEP_WORDS if size >= 2048 else 1
 
 
 def _face(source: SceneSource, *, measured: bool) -> FaceColor:
@@ -104,9 +104,9 @@ def simulated(person: Subject, skin: FineSkin) -> FaceColor:
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),
         {name: person.hemoglobin(name) for name in STATES if name != NEUTRAL},
-        radius_px=RADIUS_OF_SIZE * person.size,
+        radius_px=RADIUS_PER_SIZE * person.size,
         valid=person.atlas.covered,
-        stored_size=min(RIG_SIZE, person.size),
+        stored_size=min(RIG_PX, person.size),
     )
     return FaceColor(
         melanin=skin.melanin(),
@@ -131,9 +131,9 @@ def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
     """Return the measured albedo, (N, N, 3), of the dome's or a fitted model's folder."""
     for kind in ("model", "dome"):
         appearance = source.appearances.get(kind)
-        if appearance is None or ALBEDO not in appearance.maps:
+        if appearance is None or ALBEDO_MAP not in appearance.maps:
             continue
-        found = appearance.maps[ALBEDO]
+        found = appearance.maps[ALBEDO_MAP]
         valid: BoolArray = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
         if found.valid is not None:
             valid = valid & found.valid

@@ -23,10 +23,10 @@ from scipy.special import erf
 from model import dipole, fresnel
 from skinrig.arrays import Float64Array
 
-COUNT: Final = 4
+GAUSSIANS: Final = 4
 """Spread an edge of light within 0.1 % (three: 0.4 %; six: 0.01 %) and are two passes each."""
-_NODES: Final = 240
-_FAR: Final = 12.0  # radii reach so many times 1/sigma_tr, where e^-12 is left
+_RADIUS_NODES: Final = 240
+_MAX_RELATIVE_RADIUS: Final = 12.0  # radii reach so many times 1/sigma_tr, where e^-12 is left
 
 
 class ProfileError(ValueError):
@@ -68,7 +68,11 @@ class GaussianProfile:
 
 
 def fit(
-    r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, *, eta: float = fresnel.ETA_SKIN, count: int = COUNT
+    r_d: ArrayLike,
+    sigma_tr_per_mm: ArrayLike,
+    *,
+    eta: float = fresnel.ETA_SKIN,
+    count: int = GAUSSIANS,
 ) -> GaussianProfile:
     """Fit Gaussians to the dipoles of three channels.
 
@@ -142,7 +146,9 @@ def _dipoles(
 ) -> tuple[Float64Array, Float64Array]:
     """Return radii, mm, and the normalized profiles at them, (n, 3), 1/mm^2."""
     sigma_a, sigma_s = dipole.coefficients(dipole.invert_to_deficit(albedo, eta), transport)
-    radii = np.geomspace(1e-4 / transport.max(), _FAR / transport.min(), _NODES)
+    radii = np.geomspace(
+        1e-4 / transport.max(), _MAX_RELATIVE_RADIUS / transport.min(), _RADIUS_NODES
+    )
     values = dipole.reflectance(radii[:, None], sigma_a, sigma_s, eta)
     return radii, values / albedo
 

@@ -12,7 +12,7 @@ from model.facial_color.state_maps import NEUTRAL
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import placing
-from skinrig.viewer.assets.face_color import RIG_SIZE, FaceColor
+from skinrig.viewer.assets.face_color import RIG_PX, FaceColor
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rigsim.subject import Subject
     from skinrig.viewer.scene import SceneSource
 
-MELANIN = "melanin"
+MELANIN_MAP = "melanin"
 
 
 def placed(source: SceneSource, subject: Subject) -> FaceColor:
@@ -64,15 +64,15 @@ def placed(source: SceneSource, subject: Subject) -> FaceColor:
             "skin did not face the camera; it continues what is beside it",
         )
     ]
-    if MELANIN in appearance.maps:
-        found = appearance.maps[MELANIN]
+    if MELANIN_MAP in appearance.maps:
+        found = appearance.maps[MELANIN_MAP]
         valid = rig.valid if found.valid is None else found.valid
         melanin, melanin_known = where.sampled(found.values, valid)
         melanin = filled(melanin, melanin_known)
     else:
         left_out.append(("melanin of this face", "no map of it is in the folder; simulated"))
         melanin = FineSkin(subject, size).melanin()
-    cells = fitting((size, size), RIG_SIZE)
+    cells = fitting((size, size), RIG_PX)
     states: dict[str, Float64Array] = {}
     for name in (NEUTRAL, *rig.states):
         held = rig.neutral_mean_valid if name == NEUTRAL else rig.states[name].valid

@@ -20,11 +20,11 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray
 Points2 = Mapping[str, tuple[float, float]]
 Points3 = Mapping[str, tuple[float, float, float]]
 
-FEWEST: Final = 7
+MIN_LANDMARKS: Final = 7
 """Landmarks; a projective camera has 11 unknowns, and each landmark tells two."""
-LEAST_COSINE: Final = 0.3
+MIN_VIEW_COSINE: Final = 0.3
 """Between surface and view: texels more aslant are not taken from the picture."""
-STDERR_PX: Final = 1.0
+LANDMARK_STDERR_PX: Final = 1.0
 """Of a landmark along each axis."""
 
 
@@ -93,19 +93,19 @@ def place(
     Raises
     ------
     PlacingError
-        Fewer than `FEWEST` names in both, or points that lie too flat or on a line.
+        Fewer than `MIN_LANDMARKS` names in both, or points that lie too flat or on a line.
     """
     names = sorted(set(landmarks_mm) & set(landmarks_px))
-    if len(names) < FEWEST:
+    if len(names) < MIN_LANDMARKS:
         raise PlacingError(
             f"landmarks: {len(names)} names are in both the picture's table and the mesh, "
-            f"expected at least {FEWEST}; the mesh has {', '.join(sorted(landmarks_mm))}"
+            f"expected at least {MIN_LANDMARKS}; the mesh has {', '.join(sorted(landmarks_mm))}"
         )
     solid = np.array([landmarks_mm[name] for name in names], np.float64)
     flat = np.array([landmarks_px[name] for name in names], np.float64)
     camera = _camera(solid, flat)
     try:
-        field = landmark_field.fit(_project(camera, solid), flat, stderr_px=STDERR_PX)
+        field = landmark_field.fit(_project(camera, solid), flat, stderr_px=LANDMARK_STDERR_PX)
     except landmark_field.LandmarkFieldError as error:
         raise PlacingError(f"landmarks: {error}") from error
     pixel = np.zeros((*covered.shape, 2))
@@ -123,7 +123,7 @@ def place(
     facing = np.sum(way * normal, axis=-1)
     return Placement(
         pixel,
-        covered & (facing > LEAST_COSINE),
+        covered & (facing > MIN_VIEW_COSINE),
         float(np.median(field.leave_one_out_px)),
         len(names),
     )

@@ -22,19 +22,19 @@ from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.viewer.assets import compact_brdf, gaussian_profiles
-from skinrig.viewer.assets.compact_brdf import LANES, CompactBrdf
+from skinrig.viewer.assets.compact_brdf import LOBES_PER_LOOKUP, CompactBrdf
 from skinrig.viewer.assets.gaussian_profiles import GaussianProfile
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
-SHARES_SIZE: Final = 256
+SHARES_PX: Final = 256
 """Most texels a side of the maps of shares; finer ones are averaged."""
 SHARE_BITS: Final = 7
 """Binary digits of a share in the page: within 0.8 %, a sixth of a fit's own errors."""
-TRANSLUCENCY_SIZE: Final = 128
+TRANSLUCENCY_PX: Final = 128
 """Texels a side of the map of widths: a probe measures few places, between them it is smooth."""
-FITTED: Final = ("model", "dome")
+FITTED_KINDS: Final = ("model", "dome")
 """Folders that hold lobes, the better one first."""
-POPULATION: Final = "surface"
+POPULATION_SPACE: Final = "surface"
 """Space of the trait library whose centre is the mean surface of a population."""
 TYPICAL_CHROMOPHORES: Final = (0.03, 0.03)
 """Volume fractions of melanin and hemoglobin, whose color stands in for R_d where there is none:
@@ -93,15 +93,15 @@ def lobes_of(source: SceneSource) -> PageLobes:
     """Return the lobes of a face, or of the mean of a population."""
     from skinrig.editing import surface_mixtures
 
-    for kind in FITTED:
+    for kind in FITTED_KINDS:
         appearance = source.appearances.get(kind)
         if appearance is not None and skin_reflectance.BASIS_FILE in appearance.files:
             lobes = skin_reflectance.lobes_of(appearance)
             mixtures = surface_mixtures.read(appearance)
-            shares = filled(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_SIZE)
+            shares = filled(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
             shares = np.maximum(shares, np.float32(0.0))  # filling can undershoot
             return PageLobes(lobes, shares, mixtures.mix, mixtures.materials, "fitted")
-    space = trait_storage.default().spaces[POPULATION]
+    space = trait_storage.default().spaces[POPULATION_SPACE]
     materials = brdf_tables.default()
     if space.names and space.names != materials.names:
         raise RuntimeError("the packaged traits are of other materials than this package's")
@@ -119,10 +119,10 @@ def lobes_of(source: SceneSource) -> PageLobes:
 def layers_of(shares: Float32Array) -> Float32Array:
     """Return shares (H, W, K) as layers of four, (L, H, W, 4); what fills them up is 0."""
     height, width, count = shares.shape
-    groups = -(-count // LANES)
-    padded = np.zeros((height, width, groups * LANES), np.float32)
+    groups = -(-count // LOBES_PER_LOOKUP)
+    padded = np.zeros((height, width, groups * LOBES_PER_LOOKUP), np.float32)
     padded[..., :count] = shares
-    split = padded.reshape(height, width, groups, LANES)
+    split = padded.reshape(height, width, groups, LOBES_PER_LOOKUP)
     return np.ascontiguousarray(np.moveaxis(split, 2, 0))
 
 
@@ -174,7 +174,7 @@ def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | N
     told
         Where the translucency comes from, for people.
     """
-    for kind in FITTED:
+    for kind in FITTED_KINDS:
         appearance = source.appearances.get(kind)
         if appearance is None:
             continue
@@ -186,7 +186,7 @@ def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | N
                 logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
                 mean = logs[known].astype(np.float64).mean(axis=0)
                 off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
-                widths = np.exp(filled(off, known, TRANSLUCENCY_SIZE)[..., 0])
+                widths = np.exp(filled(off, known, TRANSLUCENCY_PX)[..., 0])
                 even = float(np.ptp(widths)) < 1e-3
                 profile = gaussian_profiles.fit(r_d, np.exp(-mean))
                 return profile, None if even else widths, _told(appearance)

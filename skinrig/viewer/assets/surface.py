@@ -10,9 +10,9 @@ from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
-MAPS_SIZE: Final = 256
+MAPS_PX: Final = 256
 """Most texels a side of roughness and intensity, which vary by region."""
-FINE: Final = 20
+FINEST_STEP_WORDS: Final = 20
 """Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 5 um at most."""
 
 
@@ -24,9 +24,9 @@ def assets(source: SceneSource) -> Assets:
     covered = subject.atlas.covered
     height = (source.skin or FineSkin(subject, subject.size)).height_um()[..., None]
     # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
-    roughness = halved(filled(subject.roughness, covered), MAPS_SIZE)
+    roughness = halved(filled(subject.roughness, covered), MAPS_PX)
     # hair hides the skin's gloss, as the subject's own renderings have it
-    intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_SIZE)
+    intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
     left_out: tuple[tuple[str, str], ...] = ()
     if source.kind in ("dynamic", "dome", "model"):
@@ -39,7 +39,10 @@ def assets(source: SceneSource) -> Assets:
     return {
         "textures": {
             "relief_height": Texture(
-                height.astype(np.float32), "u8", "mipmap", fine=FINE if len(height) >= 2048 else 1
+                height.astype(np.float32),
+                "u8",
+                "mipmap",
+                fine=FINEST_STEP_WORDS if len(height) >= 2048 else 1,
             ),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
         },

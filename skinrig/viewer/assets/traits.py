@@ -24,18 +24,18 @@ from model.traits import TraitSpace, lobe_edits, reduced_spaces
 from model.traits import storage as trait_storage
 from model.traits.vectors import DOUBTFUL_P, TraitVector
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.viewer.assets.compact_brdf import LANES
+from skinrig.viewer.assets.compact_brdf import LOBES_PER_LOOKUP
 from skinrig.viewer.assets.reflectance import PageLobes
 
-SWEEPS: Final = 96
+DESCENT_SWEEPS: Final = 96
 """Of coordinate descent: after as many, errors stay within a few percent of a trait."""
-MOST_ADDED: Final = 4
+MAX_ADDED_LOBES: Final = 4
 """Lobes that traits may bring: one more look-up for all of them."""
-TRIED: Final = 400
+SAMPLED_TEXELS: Final = 400
 """Texels on which lobes are chosen and errors measured."""
-AMOUNTS: Final = (-1.0, 1.0)
+SLIDER_ENDS: Final = (-1.0, 1.0)
 """Ends of a slider."""
-OPPOSITE: Final = {"caucasian": "asian", "male": "female"}
+OPPOSITE_TRAITS: Final = {"caucasian": "asian", "male": "female"}
 """Traits that are others the other way round."""
 
 
@@ -70,7 +70,7 @@ class LobeTraits:
     def projected(self, shares: Float64Array, amounts: Mapping[str, float]) -> Float32Array:
         """Return the shares under some traits as the page computes them.
 
-        Least squares over shares of at least 0 by `SWEEPS` sweeps of coordinate descent, in
+        Least squares over shares of at least 0 by `DESCENT_SWEEPS` sweeps of coordinate descent, in
         float32: the shares nearest to what is asked, from those given.
 
         Parameters
@@ -88,7 +88,7 @@ class LobeTraits:
             return np.asarray(shares, np.float32)
         wanted = given @ self.gram + asked
         found = given.copy()
-        for _ in range(SWEEPS):
+        for _ in range(DESCENT_SWEEPS):
             for k in range(len(self.scale)):
                 step = wanted[:, k] - found @ self.gram[:, k]
                 found[:, k] = np.maximum(found[:, k] + step, np.float32(0.0))
@@ -104,7 +104,7 @@ def told_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
     return tuple(
         name
         for name, trait in traits.items()
-        if trait.confidence.p_value <= DOUBTFUL_P and OPPOSITE.get(name) not in traits
+        if trait.confidence.p_value <= DOUBTFUL_P and OPPOSITE_TRAITS.get(name) not in traits
     )
 
 
@@ -125,7 +125,7 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
     names = told_from_chance(traits.traits)
     rows = _some(found.shares)
     mix = np.asarray(found.mix, np.float64)
-    most = -(-len(mix) // LANES) * LANES + MOST_ADDED
+    most = -(-len(mix) // LOBES_PER_LOOKUP) * LOBES_PER_LOOKUP + MAX_ADDED_LOBES
     for name in sorted(names, key=lambda one: -_length(traits, one)):
         widened = lobe_edits.edit_weights(_padded(rows, len(mix)), mix, traits, {name: 1.0})
         if len(widened.mix) <= most:
@@ -163,7 +163,7 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
 def surface_facts(traits: LobeTraits) -> dict[str, Any]:
     """Return what the page needs to know of surface traits; lobes and shares go with the lobes'."""
     return {
-        "sweeps": SWEEPS,
+        "sweeps": DESCENT_SWEEPS,
         "gram": [float(x) for x in traits.gram.reshape(-1)],
         "scale": [float(x) for x in traits.scale],
         "traits": {
@@ -178,12 +178,12 @@ def surface_facts(traits: LobeTraits) -> dict[str, Any]:
 
 
 def _some(shares: Float32Array) -> Float64Array:
-    """Return at most `TRIED` texels with any share, evenly taken, (n, K)."""
+    """Return at most `SAMPLED_TEXELS` texels with any share, evenly taken, (n, K)."""
     rows = shares.reshape(-1, shares.shape[-1]).astype(np.float64)
     rows = rows[rows.sum(axis=1) > 0.0]
     if not len(rows):
         return np.ones((1, shares.shape[-1]))
-    return rows[:: -(-len(rows) // TRIED)]
+    return rows[:: -(-len(rows) // SAMPLED_TEXELS)]
 
 
 def _padded(rows: Float64Array, count: int) -> Float64Array:

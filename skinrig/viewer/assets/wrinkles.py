@@ -28,9 +28,9 @@ MAP_PX: Final = 512
 MASK_PX: Final = 64
 WEIGHTS_PX: Final = 128
 """Side of the normals that the zones' weights are found on."""
-ZONES: Final = 8
+ZONES_PER_LAYER: Final = 8
 """Of each wrinkle map, in two RGBA textures."""
-MOST_LAYERS: Final = 4
+MAX_LAYERS: Final = 4
 """Wrinkle maps that the shader has room for."""
 
 
@@ -80,7 +80,7 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     few = min(MASK_PX, size)
     zones = fit_zones(
         amplitudes(neutral, posed, size=(few, few)),
-        zones=ZONES,
+        zones=ZONES_PER_LAYER,
         rng=np.random.default_rng(subject.seed),
     )
     # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
@@ -111,9 +111,9 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
     WrinkleAssetError
         For more maps than the shader has room for.
     """
-    if len(model.layers) > MOST_LAYERS:
+    if len(model.layers) > MAX_LAYERS:
         raise WrinkleAssetError(
-            f"layers: got {len(model.layers)} wrinkle maps, expected at most {MOST_LAYERS}"
+            f"layers: got {len(model.layers)} wrinkle maps, expected at most {MAX_LAYERS}"
         )
     tables = [as_table(layer.table) for layer in model.layers]
     driven = sorted({name for table in tables for name in table.rows} & set(source.mesh.shapes))
@@ -178,7 +178,7 @@ def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float
         count = max(int(np.count_nonzero((wrinkle != 0).any(axis=2))), 1)
         masks = resampled(np.asarray(layer.masks, np.float64), shape)
         rows = [_level_rms(mask[..., None] * wrinkle, count) for mask in masks]
-        found += rows + [[0.0] * len(rows[0])] * (ZONES - len(rows))
+        found += rows + [[0.0] * len(rows[0])] * (ZONES_PER_LAYER - len(rows))
     return found
 
 
@@ -209,9 +209,9 @@ def _masks(layers: tuple[Layer, ...]) -> Float32Array:
     side = max(max(layer.masks.shape[1:]) for layer in layers)
     out = []
     for layer in layers:
-        if len(layer.masks) > ZONES:
+        if len(layer.masks) > ZONES_PER_LAYER:
             raise WrinkleAssetError(
-                f"masks: got {len(layer.masks)} zones, expected at most {ZONES}"
+                f"masks: got {len(layer.masks)} zones, expected at most {ZONES_PER_LAYER}"
             )
         planes = resampled(np.asarray(layer.masks, np.float32), (side, side))
         pair = mask_textures(planes)

@@ -23,13 +23,13 @@ from scipy.sparse.linalg import splu
 
 from skinrig.arrays import Float64Array, FloatArray, Int64Array
 
-LARGEST_MM: Final = 200.0
+MAX_LOOP_MM: Final = 200.0
 """Length of a loop that is closed, at most: an eye, a nostril, the underside of a chin."""
-PART_OF_RIM: Final = 0.5
+MAX_HOLE_RIM_RATIO: Final = 0.5
 """A loop of more than this part of the longest is another rim."""
-ROUNDS: Final = 3
+WEIGHT_ROUNDS: Final = 3
 """Of the energy's weights, which depend on the shape that it gives."""
-LEAST_WEIGHT: Final = 1e-3
+MIN_EDGE_WEIGHT: Final = 1e-3
 """Of an edge, in cotangents: less would let triangles turn over."""
 
 
@@ -81,7 +81,7 @@ def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[Patch]:
     Returns
     -------
     list of Patch
-        None for the longest loop, which is the rim of a scan, for loops above `LARGEST_MM`, and
+        None for the longest loop, which is the rim of a scan, for loops above `MAX_LOOP_MM`, and
         for those that meet themselves.
     """
     points = np.asarray(vertices_mm, np.float64)
@@ -91,7 +91,7 @@ def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[Patch]:
     found.sort(key=lambda one: -one[0])
     if not found:
         return []
-    most = min(LARGEST_MM, PART_OF_RIM * found[0][0])
+    most = min(MAX_LOOP_MM, MAX_HOLE_RIM_RATIO * found[0][0])
     neighbors = _neighbors(joined, len(points))
     return [_patch(points, neighbors, loop, size) for size, loop in found[1:] if size <= most]
 
@@ -148,7 +148,7 @@ def _patch(
         [(i, index[int(v)]) for i, v in zip(beside.row, beside.col, strict=True) if int(v) in index]
     ).reshape(-1, 2)
     whole = np.concatenate([flat, points[outer]])
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         whole[n : n + m] = _smoothed(whole, faces, around, n, m)
     return Patch(loop, disc, faces, whole[n : n + m].copy(), length)
 
@@ -199,7 +199,7 @@ def _smoothed(
         one, two = b - a, c - a
         sine = np.linalg.norm(np.cross(one, two), axis=1)
         cotangent = 0.5 * (one * two).sum(axis=1) / np.maximum(sine, 1e-12)
-        weight = np.clip(cotangent, LEAST_WEIGHT, 10.0)
+        weight = np.clip(cotangent, MIN_EDGE_WEIGHT, 10.0)
         rows += [faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]]
         columns += [faces[:, (k + 2) % 3], faces[:, (k + 1) % 3]]
         values += [weight, weight]

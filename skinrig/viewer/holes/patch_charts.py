@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from rigsim.geometry.mesh import Mesh
 
 
-CELLS: Final = 512
+GRID_CELLS: Final = 512
 """Side of the grid on which empty places are sought."""
-MARGIN: Final = 4.0 / 256.0
+PATCH_MARGIN: Final = 4.0 / 256.0
 """Between a disc and anything else: four texels of a map of 256, so that filters stay clean."""
-LEAST_SCALE: Final = 0.25
+MIN_RELATIVE_SCALE: Final = 0.25
 """Of the scale of the texture around: coarser than this a patch finds no place."""
-MEASURED: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
+MEASURED_TEXTURES: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
 """Textures that are not drawn by the point of the surface."""
 
 
@@ -79,7 +79,7 @@ class ClosedMesh:
         if not self.charts:
             return scene
         textures: Mapping[str, Texture] = {
-            name: self.painted_texture(one) if name in MEASURED else one
+            name: self.painted_texture(one) if name in MEASURED_TEXTURES else one
             for name, one in scene.textures.items()
         }
         return dataclasses.replace(scene, textures=textures)
@@ -130,7 +130,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
     patches = hole_closing.patches(mesh.vertices_mm, mesh.faces)
     if not patches or mesh.shapes:
         return ClosedMesh(mesh, (), ())
-    taken = unwrap(mesh, CELLS).covered
+    taken = unwrap(mesh, GRID_CELLS).covered
     scale = _uv_per_mm(mesh)
     vertices, faces, uv = [mesh.vertices_mm], [mesh.faces], [mesh.uv]
     count = len(mesh.vertices_mm)
@@ -169,17 +169,17 @@ def _placed(taken: BoolArray, radius: float) -> tuple[Float64Array, float] | Non
     """Return middle and radius of the emptiest place, smaller where it must be; None: no room."""
     far = ndimage.distance_transform_edt(np.pad(~taken, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(far)), far.shape)
-    most = (float(far[row, column]) - 1.0) / CELLS - MARGIN
-    if most < LEAST_SCALE * radius:
+    most = (float(far[row, column]) - 1.0) / GRID_CELLS - PATCH_MARGIN
+    if most < MIN_RELATIVE_SCALE * radius:
         return None
-    center = np.array([(column + 0.5) / CELLS, 1.0 - (row + 0.5) / CELLS])
+    center = np.array([(column + 0.5) / GRID_CELLS, 1.0 - (row + 0.5) / GRID_CELLS])
     return center, min(radius, most)
 
 
 def _take(taken: BoolArray, center: Float64Array, radius: float) -> None:
-    at = (np.arange(CELLS) + 0.5) / CELLS
+    at = (np.arange(GRID_CELLS) + 0.5) / GRID_CELLS
     far2 = (at[None, :] - center[0]) ** 2 + (1.0 - at[:, None] - center[1]) ** 2
-    taken[far2 <= (radius + 1.0 / CELLS) ** 2] = True
+    taken[far2 <= (radius + 1.0 / GRID_CELLS) ** 2] = True
 
 
 def _paint(layer: Float32Array, chart: Chart) -> None:
@@ -199,7 +199,7 @@ def _paint(layer: Float32Array, chart: Chart) -> None:
         axis=-1,
     )
     values = chart.patch.continued(rim.astype(np.float64))
-    reach = chart.radius + MARGIN
+    reach = chart.radius + PATCH_MARGIN
     x0, y0 = chart.center
     j = np.arange(max(int((x0 - reach) * width), 0), min(int((x0 + reach) * width) + 1, width))
     i = np.arange(

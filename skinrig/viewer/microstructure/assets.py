@@ -37,9 +37,9 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, Viewe
 SAMPLE_PX: Final = 512
 """Side of the part of a displacement that its slopes are known from."""
 CELL_PX: Final = 56
-MOST_BREAKS: Final = 8
+MAX_BREAKS: Final = 8
 """Lines of alpha that the shader has room for, less one."""
-MOST_REACH_PX: Final = 64
+MAX_REACH_PX: Final = 64
 """Kernels that reach farther than this leave nothing of the window."""
 
 
@@ -103,14 +103,14 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
     """
     growth = grown(relief, seed=seed)
     table = relief.table
-    if len(table.alpha_breaks) > MOST_BREAKS:
+    if len(table.alpha_breaks) > MAX_BREAKS:
         raise MicrostructureAssetError(
-            f"table: got {len(table.alpha_breaks)} breaks, expected at most {MOST_BREAKS}"
+            f"table: got {len(table.alpha_breaks)} breaks, expected at most {MAX_BREAKS}"
         )
     scale = px_per_mm(mesh)
     virtual = round(1e3 / (relief.pixel_um * float(np.median(scale))))
     virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
-    virtual = min(virtual, relief_growth.LARGEST_PX // 2)
+    virtual = min(virtual, relief_growth.MAX_LATTICE_PX // 2)
     reach = reach_px(table, scale, virtual)
     below, above = table.sigma_lines_um()
     return Assets(
@@ -129,7 +129,7 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
                 "choices": growth.choices,
                 "seed": growth.seed,
                 "virtual_px": virtual,
-                "levels": relief_growth.LEVELS,
+                "levels": relief_growth.GROWN_LEVELS,
                 "reach_px": reach,
                 "stretch_range": list(table.stretch_range),
                 "alpha_limits": list(ALPHA_LIMITS),
@@ -156,15 +156,15 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     Raises
     ------
     MicrostructureAssetError
-        For more than `MOST_REACH_PX`.
+        For more than `MAX_REACH_PX`.
     """
     # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
     finest = float(np.percentile(scale, 99.0))
     reach = math.ceil(4.0 * largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
-    if reach > MOST_REACH_PX:
+    if reach > MAX_REACH_PX:
         raise MicrostructureAssetError(
             f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
-            f"{MOST_REACH_PX}: lengths differ too much over its texture"
+            f"{MAX_REACH_PX}: lengths differ too much over its texture"
         )
     return reach
 

@@ -9,9 +9,9 @@ What is fixed here:
 
 - Corner (i, j) shows the patch moved by a whole number of `STEP_PX` pixels that a hash of (i, j)
   and the seed chooses among all moves at which its hexagon stays within the patch. Whole numbers:
-  no sample lies between pixels, and levels of a mip pyramid up to `LEVELS` move by whole pixels
-  too.
-- Weights are the barycentric ones to the power `SHARPNESS`, divided by the root of their summed
+  no sample lies between pixels, and levels of a mip pyramid up to `GROWN_LEVELS` move by whole
+  pixels too.
+- Weights are the barycentric ones to the power `WEIGHT_POWER`, divided by the root of their summed
   squares: mean and variance are those of the patch where the three places are uncorrelated (Heitz
   and Neyret 2018, eq. 2, without their transform of histograms, so a skewed histogram comes out
   less skewed where places meet). Weights are continuous: there are no seams. Between places relief
@@ -35,15 +35,15 @@ import numpy as np
 
 from skinrig.arrays import Float32Array, Float64Array, Int64Array, UInt32Array
 
-LEVELS: Final = 4
-"""Levels of a pyramid that can be grown: 0 (the patch's pixels) to LEVELS - 1."""
-STEP_PX: Final = 2 ** (LEVELS - 1)
-SHARPNESS: Final = 4
+GROWN_LEVELS: Final = 4
+"""Levels of a pyramid that can be grown: 0 (the patch's pixels) to GROWN_LEVELS - 1."""
+STEP_PX: Final = 2 ** (GROWN_LEVELS - 1)
+WEIGHT_POWER: Final = 4
 """Power of the barycentric weights: the share of skin where places mix is small, but not so small
 that the blend's own slopes show."""
-LARGEST_PX: Final = 2**17
+MAX_LATTICE_PX: Final = 2**17
 """Farther out the lattice's integers leave 32 bits."""
-LEAST_CHOICES: Final = 4
+MIN_MOVES: Final = 4
 """Moves to choose from along each side; below, repetition would be seen at once."""
 
 
@@ -85,7 +85,7 @@ class GrownRelief:
             raise ReliefGrowthError(f"pixel_um: got {self.pixel_um}, expected above 0")
         if not 0 <= self.seed < 2**32:
             raise ReliefGrowthError(f"seed: got {self.seed}, expected 0 to 2^32 - 1")
-        if self.cell_px < 2 * STEP_PX or self.choices < LEAST_CHOICES:
+        if self.cell_px < 2 * STEP_PX or self.choices < MIN_MOVES:
             raise ReliefGrowthError(
                 f"cell_px: got {self.cell_px} for a patch of {shape[0]} px, expected at least "
                 f"{2 * STEP_PX} and at most {largest_cell_px(shape[0])}"
@@ -98,8 +98,8 @@ class GrownRelief:
 
     def level(self, level: int) -> Float32Array:
         """Return the patch's means over 2^level pixels a side, shape (P / 2^level,) * 2."""
-        if not 0 <= level < LEVELS:
-            raise ReliefGrowthError(f"level: got {level}, expected 0 to {LEVELS - 1}")
+        if not 0 <= level < GROWN_LEVELS:
+            raise ReliefGrowthError(f"level: got {level}, expected 0 to {GROWN_LEVELS - 1}")
         side = self.patch.shape[0] >> level
         blocks = self.patch.reshape(side, 1 << level, side, 1 << level).astype(np.float64)
         return blocks.mean(axis=(1, 3)).astype(np.float32)
@@ -123,10 +123,10 @@ class GrownRelief:
         ndarray of float32, shape `shape`
         """
         patch = self.level(level)
-        if (max(abs(top), abs(left)) + max(shape)) << level > LARGEST_PX:
+        if (max(abs(top), abs(left)) + max(shape)) << level > MAX_LATTICE_PX:
             raise ReliefGrowthError(
                 f"window: got ({top}, {left}) {shape} at level {level}, expected within "
-                f"{LARGEST_PX} px of level 0"
+                f"{MAX_LATTICE_PX} px of level 0"
             )
         y, x = np.meshgrid(
             np.arange(top, top + shape[0]), np.arange(left, left + shape[1]), indexing="ij"
@@ -163,8 +163,8 @@ def _choices(side_px: int, cell_px: int) -> int:
 
 
 def largest_cell_px(side_px: int) -> int:
-    """Return the largest cell that leaves `LEAST_CHOICES` moves in a patch of so many pixels."""
-    fits = [c for c in range(1, side_px) if _choices(side_px, c) >= LEAST_CHOICES]
+    """Return the largest cell that leaves `MIN_MOVES` moves in a patch of so many pixels."""
+    fits = [c for c in range(1, side_px) if _choices(side_px, c) >= MIN_MOVES]
     return max(fits, default=0)
 
 
@@ -210,6 +210,6 @@ def corners_at(
     one = np.where(upper, 0, 1)
     corners = [(i + one, j + one), (i, j + 1), (i + 1, j)]
     raw = [np.abs(rest), np.where(upper, q, 1.0 - p), np.where(upper, p, 1.0 - q)]
-    power = [w**SHARPNESS for w in raw]
+    power = [w**WEIGHT_POWER for w in raw]
     length = np.sqrt(sum(w * w for w in power))
     return corners, [w / length for w in power]

@@ -13,10 +13,10 @@ from model.microstructure import KernelTable, gaussian_weights, kernel_parameter
 from skinrig.arrays import Float64Array
 from skinrig.viewer.microstructure.relief_growth import GrownRelief
 
-STRETCHES: Final = 33
+STRETCH_NODES: Final = 33
 """Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
 STRETCH_RANGE: Final = (0.5, 1.5)
-FEWEST_PX: Final = 6
+MIN_LEVEL_PX: Final = 6
 """Pixels a side of the coarsest level whose slopes are counted."""
 
 
@@ -29,7 +29,7 @@ def slope_rms(growth: GrownRelief) -> list[float]:
     found = []
     height = growth.patch.astype(np.float64)
     step = growth.pixel_um
-    while height.shape[0] >= FEWEST_PX:
+    while height.shape[0] >= MIN_LEVEL_PX:
         dx = (height[1:-1, 2:] - height[1:-1, :-2]) / (2.0 * step)
         dy = (height[2:, 1:-1] - height[:-2, 1:-1]) / (2.0 * step)
         found.append(float(np.sqrt(np.mean(dx**2 + dy**2))))
@@ -53,7 +53,7 @@ def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
 
     Returns
     -------
-    ndarray, shape (STRETCHES, STRETCHES, 2)
+    ndarray, shape (STRETCH_NODES, STRETCH_NODES, 2)
         Variance along s and along t by r_s (rows) and r_t (columns), over `STRETCH_RANGE`.
     """
     side = growth.patch.shape[0]
@@ -62,9 +62,9 @@ def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
     spectrum = 0.5 * (spectrum + spectrum.T)
     turn = 2.0 * np.pi * np.fft.fftfreq(side)
     slope = np.sin(turn) ** 2
-    ratios = np.linspace(*STRETCH_RANGE, STRETCHES)
+    ratios = np.linspace(*STRETCH_RANGE, STRETCH_NODES)
     alpha, sigma_um = kernel_parameters(ratios, table)
-    transfer = np.empty((STRETCHES, side))
+    transfer = np.empty((STRETCH_NODES, side))
     for row, (a, s) in enumerate(zip(alpha, sigma_um / growth.pixel_um, strict=True)):
         weights = gaussian_weights(s)
         wave = np.cos(turn[:, None] * np.arange(weights.size)) @ (

@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 
 TILE_PX: Final = 256
-LEAST_PX: Final = 512
+MIN_SIDE_PX: Final = 512
 """Side of the smallest map, and of the coarsest level at least."""
-MOST_LEVELS: Final = 8
-ROWS: Final = 512
+MAX_LEVELS: Final = 8
+ROWS_PER_READ: Final = 512
 """Rows of a level that are read at a time."""
-WORDS: Final = 65535
+MAX_WORD: Final = 65535
 
 
 class TileError(ValueError):
@@ -52,7 +52,7 @@ class Pyramid:
     @property
     def step_um(self) -> float:
         """Height between two words of a tile; the largest error of a tile is half of it."""
-        return (self.high - self.low) / WORDS
+        return (self.high - self.low) / MAX_WORD
 
     def tile(self, level: int, row: int, column: int) -> bytes:
         """Return a tile as little-endian words, `TILE_PX` squared, row 0 at the top.
@@ -85,7 +85,7 @@ class Pyramid:
             np.float64,
         )
         spread = self.high - self.low or 1.0
-        words = np.rint(np.clip((part - self.low) / spread, 0.0, 1.0) * WORDS)
+        words = np.rint(np.clip((part - self.low) / spread, 0.0, 1.0) * MAX_WORD)
         return words.astype("<u2").tobytes()
 
 
@@ -95,7 +95,7 @@ def build(source: Any, folder: Path) -> Pyramid:
     Parameters
     ----------
     source : array or memory map, shape (S, S)
-        Heights, um, finite; S is `LEAST_PX` times a power of two.
+        Heights, um, finite; S is `MIN_SIDE_PX` times a power of two.
     folder : Path
         For the coarser levels; made, and replaced where one is there. A third of the file's size.
 
@@ -115,8 +115,8 @@ def build(source: Any, folder: Path) -> Pyramid:
     shape = tuple(int(side) for side in np.shape(source))
     if len(shape) != 2 or shape[0] != shape[1] or not _fits(shape[0]):
         raise TileError(
-            f"displacement: got shape {shape}, expected a square with sides of {LEAST_PX} px times "
-            "a power of two (such as 4096 or 16384)"
+            f"displacement: got shape {shape}, expected a square with sides of {MIN_SIDE_PX} px "
+            "times a power of two (such as 4096 or 16384)"
         )
     low, high = _range(source)
     part = folder.with_name(f".{folder.name}.part")
@@ -124,7 +124,7 @@ def build(source: Any, folder: Path) -> Pyramid:
     part.mkdir(parents=True)
     try:
         level, number = source, 1
-        while level.shape[0] > LEAST_PX and number < MOST_LEVELS:
+        while level.shape[0] > MIN_SIDE_PX and number < MAX_LEVELS:
             level = _halved(level, part / f"level_{number}.npy")
             number += 1
         shutil.rmtree(folder, ignore_errors=True)
@@ -164,13 +164,13 @@ def open_displacement(path: Path, folder: Path) -> Pyramid:
 
 
 def _fits(side: int) -> bool:
-    return side >= LEAST_PX and side % LEAST_PX == 0 and (side & (side - 1)) == 0
+    return side >= MIN_SIDE_PX and side % MIN_SIDE_PX == 0 and (side & (side - 1)) == 0
 
 
 def _range(source: Any) -> tuple[float, float]:
     low, high = np.inf, -np.inf
-    for top in range(0, source.shape[0], ROWS):
-        rows = np.asarray(source[top : top + ROWS])
+    for top in range(0, source.shape[0], ROWS_PER_READ):
+        rows = np.asarray(source[top : top + ROWS_PER_READ])
         if not np.isfinite(rows).all():
             raise TileError(
                 f"displacement: got NaN or infinity in rows {top} to {top + len(rows) - 1}, "
@@ -183,9 +183,9 @@ def _range(source: Any) -> tuple[float, float]:
 def _halved(source: Any, path: Path) -> Any:
     side = source.shape[0] // 2
     target = np.lib.format.open_memmap(path, "w+", np.float32, (side, side))
-    for top in range(0, side, ROWS):
-        rows = np.asarray(source[2 * top : 2 * (top + ROWS)], np.float64)
+    for top in range(0, side, ROWS_PER_READ):
+        rows = np.asarray(source[2 * top : 2 * (top + ROWS_PER_READ)], np.float64)
         blocks = rows.reshape(rows.shape[0] // 2, 2, side, 2)
-        target[top : top + ROWS] = blocks.mean(axis=(1, 3))
+        target[top : top + ROWS_PER_READ] = blocks.mean(axis=(1, 3))
     target.flush()
     return target

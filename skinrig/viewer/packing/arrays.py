@@ -23,7 +23,7 @@ from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
 Words = NDArray[Any]
 """uint8, uint16, int16, float16 or float32."""
 
-PREDICTORS: Final = ("none", "left", "up", "plane")
+PREDICTOR_NAMES: Final = ("none", "left", "up", "plane")
 """Which neighbors a word is predicted from; "plane" is left + up - upper left."""
 NORMAL_STEPS: Final = 8191.0
 """Steps of a normal's component from 0 to 1: 0.005 degrees."""
@@ -238,7 +238,7 @@ def _predicted(words: Words) -> tuple[str, bytes]:
     flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
     best = ("raw", little.tobytes())
     least = -1
-    for predictor in PREDICTORS:
+    for predictor in PREDICTOR_NAMES:
         data = _bytes_of(_differences(flat, predictor))
         size = deflating.guessed_size(data)
         if least < 0 or size < least:

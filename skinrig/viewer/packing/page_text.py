@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-UNSAFE: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
+UNSAFE_CODES: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
 """Codes of characters that HTML, editors or transports may change: controls, line ends, and those
 with which markup begins."""
 
@@ -15,8 +15,8 @@ def as_text(data: bytes) -> str:
     """Return bytes as text of which UTF-8 holds seven bits a byte (base64: six).
 
     A character below 128 is seven bits, the first the highest. Those that a page or an editor may
-    change (`UNSAFE`) become, with the seven bits behind them, one of two bytes:
-    ``(index in UNSAFE + 1) * 128 + next``.
+    change (`UNSAFE_CODES`) become, with the seven bits behind them, one of two bytes:
+    ``(index in UNSAFE_CODES + 1) * 128 + next``.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def as_text(data: bytes) -> str:
     groups = np.concatenate([bits, np.zeros(-len(bits) % 7, np.uint8)]).reshape(-1, 7)
     codes = (np.packbits(groups, axis=1)[:, 0] >> 1).astype(np.uint16)
     unsafe = np.full(128, -1, np.int64)
-    unsafe[list(UNSAFE)] = np.arange(len(UNSAFE))
+    unsafe[list(UNSAFE_CODES)] = np.arange(len(UNSAFE_CODES))
     if len(codes) and unsafe[codes[-1]] >= 0:
         codes = np.append(codes, np.uint16(32))  # something for the last to be joined with
     found = np.flatnonzero(unsafe[codes] >= 0)

@@ -1,5 +1,6 @@
 import io
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,6 +16,21 @@ def test_an_8_bit_image_reads_back_equal_through_another_reader(shape):
 
 def test_a_16_bit_gray_image_reads_back_equal():
     image = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
+
+
+@pytest.mark.parametrize("quick", [False, True])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_16_bit_color_image_keeps_all_its_bits(rng, channels, quick):
+    image = rng.integers(0, 65536, (5, 7, channels), dtype=np.uint16)
+    data = png.encode(image, quick=quick)
+    assert data[24:26] == bytes([16, {3: 2, 4: 6}[channels]])  # depth and color type
+    read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(read[..., [2, 1, 0, 3][:channels]], image)
+
+
+def test_a_view_of_an_image_is_encoded_as_it_reads(rng):
+    image = rng.integers(0, 256, (8, 9, 4), dtype=np.uint8)[::-2, ::2]
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
 
 

@@ -86,12 +86,12 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
 @pytest.mark.parametrize(
     ("words", "value"),
     [
-        (r"fewer than (\d+) %", 100 * verdict.OVERCONFIDENT),
-        (r"or more than (\d+) % of truths", 100 * verdict.UNDERCONFIDENT),
-        (r"more than (\d+) % are masked", 100 * verdict.MUCH_MASKED),
-        (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MOST_BEYOND),
-        (r"within (\d+) mm in the median", run_comparison.SAME_PLACE_MM),
-        (r"has (\d+) colors", map_pictures.LEVELS),
+        (r"fewer than (\d+) %", 100 * verdict.MIN_COVERAGE),
+        (r"or more than (\d+) % of truths", 100 * verdict.MAX_COVERAGE),
+        (r"more than (\d+) % are masked", 100 * verdict.MAX_UNREMARKED_MASK),
+        (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
+        (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
+        (r"has (\d+) colors", map_pictures.SCALE_COLORS),
         (r"faces from the front (\d+)", WIDTH_PX),
     ],
 )

@@ -9,6 +9,7 @@ from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig import report
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.reporting import page
 from skinrig.reporting.folders import discover
 from skinrig.reporting.sections import population
 from skinrig.reporting.sections.chromophore import panels
@@ -95,10 +96,13 @@ def test_the_first_screen_says_that_nobody_was_measured(folder):
 
 def test_a_map_of_rounding_alone_does_not_look_like_structure(rng):
     noise = 1e-11 * rng.random((24, 32))
-    told = panels(SkinAppearance({"gamut_distance": SkinMap(noise, "1")}, "simulated"), None)
-    assert "e-11" not in told
-    far = panels(SkinAppearance({"gamut_distance": SkinMap(noise * 1e9, "1")}, "simulated"), None)
-    assert "0.009" in far
+
+    def shown(values):
+        appearance = SkinAppearance({"gamut_distance": SkinMap(values, "1")}, "simulated")
+        return page.fragment(panels(appearance, None))
+
+    assert "e-11" not in shown(noise)
+    assert "0.009" in shown(noise * 1e9)
 
 
 def test_a_medium_is_not_counted_as_a_person(tmp_path):
@@ -117,7 +121,8 @@ def test_a_medium_is_not_counted_as_a_person(tmp_path):
         appearances[subject] = SkinAppearance(
             {}, "simulated", parameters={"truth": name}, files=files
         )
-    assert "measured here, 1 session<" in population.section(appearances, truths)
-    assert "measured here, 2 sessions<" in population.section(appearances)  # no truth tells
+    assert "measured here, 1 session<" in page.fragment(population.section(appearances, truths))
+    no_truth_tells = page.fragment(population.section(appearances))
+    assert "measured here, 2 sessions<" in no_truth_tells
     del appearances["III"]
-    assert not population.section(appearances, truths)
+    assert not list(population.section(appearances, truths))

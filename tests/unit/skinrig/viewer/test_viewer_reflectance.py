@@ -46,10 +46,10 @@ def traits(face):
 
 def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face, forms):
     found = compact_brdf.chosen(face.lobes)
-    assert max(found.rms_error, found.strong_error) <= compact_brdf.GOOD_ENOUGH
+    assert max(found.rms_error, found.strong_error) <= compact_brdf.MAX_FORM_ERROR
     every = {(one.form, one.detail): max(one.rms_error, one.strong_error) for one in forms}
-    coarser = compact_brdf.SLABS[compact_brdf.SLABS.index(found.detail) - 1]
-    assert every["table", coarser] > compact_brdf.GOOD_ENOUGH
+    coarser = compact_brdf.TRIED_SLABS[compact_brdf.TRIED_SLABS.index(found.detail) - 1]
+    assert every["table", coarser] > compact_brdf.MAX_FORM_ERROR
 
 
 def test_factors_as_good_as_the_table_need_more_look_ups(face, forms):
@@ -259,6 +259,6 @@ def test_shapes_of_single_muscles_make_the_six_emotions():
         for side in "LR"
     ] + ["jawOpen", "mouthPucker"]
     found = presets.presets(names)
-    assert set(presets.EMOTIONS) <= set(found)
+    assert set(presets.EMOTION_STATES) <= set(found)
     assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())
     assert "after exercise" not in found  # no blood, no exercise

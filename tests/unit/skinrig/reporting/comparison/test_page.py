@@ -15,7 +15,7 @@ from skinrig.report import ReportError
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 from skinrig.reporting.comparison import truth_errors
-from skinrig.reporting.comparison.maps import BY_CHANCE, compare
+from skinrig.reporting.comparison.maps import CHANCE_FRACTIONS, compare
 
 SIDE = 200
 PIXELS = SIDE * SIDE
@@ -38,7 +38,7 @@ def two_estimates(rng, *, stated=1.0, spread=(0.3, 0.4)):
 
 def test_noise_of_the_stated_size_lies_apart_as_chance_has_it(rng):
     found = compare("thickness", *two_estimates(rng))
-    for share, expected in zip(found.beyond, BY_CHANCE, strict=True):
+    for share, expected in zip(found.beyond, CHANCE_FRACTIONS, strict=True):
         assert share_is(share, expected)
     assert found.combined == pytest.approx(0.5, rel=1e-5)
     assert not found.disagree
@@ -46,7 +46,7 @@ def test_noise_of_the_stated_size_lies_apart_as_chance_has_it(rng):
 
 def test_noise_twice_as_large_as_stated_is_called_a_disagreement(rng):
     found = compare("thickness", *two_estimates(rng, stated=0.5))
-    assert not share_is(found.beyond[0], BY_CHANCE[0])
+    assert not share_is(found.beyond[0], CHANCE_FRACTIONS[0])
     assert found.disagree
 
 
@@ -80,7 +80,7 @@ def test_normals_that_err_as_stated_lie_apart_as_chance_has_it(rng):
     honest = [noisy_normals(rng, 0.01, 0.01) for _ in range(2)]
     found = compare("normals", *honest)
     assert found.unit == "°"
-    for share, expected in zip(found.beyond, BY_CHANCE, strict=True):
+    for share, expected in zip(found.beyond, CHANCE_FRACTIONS, strict=True):
         assert share_is(share, expected)
     assert not found.disagree
     assert compare("normals", *(noisy_normals(rng, 0.01, 0.005) for _ in range(2))).disagree
@@ -249,4 +249,4 @@ def test_errors_against_the_truth_come_with_their_band(folders):
     rows = truth_errors.of(store.read(folders["b"]), store.read(folders["truth"]))
     assert {row.skin for row in rows} == {"all", "melanin 0.05–0.1"}
     assert all(row.error == pytest.approx(30.0, abs=0.3) for row in rows)
-    assert map_comparison.MOST_BEYOND > BY_CHANCE[-1]
+    assert map_comparison.MAX_FRACTION_BEYOND > CHANCE_FRACTIONS[-1]

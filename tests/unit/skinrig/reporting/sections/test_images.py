@@ -44,7 +44,7 @@ def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
         },
     )
     checks: list[page.Check] = []
-    body = pictures.section(folder, checks)
+    body = page.fragment(pictures.section(folder, checks))
     assert [check.passed for check in checks] == [False]
     assert "no surface" in body
     assert "light held out" in body
@@ -60,9 +60,9 @@ def test_a_report_finds_pictures_below_its_folder(tmp_path):
 
 
 def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "LARGEST_BYTES", 10)
+    monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
-    body = pictures.section(folder, [])
+    body = page.fragment(pictures.section(folder, []))
     assert "Too large for here: radiance.png" in body
     assert "data:image" not in body
 
@@ -71,7 +71,7 @@ def test_other_documents_are_no_pictures(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     (folder / "analysis.json").write_text(json.dumps({"schema": "somebody.else/1"}))
-    assert pictures.section(folder, []) == ""
+    assert not list(pictures.section(folder, []))
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(ReportError, match="holds no"):

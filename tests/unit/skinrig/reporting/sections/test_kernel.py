@@ -7,6 +7,7 @@ import pytest
 
 from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
+from skinrig.reporting import page
 from skinrig.reporting.sections import kernel
 
 FIT = {
@@ -29,9 +30,8 @@ FIT = {
 
 def table_of(fit):
     text = json.dumps({"fits": [fit], "tables": []}).encode()
-    html = kernel.section(
-        "gradient", SkinAppearance({}, "simulated", files={KERNEL_FILE: text}), []
-    )
+    appearance = SkinAppearance({}, "simulated", files={KERNEL_FILE: text})
+    html = page.fragment(kernel.section("gradient", appearance, []))
     head = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", html)
     cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", html.split("<tbody>")[1])
     return list(zip(head, cells, strict=False))

@@ -55,8 +55,8 @@ def test_a_fitted_base_comes_along_with_its_holes_filled():
 def test_what_pixels_still_show_is_the_rms_of_means_of_a_zones_part():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(),))
     rows = wrinkle_assets.retained_rms(model, (16, 16))
-    assert len(rows) == wrinkle_assets.ZONES
-    assert [len(row) for row in rows] == [5] * wrinkle_assets.ZONES
+    assert len(rows) == wrinkle_assets.ZONES_PER_LAYER
+    assert [len(row) for row in rows] == [5] * wrinkle_assets.ZONES_PER_LAYER
     from model.texture_resampling import resampled
 
     mask = resampled(model.layers[0].masks[1].astype(float), (16, 16))

@@ -37,7 +37,7 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief, r_s, r_t):
     growth = assets.grown(relief)
     table = slope_variances.strained_variance(growth, relief.table)
-    ratios = np.linspace(*slope_variances.STRETCH_RANGE, slope_variances.STRETCHES)
+    ratios = np.linspace(*slope_variances.STRETCH_RANGE, slope_variances.STRETCH_NODES)
     found = table[np.searchsorted(ratios, r_s), np.searchsorted(ratios, r_t)]
     alpha, sigma_um = kernel_parameters([r_s, r_t], relief.table)
     sigma = sigma_um / growth.pixel_um
@@ -59,13 +59,13 @@ def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief,
 
 def test_neutral_skin_keeps_its_variance(relief):
     table = slope_variances.strained_variance(assets.grown(relief), relief.table)
-    middle = slope_variances.STRETCHES // 2
+    middle = slope_variances.STRETCH_NODES // 2
     np.testing.assert_allclose(table[middle, middle], 1.0, rtol=1e-9)
 
 
 def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
     table = slope_variances.strained_variance(assets.grown(relief), relief.table)
-    middle = slope_variances.STRETCHES // 2
+    middle = slope_variances.STRETCH_NODES // 2
     along = table[:, middle, 0]
     assert along[middle - 6] > 1.5
     assert along[middle + 6] < 0.75

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from skinrig.viewer.microstructure import relief_growth
-from skinrig.viewer.microstructure.relief_growth import LEVELS, GrownRelief, ReliefGrowthError
+from skinrig.viewer.microstructure.relief_growth import GROWN_LEVELS, GrownRelief, ReliefGrowthError
 
 
 def gaussian_patch(side: int = 192, sigma: float = 3.0) -> np.ndarray:
@@ -47,7 +47,7 @@ def test_grown_relief_has_no_seams(growth):
 
 def test_a_coarser_level_is_the_mean_of_the_finer_one_but_for_changing_weights(growth):
     fine = growth.window(160, 320, (512, 512)).astype(np.float64)
-    for level in range(1, LEVELS):
+    for level in range(1, GROWN_LEVELS):
         side = 512 >> level
         mean = fine.reshape(side, 1 << level, side, 1 << level).mean(axis=(1, 3))
         coarse = growth.window(160 >> level, 320 >> level, (side, side), level=level)
@@ -62,7 +62,7 @@ def test_every_place_that_is_shown_lies_in_the_patch():
     patch = np.arange(96.0 * 96.0).reshape(96, 96).astype(np.float32)
     largest = relief_growth.largest_cell_px(96)
     growth = GrownRelief(patch, 10.0, largest, 1)
-    for level in range(LEVELS):
+    for level in range(GROWN_LEVELS):
         window = growth.window(-37, -11, (200, 200), level=level)
         assert np.isfinite(window).all()
     with pytest.raises(ReliefGrowthError, match="cell_px: got"):
@@ -92,4 +92,4 @@ def test_what_cannot_be_grown_from_is_refused(change, message):
 
 def test_places_beyond_32_bits_are_refused(growth):
     with pytest.raises(ReliefGrowthError, match="window: got"):
-        growth.window(relief_growth.LARGEST_PX, 0, (8, 8))
+        growth.window(relief_growth.MAX_LATTICE_PX, 0, (8, 8))

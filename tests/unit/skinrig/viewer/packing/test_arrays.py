@@ -17,7 +17,7 @@ def _bytes_of(text):
     codes = []
     for one in map(ord, text):
         if one >= 128:
-            codes.append(page_text.UNSAFE[(one >> 7) - 1])
+            codes.append(page_text.UNSAFE_CODES[(one >> 7) - 1])
         codes.append(one & 127)
     bits = np.array([[(code >> k) & 1 for k in range(6, -1, -1)] for code in codes], np.uint8)
     return np.packbits(bits.reshape(-1)).tobytes()
@@ -39,13 +39,13 @@ def test_text_gives_its_bytes_back(count, rng):
     data = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
     text = page_text.as_text(data)
     assert _bytes_of(text)[: len(data)] == data
-    assert not {chr(code) for code in page_text.UNSAFE} & set(text)
+    assert not {chr(code) for code in page_text.UNSAFE_CODES} & set(text)
 
 
 def test_text_of_bytes_that_are_all_unsafe_is_safe_and_small():
     for fill in (0, 255):
         text = page_text.as_text(bytes([fill]) * 7001)
-        assert not {chr(code) for code in page_text.UNSAFE} & set(text)
+        assert not {chr(code) for code in page_text.UNSAFE_CODES} & set(text)
         assert len(text.encode("utf-8")) <= 8 / 7 * 7001 + 2
         assert _bytes_of(text)[:7001] == bytes([fill]) * 7001
 
@@ -88,7 +88,7 @@ def test_a_coarse_finest_octave_keeps_means_and_states_its_error(rng):
     assert len(packed.payload) < len(packing.pack(_scene(noise=Texture(values))).payload)
 
 
-@pytest.mark.parametrize("predictor", packing.PREDICTORS)
+@pytest.mark.parametrize("predictor", packing.PREDICTOR_NAMES)
 def test_differences_are_undone_by_sums(predictor, rng):
     words = rng.integers(0, 65536, (2, 9, 7, 3), dtype=np.uint16)
     back = packing._differences(words, predictor)
