@@ -28,18 +28,18 @@ from skinrig.simulating.orders import (
 if TYPE_CHECKING:
     from rigsim.population.population import Member
 
-TEXELS = 512
+TEXTURE_TEXELS = 512
 """Along one side of a face's maps."""
 WIDTHS_PX = {"small": 320, "full": 1300}
-LIGHTS = {"small": 48, "full": None}
-VIEWS = {"small": 6, "full": None}
-SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
+LIGHT_COUNTS = {"small": 48, "full": None}
+VIEW_COUNTS = {"small": 6, "full": None}
+TEST_SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
 """Where the truth keeps pictures of the reflection."""
-BEHIND = -0.3
+MIN_FRONT_COSINE = -0.3
 """Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
-SCAN = "scan.ply"
-TRUE_MESH = "mesh.ply"
-BLEND_SHAPES = "expressions.npz"
+SCAN_FILE = "scan.ply"
+TRUE_MESH_FILE = "mesh.ply"
+BLEND_SHAPES_FILE = "expressions.npz"
 """The face at rest with the movement of each expression, see `rigsim.geometry.mesh.load_mesh`."""
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
@@ -149,13 +149,13 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
 
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
-        TRUE_MESH: binary_ply(mesh.vertices_mm, mesh.faces),
-        BLEND_SHAPES: _blend_shapes(scene.subject),
+        TRUE_MESH_FILE: binary_ply(mesh.vertices_mm, mesh.faces),
+        BLEND_SHAPES_FILE: _blend_shapes(scene.subject),
         TEST_FILE: make_test(
             scene,
             truth,
             rng=np.random.default_rng([seed, 8]),
-            sites={name: landmarks[name] for name in SITES},
+            sites={name: landmarks[name] for name in TEST_SITES},
         ),
     }
 
@@ -215,14 +215,14 @@ def small_dome(
             raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
         places = np.array([row.position_mm for row in rows])
         # few lights stand where they reach a face; many stand all around
-        use = np.flatnonzero(places[:, 2] >= BEHIND * np.linalg.norm(places, axis=1))
+        use = np.flatnonzero(places[:, 2] >= MIN_FRONT_COSINE * np.linalg.norm(places, axis=1))
         use = use if len(use) >= count else np.arange(len(rows))
-        kept[field] = [rows[use[k]].name for k in spread(places[use], count)]
+        kept[field] = [rows[use[k]].name for k in farthest_point_sample(places[use], count)]
     rig = rig.subset(lights=kept["lights"], views=kept["views"])
     return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
 
 
-def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
+def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]:
     """Return the numbers of ``count`` directions, each next one the farthest from those before.
 
     Parameters
@@ -252,8 +252,8 @@ def _rig(order: DomeOrder) -> Rig:
     if order.plan is None:
         return small_dome(
             load_rig("dome"),
-            lights=order.lights or LIGHTS[order.size],
-            views=order.views or VIEWS[order.size],
+            lights=order.lights or LIGHT_COUNTS[order.size],
+            views=order.views or VIEW_COUNTS[order.size],
             width_px=width_px,
         )
     dome = load_rig("dome")
@@ -297,11 +297,11 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
-        person = one.face(TEXELS)
+        person = one.face(TEXTURE_TEXELS)
         conditions = dict(one.applied) | conditions
     else:
         subject = subject_file.named(order.subject)
-        person = subject.face(seed=order.seed, size=TEXELS, mesh=order.mesh)
+        person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig,
@@ -345,7 +345,7 @@ def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
         scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
-    if SCAN not in session.attachments():
+    if SCAN_FILE not in session.attachments():
         kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
-        session.attach(SCAN, scan.ply, about={"kind": kind, "unit": "mm"})
+        session.attach(SCAN_FILE, scan.ply, about={"kind": kind, "unit": "mm"})
     return {"scan_to_dome": scan.to_dome.tolist()}

@@ -10,33 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from capture.acquire import run_plan
-from capture.devices.box import Box
-from capture.devices.caliper import CaliperBox
 from capture.devices.camera import open_camera
-from capture.devices.dome import DomeBox, Eyes
-from capture.devices.flash import FlashBox
-from capture.devices.gradient_sphere import GradientSphereBox
-from capture.devices.port import Port
-from capture.devices.probe import ProbeBox
+from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
 from model import store
 from model.skin import SkinAppearance
+from skinrig.capturing.addresses import open_box
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.orders import USES, Order, Simulated, SimulationError
 from skinrig.simulating.resumption import refusals
 from skinrig.simulating.shot_numbers import shots_made
-
-BOXES: Mapping[str, type[Box]] = {
-    "flash": FlashBox,
-    "dome": DomeBox,
-    "gradient_sphere": GradientSphereBox,
-    "caliper": CaliperBox,
-    "probe": ProbeBox,
-}
-"""Driver of each kind of box."""
 
 
 def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
@@ -53,9 +39,9 @@ def open_session(
         lines = refusals(session, asked, order.seed, order.person)
         if lines:
             session.release()
-            told = "".join(f"\n  {line}" for line in lines)
+            differing = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
-                f"{order.out}: cannot be gone on with as asked{told}\n"
+                f"{order.out}: cannot be gone on with as asked{differing}\n"
                 "  resume with the same settings, or name another folder"
             )
         return session
@@ -189,7 +175,7 @@ def drive(
     name = world.register(session.id)
     boxes = {
         # a number of fixed length: with drawn ones the lines would take a little longer or shorter
-        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock, first_seq=1))
+        kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
         for kind in rig.boxes
     }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}

@@ -25,14 +25,14 @@ from skinrig.simulating.orders import GradientOrder, Simulated, SimulationError,
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
-SITE = "forehead"
+DEFAULT_SITE = "forehead"
 FORCE_LIMIT_N = 2.0
 """What simulated skin bears."""
-STRETCHES = (0.66, 1.4)
+STRETCH_RANGE = (0.66, 1.4)
 """No simulated skin goes further before it buckles or comes off."""
-SHIFT_MM = 0.3
+MAX_SHIFT_MM = 0.3
 """How far the patch may come to lie off the middle: five standard deviations of its motion."""
-NEAR_S = 0.05
+MAX_LOG_LAG_S = 0.05
 
 
 def simulate_gradient(order: GradientOrder) -> Simulated:
@@ -47,7 +47,7 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
         "width_px": rig.views[0].width_px,
         "subject": subject_records.of_manifest(order.subject),
         "target": order.target or "",
-        "site": order.site or SITE,
+        "site": order.site or DEFAULT_SITE,
         "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
         "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
@@ -126,11 +126,11 @@ def make_scene(
     angles = {float(s.index["angle"]) for s in plan.steps if state_of(s)} if plan else set()
     size_mm = size_for(
         max(rig.views[0].field_mm),
-        STRETCHES,
+        STRETCH_RANGE,
         angle_deg=angles.pop() if len(angles) == 1 else None,
-        shift_mm=SHIFT_MM,
+        shift_mm=MAX_SHIFT_MM,
     )
-    skin = subject_file.named(subject).patch(site or SITE, seed=seed, size_mm=size_mm)
+    skin = subject_file.named(subject).patch(site or DEFAULT_SITE, seed=seed, size_mm=size_mm)
     on_s = None if plan is None else longest_on_s(plan)
     return GradientScene(
         rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s, **(without or {})
@@ -191,7 +191,9 @@ class GripLog(SceneLog):
                 continue
             run = int(str(lit[0].actual["token"]).partition(".")[0].removeprefix("sim"))
             time_s = float(lit[0].line.t_box_s or 0.0)
-            near = [e for e in entries if e["run"] == run and abs(e["t_s"] - time_s) < NEAR_S]
+            near = [
+                e for e in entries if e["run"] == run and abs(e["t_s"] - time_s) < MAX_LOG_LAG_S
+            ]
             if not near:
                 raise SimulationError(f"{self._path}: tells nothing of the state {name}")
             found.append(GripState(**near[0]["grip"]))

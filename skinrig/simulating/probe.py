@@ -19,15 +19,15 @@ from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.scenes.probe.truth import appearance as ground_truth
-from skinrig.capturing.acquisition import directions_of
+from skinrig.capturing.plan_choice import directions_of
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
 
-PHOTONS = {"small": 60_000, "full": 2_000_000}
+TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
-NEAR_S = 1e-3
+MAX_LOG_LAG_S = 1e-3
 
 
 def simulate_probe(order: ProbeOrder) -> Simulated:
@@ -126,7 +126,7 @@ def make_scene(
         tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    return ProbeScene(rig, tissue, seed=seed, photons=PHOTONS[size])
+    return ProbeScene(rig, tissue, seed=seed, photons=TRUTH_PHOTONS[size])
 
 
 class HeadLog(SceneLog):
@@ -184,7 +184,9 @@ class HeadLog(SceneLog):
                 record = frames[step.id]
                 run = int(str(record.actual["run"]).removeprefix("sim"))
                 time_s = float(record.line.t_box_s or 0.0)
-                near = [mbar for t_s, mbar in by_run.get(run, []) if abs(t_s - time_s) < NEAR_S]
+                near = [
+                    mbar for t_s, mbar in by_run.get(run, []) if abs(t_s - time_s) < MAX_LOG_LAG_S
+                ]
                 if not near:
                     raise SimulationError(f"{self._path}: tells nothing of the step {step.id}")
                 suctions.setdefault(placement, []).append(near[0])

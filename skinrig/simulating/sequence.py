@@ -37,7 +37,7 @@ COURSE_FILE = "perfusion_course.json"
 """In the truth: the blood of each frame at its own time."""
 LANDMARKS_FILE = "landmarks.csv"
 """In the truth: named points of the face at rest, px of its superpixels."""
-POINTS = {
+COURSE_LANDMARKS = {
     "forehead": "forehead",
     "cheek": "cheek left",
     "nose": "nose tip",
@@ -45,12 +45,12 @@ POINTS = {
     "temple": "temple left",
 }
 """The five places of Jimenez et al. 2010, figure 7, and the landmarks they lie on."""
-RADIUS_SHARE = 0.02
+DISC_RADIUS_FRACTION = 0.02
 """Radius of a place's disc, of the picture's width."""
-TEXELS = (256, 512)
-"""Of the face's texture: for pictures up to `COARSE_PX` across, and for larger ones."""
-COARSE_PX = 384
-RESUMED_AFTER_S = 10.0
+TEXTURE_TEXELS_BY_WIDTH = (256, 512)
+"""Of the face's texture: for pictures up to `MAX_COARSE_WIDTH_PX` across, and for larger ones."""
+MAX_COARSE_WIDTH_PX = 384
+INTERRUPTION_S = 10.0
 """Time on the host's clock that a simulated interruption takes, s."""
 
 
@@ -89,7 +89,9 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
         course: Any = PromptedCourse(sequence.state, seed=seed, **known)
     else:
         course = EventCourse(sequence.state, constant_s)
-    texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
+    texels = (
+        TEXTURE_TEXELS_BY_WIDTH[0] if width <= MAX_COARSE_WIDTH_PX else TEXTURE_TEXELS_BY_WIDTH[1]
+    )
     subject = subject_file.named(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
@@ -107,7 +109,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     session = open_session(order, plan, rig, asked, scene)
     log = ExposureLog(truth.with_name(f"{truth.name}.flashes.jsonl"), resume=order.resume)
     before_s = _event_s(session)
-    begun_s = time.time() if before_s is None else _last_s(session) + RESUMED_AFTER_S
+    begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
     if before_s is not None and not sequence.prompted:
         course.tell(before_s - begun_s, sequence.state)  # it was over before this world began
 
@@ -149,10 +151,12 @@ def _write_truth(
 ) -> None:
     """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
     poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
-    radius_px = RADIUS_SHARE * session.rig.views[0].width_px / 2
+    radius_px = DISC_RADIUS_FRACTION * session.rig.views[0].width_px / 2
     places = {pose: landmarks_at_superpixels(scene.landmarks_px(pose)) for pose in poses}
     points = {
-        pose: {name: places[pose][of] for name, of in POINTS.items() if of in places[pose]}
+        pose: {
+            name: places[pose][of] for name, of in COURSE_LANDMARKS.items() if of in places[pose]
+        }
         for pose in poses
     }
     frames = []

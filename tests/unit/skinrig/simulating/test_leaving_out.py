@@ -10,7 +10,7 @@ from capture.session import Session
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.scene import GradientScene
-from skinrig.simulating.leaving_out import SWITCHES
+from skinrig.simulating.leaving_out import SWITCHES_BY_RIG
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 
@@ -19,7 +19,7 @@ from skinrig.simulating.simulation import simulate_session
     ("rig", "scene"), [("flash", FlashScene), ("dome", DomeScene), ("gradient", GradientScene)]
 )
 def test_every_name_is_an_argument_of_the_rig_s_scene(rig, scene):
-    assert set(SWITCHES[rig]) <= set(inspect.signature(scene).parameters)
+    assert set(SWITCHES_BY_RIG[rig]) <= set(inspect.signature(scene).parameters)
 
 
 def test_effects_left_out_of_the_flash_rig_are_told_under_their_names(tmp_path):
