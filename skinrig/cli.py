@@ -23,11 +23,9 @@ from skinrig.commands import (
     measuring,
     planning,
     reconstructing,
-    reflectance,
     rendering,
-    report,
+    showing,
     simulating,
-    view,
 )
 from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed
@@ -37,7 +35,7 @@ app = typer.Typer(
     name="skinrig",
     cls=Commands,
     help="Capture, calibrate and reconstruct skin appearance, with rigs that can be simulated.",
-    epilog=f"Begin with: skinrig demo\n\nExit codes: {errors.CODES}",
+    epilog=f"Begin with: skinrig demo\n\nExit codes: {errors.EXIT_CODE_HELP}",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
     add_completion=True,
@@ -98,25 +96,24 @@ def demo(
 
 
 for command in (
-    simulating.simulate,
-    capturing.capture,
-    capturing.serve,
     capturing.verify,
     reconstructing.calibrate,
     reconstructing.reconstruct,
     measuring.bench,
     measuring.doctor,
-    planning.plan,
     rendering.render,
     editing.edit,
-    report.report,
-    view.view,
+    showing.report,
+    showing.view,
     export.export,
 ):
     app.command(cls=Command)(command)
 dynamic.fit_app.command("traits", cls=Command)(editing.fit_traits)
+app.add_typer(simulating.simulate_app, name="simulate")
+app.add_typer(capturing.capture_app, name="capture")
+app.add_typer(capturing.serve_app, name="serve")
+app.add_typer(planning.plan_app, name="plan")
 app.add_typer(importing.import_app, name="import")
-dynamic.fit_app.command("reflectance", cls=Command)(reflectance.fit_reflectance)
 app.add_typer(dynamic.fit_app, name="fit")
 app.add_typer(dynamic.apply_app, name="apply")
 analysing.analyse_app.command("albedo", cls=Command)(editing.analyse_albedo)

@@ -10,7 +10,7 @@ from capture.session import ConsentError, Subject
 from capture.session.manifest import ANY_USE
 from skinrig.errors import UsageError
 
-KEY = "consent"
+CONSENT_KEY = "consent"
 """Of an appearance's parameters: what the subject of each measured session agreed to."""
 
 
@@ -78,11 +78,11 @@ def recorded(appearance: Traced) -> list[dict[str, Any]]:
     """
     found: list[dict[str, Any]] = []
     for source in _sources(appearance):
-        found += [dict(one) for one in source.get(KEY) or () if dict(one) not in found]
+        found += [dict(one) for one in source.get(CONSENT_KEY) or () if dict(one) not in found]
     return found
 
 
-def carried(*appearances: Traced) -> list[dict[str, Any]]:
+def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:
     """Return the record that what is made of several appearances must bear.
 
     One that was measured and says nothing counts as of a subject who agreed to nothing.
@@ -102,7 +102,7 @@ def carried(*appearances: Traced) -> list[dict[str, Any]]:
     return out
 
 
-def told(records: Sequence[Mapping[str, Any]]) -> list[str]:
+def format_consent(records: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return records as people read them, a line a subject.
 
     Examples
@@ -178,7 +178,7 @@ def _day(text: object, where: str) -> date:
 def _silent(appearance: Traced) -> bool:
     """Return whether anything in it was measured of somebody whose consent is not told."""
     parts = _sources(appearance)
-    return any(part.get("source") == "measured" and not part.get(KEY) for part in parts)
+    return any(part.get("source") == "measured" and not part.get(CONSENT_KEY) for part in parts)
 
 
 def _sources(appearance: Traced) -> list[dict[str, Any]]:

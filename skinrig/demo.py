@@ -18,12 +18,12 @@ from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import suggest
 from skinrig.waiting_threads import WAITING_ASLEEP
-from skinrig.workspace import look
+from skinrig.workspace import scan
 from skinrig.written_units import unit_sign
 
-MOST_AT_ONCE = 2
+MAX_JOBS = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
-BENCHED = (
+BENCH_STAGES = (
     "hdr",
     "normals",
     "lumitexels",
@@ -84,7 +84,7 @@ def run_demo(
     _make_room(out)
     began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]
-    at_once = min(len(asked), MOST_AT_ONCE, os.cpu_count() or 1) if jobs is None else jobs
+    at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
     done = _side_by_side if at_once > 1 else _one_by_one
     parts = done(asked, (out, seed, width_px, console), at_once)
     found = Findings()
@@ -97,7 +97,9 @@ def run_demo(
     with _share("measure error against run time", shares, console):
         from skinrig.benchmarks.stages import run_stages
 
-        bench = run_stages(BENCHED, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console)
+        bench = run_stages(
+            BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
+        )
     document: dict[str, Any] = {
         "schema": "skinrig.demo/1",
         "title": "This demo",
@@ -130,7 +132,7 @@ def run_demo(
     beside = f", {at_once} rigs side by side" if at_once > 1 else ""
     total_s = time.perf_counter() - began
     console.say(f"\nall of it: {total_s:.1f} s{beside}")
-    for step in suggest(look(out), out):
+    for step in suggest(scan(out), out):
         console.say(f"next: {step.command}  ({step.why})")
     return {
         "out": out,

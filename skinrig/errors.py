@@ -29,7 +29,7 @@ DEVICE_FAILED = 4
 EXTRA_MISSING = 5
 BUG = 70
 INTERRUPTED = 130
-CODES = (
+EXIT_CODE_HELP = (
     f"{DONE} done; {LIMIT_MISSED} a limit was missed; {USAGE} the command line cannot be read (an "
     f"argument missing, not of its form, or at odds with another); {BAD_INPUT} what it names is "
     f"not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a capture failed; "
@@ -96,7 +96,7 @@ _ADVICE = {
 _OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 
 
-RESUMED = ("capture", "serve", "simulate")
+RESUMABLE_COMMANDS = ("capture", "serve", "simulate")
 """Commands that have --resume."""
 
 
@@ -118,7 +118,7 @@ def interruption(given: Sequence[str]) -> str:
     command = next((word for word in given if not word.startswith("-")), "")
     if command == "serve":  # what it is resumed with is not its own
         return "interrupted; serve with --resume SESSION to go on with a session captured from it"
-    if command in RESUMED:
+    if command in RESUMABLE_COMMANDS:
         return "interrupted; the same command with --resume goes on"
     kept = any(word == "--out" or word.startswith("--out=") for word in given)
     if command == "bench" and kept and "--extremes" not in given:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from skinrig.workspace import Surroundings, look
+from skinrig.workspace import Workspace, scan
 
-CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
+CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
     "flash": {
         "white": "white",
         "flat": "sensor",
@@ -24,7 +24,7 @@ CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "probe": {"phantom": "fibre"},
 }
 """The calibration that each target of a rig makes."""
-WANTS: Final[Mapping[str, str]] = {
+DEFAULT_WANTS: Final[Mapping[str, str]] = {
     "flash": "melanin,hemoglobin",
     "dome": "normals,r_d",
     "gradient": "normals,height,histograms,kernels",
@@ -32,11 +32,11 @@ WANTS: Final[Mapping[str, str]] = {
     "photographs": "melanin,hemoglobin",
 }
 """What is usually wanted of a session of skin."""
-UNCALIBRATED: Final = ("flash", "photographs")
+UNCALIBRATED_RIGS: Final = ("flash", "photographs")
 """Rigs whose maps need no calibration; without one something is assumed, and said."""
-OPENER: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
-DEMO: Final = "demo"
-MOST: Final = 4
+OPEN_COMMAND: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
+DEMO_FOLDER: Final = "demo"
+MAX_STEPS: Final = 4
 """Next steps that are named at once."""
 
 
@@ -48,7 +48,7 @@ class Step:
     why: str
 
 
-def named(path: str | Path) -> str:
+def shell_quote(path: str | Path) -> str:
     """Return a path as a shell takes it: in quotes where it holds a space or the like.
 
     Examples
@@ -82,14 +82,18 @@ def after_session(
     >>> after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fibre session-phantom --out calibration'
     """
-    place, store = named(session), named(calibration)
+    place, store = shell_quote(session), shell_quote(calibration)
     if target == "sequence":
         return f"skinrig reconstruct {place} --want perfusion_curves --out appearance"
     if not target:
-        needs = "" if rig not in WANTS or rig in UNCALIBRATED else f" --calibration {store}"
-        want = WANTS.get(rig, WANTS["photographs"])
+        needs = (
+            ""
+            if rig not in DEFAULT_WANTS or rig in UNCALIBRATED_RIGS
+            else f" --calibration {store}"
+        )
+        want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
         return f"skinrig reconstruct {place} --want {want}{needs} --out appearance"
-    kind = CALIBRATIONS.get(rig, {}).get(target)
+    kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
     if kind is None:
         return f"skinrig verify {place}"
     given = place
@@ -98,13 +102,13 @@ def after_session(
     return f"skinrig calibrate {kind} {given} --out {store}"
 
 
-def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
+def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
     """Return what to do next with what lies in a folder, the nearest first.
 
     Parameters
     ----------
     found
-        By `surroundings.look`.
+        By `workspace.scan`.
     folder
         As it is to be named in commands.
     """
@@ -112,12 +116,14 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
     if found.reports:
         steps.append(
             Step(
-                f"{OPENER} {named(found.reports[0])}",
+                f"{OPEN_COMMAND} {shell_quote(found.reports[0])}",
                 "the report in a browser: maps, errors, checks",
             )
         )
     elif found.appearances:
-        steps.append(Step(f"skinrig report {named(folder)}", "one page of all that lies here"))
+        steps.append(
+            Step(f"skinrig report {shell_quote(folder)}", "one page of all that lies here")
+        )
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
     fresh = [
         (path, document)
@@ -130,24 +136,29 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
         where = next((c for c in found.calibrations if rig in c.name), None)
         where = where or next(iter(found.calibrations), Path("calibration"))
         command = after_session(rig, path, None, calibration=where)
-        if rig not in CALIBRATIONS:
+        if rig not in CALIBRATION_BY_TARGET:
             command += _state_option(document)
         steps.append(Step(command, "maps with standard errors"))
     if found.appearances:
         seen = _most_whole(found.appearances, ("facial_color.json", "mesh.obj"))
         steps.append(
-            Step(f"skinrig view {named(seen)}", "a page that shows the skin moving, under light")
+            Step(
+                f"skinrig view {shell_quote(seen)}",
+                "a page that shows the skin moving, under light",
+            )
         )
         given = _most_whole(found.appearances, ("mesh.obj",))
         measured = found.appearances[given].get("source") == "measured"
         use = " --use research" if measured else ""
         steps.append(
-            Step(f"skinrig export {named(given)} --to maps{use} --out export", "other programs")
+            Step(
+                f"skinrig export {shell_quote(given)} --to maps{use} --out export", "other programs"
+            )
         )
     if found.photographs and not found.sessions:
         steps.append(
             Step(
-                f"skinrig import photos {named(folder)} --out session",
+                f"skinrig import photos {shell_quote(folder)} --out session",
                 "photographs become a session",
             )
         )
@@ -158,7 +169,7 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
             Step("skinrig import photos DIR --out session", "photographs of your own"),
             Step("skinrig doctor", "what is installed, and how to mend what is not"),
         ]
-    return tuple(steps[:MOST])
+    return tuple(steps[:MAX_STEPS])
 
 
 def welcome(folder: Path, version: str) -> str:
@@ -171,10 +182,10 @@ def welcome(folder: Path, version: str) -> str:
     version
         Of skinrig.
     """
-    found = look(folder)
-    if not found.summary() and look(folder / DEMO).summary():
-        folder = folder / DEMO
-        found = look(folder)
+    found = scan(folder)
+    if not found.summary() and scan(folder / DEMO_FOLDER).summary():
+        folder = folder / DEMO_FOLDER
+        found = scan(folder)
     steps = suggest(found, folder)
     width = max(len(step.command) for step in steps)
     summary = found.summary()
@@ -201,7 +212,7 @@ def _target(session: Mapping[str, Any]) -> str:
     states = {step.get("index", {}).get("state") for step in steps if step.get("kind") == "subject"}
     if rig == "flash" and states == {"white"}:
         return "white"
-    targets = CALIBRATIONS.get(rig, {})
+    targets = CALIBRATION_BY_TARGET.get(rig, {})
     return next((target for target in targets if target in kinds - {"dark"}), "")
 
 
@@ -214,14 +225,14 @@ def _state_option(session: Mapping[str, Any]) -> str:
         for step in session.get("plan", {}).get("steps", ())
         if step.get("kind") == "subject" and colored & set(step.get("cameras", ()))
     ]
-    return "" if not states or "neutral" in states else f" --state {named(states[0])}"
+    return "" if not states or "neutral" in states else f" --state {shell_quote(states[0])}"
 
 
 def _is_gray(session: Mapping[str, Any]) -> bool:
     """Tell imported photographs without color, of which no map of skin can be made."""
     rig = session.get("rig", {})
     filters = {view.get("cfa") for view in rig.get("views", ())}
-    return rig.get("name") not in CALIBRATIONS and filters == {"MONO"}
+    return rig.get("name") not in CALIBRATION_BY_TARGET and filters == {"MONO"}
 
 
 def _most_whole(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-PHOTOGRAPHS: Final = (
+PHOTOGRAPH_SUFFIXES: Final = (
     ".dng",
     ".nef",
     ".cr2",
@@ -31,7 +31,7 @@ REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 's
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class Workspace:
     """What lies in a folder, each sorted by name."""
 
     sessions: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class Surroundings:
         return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
 
 
-def look(folder: Path) -> Surroundings:
+def scan(folder: Path) -> Workspace:
     """Find what skinrig wrote into a folder, and photographs.
 
     Parameters
@@ -68,7 +68,7 @@ def look(folder: Path) -> Surroundings:
     try:
         entries = sorted(folder.iterdir())
     except OSError:
-        return Surroundings()
+        return Workspace()
     for entry in entries:
         if (document := _document(entry / "session.json")) is not None:
             sessions[entry] = document
@@ -80,8 +80,8 @@ def look(folder: Path) -> Surroundings:
         elif entry.name.startswith("calibration") and entry.is_dir():
             calibrations.append(entry)
     reports = [e for e in entries if e.suffix == ".html" and _is_report(e)]
-    photographs = sum(e.suffix.lower() in PHOTOGRAPHS for e in entries)
-    return Surroundings(
+    photographs = sum(e.suffix.lower() in PHOTOGRAPH_SUFFIXES for e in entries)
+    return Workspace(
         sessions, appearances, tuple(truths), tuple(calibrations), tuple(reports), photographs
     )
 

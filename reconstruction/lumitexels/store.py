@@ -408,7 +408,6 @@ def gather(
     --------
     reconstruction.lumitexels.store.LumitexelStore : for any number of points.
     """
-
     store = LumitexelStore(
         surface,
         cameras=cameras,

@@ -54,7 +54,7 @@ class AlbedoAnalysis:
     source
         "measured" where any of the faces was, else "simulated".
     consent
-        What the subjects of measured faces agreed to, see `skinrig.consent.carried`.
+        What the subjects of measured faces agreed to, see `skinrig.consent.merge_consent`.
     """
 
     histograms: Mapping[str, GroupHistograms]
@@ -141,7 +141,7 @@ def analyse_measured(
     found = dataclasses.replace(
         analyse(samples, names, groups, regions, vectors),
         source="measured" if any(one.source == "measured" for one in seen) else "simulated",
-        consent=tuple(consent.carried(*seen)),
+        consent=tuple(consent.merge_consent(*seen)),
     )
     return _write(out, found)
 

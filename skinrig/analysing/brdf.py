@@ -25,7 +25,7 @@ from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.errors import UnusableError
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 from skinrig.traits import labels as trait_labels
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
@@ -277,7 +277,7 @@ def analyse_measured(
         spheres=done[-1],
         method=method,
         source="measured" if any(one.source == "measured" for one in told) else "simulated",
-        agreed=consent.carried(*told),
+        agreed=consent.merge_consent(*told),
     )
     return done
 
@@ -298,7 +298,8 @@ def _measured(
     weights: list[SkinMap] = []
     while (name := f"basis_weight_{len(weights)}") in appearance.maps:
         weights.append(appearance.maps[name])
-    how = f"skinrig reconstruct SESSION --want r_d,basis_weight_0 --rank 24 --out {named(folder)}"
+    want = "--want r_d,basis_weight_0 --rank 24"
+    how = f"skinrig reconstruct SESSION {want} --out {shell_quote(folder)}"
     if not weights or BASIS_FILE not in appearance.files:
         raise AnalysisError(f"{folder}: holds no lobes; make them by `{how}`")
     try:
@@ -341,7 +342,7 @@ def _write(
     document = {
         "schema": SCHEMA,
         "source": source,
-        consent.KEY: [dict(one) for one in agreed],
+        consent.CONSENT_KEY: [dict(one) for one in agreed],
         "method": method,
         "rule": "plateau: the first rank whose error exceeds the least one by no more than 5 % of "
         "the fall from the first rank to the least; normalized: errors over that of the first rank",

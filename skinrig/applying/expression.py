@@ -216,7 +216,7 @@ def apply_expression(
                 "clamp": expression.clamp,
                 "emotional": expression.emotional,
                 "gain": expression.gain,
-                consent.KEY: consent.carried(*_faces(appearance, expression)),
+                consent.CONSENT_KEY: consent.merge_consent(*_faces(appearance, expression)),
                 "figures": _without_times(done.figures),
             },
             inputs={

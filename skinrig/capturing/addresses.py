@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from capture.rig import Rig
 from skinrig.errors import UsageError
+
+if TYPE_CHECKING:
+    from capture.devices.box import Box
 
 RETRY_S = 10.0
 """How long a device that is held, or reads out a frame of before, is asked for again."""
@@ -72,7 +75,26 @@ def require_addresses(
             raise UsageError(f"--camera {view.name}: {error}") from error
 
 
-def patiently(
+def open_box(kind: str, address: str, **settings: Any) -> Box:
+    """Return the driver of a box at an address; `settings` are its port's."""
+    from capture.devices.caliper import CaliperBox
+    from capture.devices.dome import DomeBox
+    from capture.devices.flash import FlashBox
+    from capture.devices.gradient_sphere import GradientSphereBox
+    from capture.devices.port import Port
+    from capture.devices.probe import ProbeBox
+
+    drivers: Mapping[str, type[Box]] = {
+        "flash": FlashBox,
+        "dome": DomeBox,
+        "gradient_sphere": GradientSphereBox,
+        "caliper": CaliperBox,
+        "probe": ProbeBox,
+    }
+    return drivers[kind](Port(address, **settings))
+
+
+def open_with_retry(
     open_device: Callable[[], _T],
     progress: Callable[[str], None],
     *,
@@ -88,14 +110,14 @@ def patiently(
     from capture.devices.port import PortBusy
 
     until_s = clock() + retry_s
-    told = False
+    reported = False
     while True:
         try:
             return open_device()
         except (CameraBusy, PortBusy) as error:
             if clock() >= until_s:
                 raise
-            if not told:
+            if not reported:
                 progress(f"{error}; trying again for {retry_s:g} s")
-            told = True
+            reported = True
         sleep(RETRY_PAUSE_S)

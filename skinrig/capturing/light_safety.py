@@ -12,7 +12,7 @@ from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
 
-WORDS: Final[Mapping[str, str]] = {
+LIGHT_FIGURE_LABELS: Final[Mapping[str, str]] = {
     "flashes_per_s": "flashes in the worst second",
     "flicker_rms": "flicker of 3 to 65 Hz, root mean square over the mean",
     "open_eyes": "open eyes",
@@ -44,7 +44,7 @@ def light_rows(figures: Mapping[str, float | str]) -> list[tuple[str, float | st
     [('open eyes', 'allowed'), ('of the blue-light limit of one that is stared at, %', 25.0)]
     """
     return [
-        (WORDS[name], 100 * float(value) if name == "blue_share" else value)
+        (LIGHT_FIGURE_LABELS[name], 100 * float(value) if name == "blue_share" else value)
         for name, value in figures.items()
     ]
 

@@ -10,11 +10,11 @@ from capture.plan.multiplexed import course_plan, multiplexed_plan
 from capture.plan.phases import phases
 from capture.rig import Rig
 
-EVENTS = ("exercise", "alcohol")
+EVENT_STATES = ("exercise", "alcohol")
 """States that follow an event instead of prompts."""
-DURATIONS_S = {"exercise": "60", "alcohol": "3600"}
+EVENT_DURATIONS_S = {"exercise": "60", "alcohol": "3600"}
 """How long they are followed by default, s: Jimenez et al. 2010, section 3."""
-PERIODS_S = {"exercise": "5.5", "alcohol": "300"}
+EVENT_SHOT_PERIODS_S = {"exercise": "5.5", "alcohol": "300"}
 """Time from shot to shot, s."""
 
 
@@ -23,7 +23,7 @@ class SequenceOrder:
     """A sequence that is asked for; times are the decimals that a user wrote."""
 
     state: str
-    """An expression that is made and dropped by prompts, or one of :data:`EVENTS`."""
+    """An expression that is made and dropped by prompts, or one of :data:`EVENT_STATES`."""
     prompt_period_s: str = "5"
     """Time from prompt to prompt, s."""
     shot_period_s: str | None = None
@@ -31,7 +31,7 @@ class SequenceOrder:
     captures: int | None = None
     """Shots of a prompted sequence; None: every phase, a tenth of them twice."""
     duration_s: str | None = None
-    """How long an event is followed, s; None: as :data:`DURATIONS_S`."""
+    """How long an event is followed, s; None: as :data:`EVENT_DURATIONS_S`."""
     reaction_s: float | None = None
     """Mean time from prompt to movement of the person that is simulated, s; None: the simulator's
     usual one. A real person has their own."""
@@ -39,7 +39,7 @@ class SequenceOrder:
     @property
     def prompted(self) -> bool:
         """Whether prompts make the course, and not an event."""
-        return self.state not in EVENTS
+        return self.state not in EVENT_STATES
 
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
@@ -80,8 +80,8 @@ def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
     return course_plan(
         rig,
         state=order.state,
-        duration_s=order.duration_s or DURATIONS_S[order.state],
-        shot_period_s=order.shot_period_s or PERIODS_S[order.state],
+        duration_s=order.duration_s or EVENT_DURATIONS_S[order.state],
+        shot_period_s=order.shot_period_s or EVENT_SHOT_PERIODS_S[order.state],
         darks=darks,
     )
 

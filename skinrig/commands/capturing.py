@@ -2,166 +2,281 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skinrig import errors
-from skinrig.commands import completion
+from skinrig.commands.help import RigCommand, RigFileGroup
 from skinrig.commands.options import (
     AllBrackets,
     Angles,
-    Captures,
     Consent,
     ConsentExpires,
-    Duration,
+    Directions,
     Json,
-    PromptPeriod,
-    Repeats,
-    Rig,
+    Pairs,
+    Placements,
+    Resume,
     Seed,
-    Sequence,
-    ShotPeriod,
+    SequenceOptions,
     Site,
     Sites,
+    Size,
     Steps,
+    Subject,
+    expand,
+    target_of,
 )
 from skinrig.console import Console, counted
 
+if TYPE_CHECKING:
+    from skinrig.capturing.acquisition import CaptureOrder
 
-def capture(
-    rig: Annotated[
-        str, typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=completion.rigs)
-    ],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
+capture_app = typer.Typer(
+    cls=RigFileGroup,
+    subcommand_metavar="RIG [ARGS]...",
+    help="Run a plan on a rig, by its name or its TOML file: real, or served by `skinrig serve`.",
+)
+serve_app = typer.Typer(
+    cls=RigFileGroup,
+    subcommand_metavar="RIG [ARGS]...",
+    help="Serve a simulated rig, by its name or its TOML file, to any client.",
+)
+
+Eyes = Annotated[
+    str, typer.Option("--eyes", help="The subject's eyes among LEDs: open, closed or shielded.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureOptions:
+    """Options of every capture."""
+
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None
     port: Annotated[
         list[str] | None, typer.Option(metavar="NAME=URL", help="Address of a box; repeatable.")
-    ] = None,
+    ] = None
     camera: Annotated[
         list[str] | None, typer.Option(metavar="VIEW=URL", help="Address of a camera; repeatable.")
-    ] = None,
-    plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None,
-    target: Annotated[
-        str | None, typer.Option(help="Plan of a calibration target, named as for simulate.")
-    ] = None,
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous",
-    consent: Consent = None,
-    consent_expires: ConsentExpires = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False,
-    plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None,
-    eyes: Annotated[
-        str, typer.Option(help="The subject's eyes among LEDs: open, closed or shielded.")
-    ] = "open",
-    force_limit: Annotated[
-        float | None,
-        typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
-    ] = None,
+    ] = None
+    plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None
+    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous"
+    consent: Consent = None
+    consent_expires: ConsentExpires = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False
+    plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None
+    resume: Resume = False
+    json: Json = False
+
+    def order(self, **more: Any) -> CaptureOrder:
+        """Return the order of a capture, with what only some rigs have."""
+        from skinrig.capturing.acquisition import CaptureOrder
+        from skinrig.capturing.addresses import addresses
+        from skinrig.consent import subject_of
+
+        return CaptureOrder(
+            out=self.out,
+            boxes=addresses(self.port or (), "--port"),
+            cameras=addresses(self.camera or (), "--camera"),
+            subject=subject_of(self.subject, self.consent, self.consent_expires),
+            dry_run=self.dry_run,
+            plan_out=self.plan_out,
+            resume=self.resume,
+            **more,
+        )
+
+
+@capture_app.command("flash", cls=RigCommand)
+@expand
+def capture_flash(
+    context: typer.Context,
+    common: CaptureOptions,
+    sequence: SequenceOptions,
+    target: Annotated[str | None, target_of("flash")] = None,
     state: Annotated[
-        list[str] | None,
-        typer.Option(help="State of the face before the flash rig, such as smile; repeatable."),
+        list[str] | None, typer.Option(help="State of the face, such as smile; repeatable.")
     ] = None,
-    sites: Sites = None,
-    repeats: Repeats = 1,
-    angles: Angles = None,
-    all_brackets: AllBrackets = False,
-    steps: Steps = None,
-    sequence: Sequence = None,
-    prompt_period: PromptPeriod = None,
-    shot_period: ShotPeriod = None,
-    captures: Captures = None,
-    duration: Duration = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
-    ] = False,
-    json: Json = False,
+    repeats: Pairs = 1,
 ) -> None:
-    """Run a plan on a rig: real, or served by `skinrig serve`.
+    """Run a plan on a flash rig: states of a face, a sequence in time, or a target.
 
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.capturing.acquisition import (
-        capture_session,
-        eyes_of,
-        names_of,
-        numbers_of,
-        range_of,
-        sequence_of,
-    )
-    from skinrig.consent import subject_of
-
-    console = Console(json)
-    done = capture_session(
-        rig,
-        out,
-        ports=port or [],
-        cameras=camera or [],
-        plan=plan,
-        target=target,
-        subject=subject_of(subject, consent, consent_expires),
-        dry_run=dry_run,
-        plan_out=plan_out,
-        resume=resume,
-        console=console,
-        eyes=eyes_of(eyes),
-        force_limit_n=force_limit,
-        angles=numbers_of(angles, "--angles"),
-        steps=range_of(steps, "--steps"),
-        sites=names_of(sites),
-        repeats=repeats,
-        all_brackets=all_brackets,
-        sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
-        states=tuple(state or ()),
-    )
-    console.document("skinrig.capture/1", done)
+    chosen = {"repeats": repeats, "sequence": sequence.order(), "states": tuple(state or ())}
+    _capture(context, common, common.order(), target, **chosen)
 
 
-def serve(
-    rig: Rig,
-    pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
+@capture_app.command("dome", cls=RigCommand)
+@expand
+def capture_dome(
+    context: typer.Context,
+    common: CaptureOptions,
+    target: Annotated[str | None, target_of("dome")] = None,
+    eyes: Eyes = "open",
+) -> None:
+    """Run a plan on a dome: a face under one light after the other, or a target.
+
+    Example: skinrig capture dome --dry-run
+    """
+    from skinrig.capturing.option_values import parse_eye_state
+
+    _capture(context, common, common.order(eyes=parse_eye_state(eyes)), target)
+
+
+@capture_app.command("gradient", cls=RigCommand)
+@expand
+def capture_gradient(
+    context: typer.Context,
+    common: CaptureOptions,
+    target: Annotated[str | None, target_of("gradient")] = None,
+    eyes: Eyes = "open",
+    force_limit: Annotated[
+        float | None,
+        typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
+    ] = None,
+    angles: Angles = None,
+    steps: Steps = None,
+) -> None:
+    """Run a plan on a gradient sphere: a patch of skin in a caliper, or a target.
+
+    Example: skinrig capture gradient --angles 0,90 --dry-run
+    """
+    from skinrig.capturing.option_values import parse_eye_state, parse_floats, parse_range
+
+    order = common.order(eyes=parse_eye_state(eyes), force_limit_n=force_limit)
+    chosen = {"angles": parse_floats(angles, "--angles"), "steps": parse_range(steps, "--steps")}
+    _capture(context, common, order, target, **chosen)
+
+
+@capture_app.command("probe", cls=RigCommand)
+@expand
+def capture_probe(
+    context: typer.Context,
+    common: CaptureOptions,
+    target: Annotated[str | None, target_of("probe")] = None,
+    sites: Sites = None,
+    repeats: Placements = 1,
+    angles: Directions = None,
+    all_brackets: AllBrackets = False,
+) -> None:
+    """Run a plan on a fibre probe: skin at some sites, or a target.
+
+    Example: skinrig capture probe --sites cheek --dry-run
+    """
+    from skinrig.capturing.option_values import parse_floats, parse_names
+
+    chosen = {
+        "sites": parse_names(sites),
+        "repeats": repeats,
+        "angles": parse_floats(angles, "--angles"),
+    }
+    _capture(context, common, common.order(all_brackets=all_brackets), target, **chosen)
+
+
+def _capture(
+    context: typer.Context,
+    common: CaptureOptions,
+    order: CaptureOrder,
+    target: str | None,
+    **chosen: Any,
+) -> None:
+    """Capture by a rig's own plan, or that of a file."""
+    from capture.rig import load_rig
+    from skinrig.capturing.acquisition import capture_session
+    from skinrig.capturing.plan_choice import choose_plan
+
+    console = Console(common.json)
+    rig = load_rig(str(context.info_name))
+    plan = choose_plan(rig, common.plan, target, **chosen)
+    console.document("skinrig.capture/1", capture_session(rig, plan, order, console))
+
+
+@dataclass(frozen=True, slots=True)
+class ServeOptions:
+    """Options of every served rig."""
+
+    pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False
     tcp: Annotated[
         str, typer.Option(help="Address for cameras and, without --pty, boxes; port 0: a free one.")
-    ] = "127.0.0.1:0",
-    anywhere: Annotated[
+    ] = "127.0.0.1:0"
+    allow_remote: Annotated[
         bool, typer.Option("--allow-remote", help="Let other machines connect.")
-    ] = False,
-    subject: Annotated[
-        str, typer.Option(help="Whose skin: a preset, I to VI, or a file NAME.toml.")
-    ] = "III",
-    site: Site = None,
-    size: Annotated[str, typer.Option(help="small or full.")] = "small",
-    seed: Seed = 0,
+    ] = False
+    subject: Subject = "III"
+    size: Size = "small"
+    seed: Seed = 0
     resume: Annotated[
         Path | None,
         typer.Option(
             help="Session that was captured from an earlier server of this rig and seed and is to "
             "be gone on with: noise of its shots does not come again."
         ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Serve a simulated rig to any client; the first lines are the addresses.
+    ] = None
+    json: Json = False
+
+
+@serve_app.command("flash", cls=RigCommand)
+@expand
+def serve_flash(context: typer.Context, common: ServeOptions) -> None:
+    """Serve a simulated flash rig; the first lines are the addresses.
 
     Boxes and cameras are on TCP, with --pty boxes on a pseudo terminal each. With --json the
     addresses are the one document, printed as soon as they can be opened.
 
     Example: skinrig serve flash --pty
     """
-    from skinrig.simulating.serving import serve_rig
+    _serve(context, common)
 
-    serve_rig(
-        rig,
-        pty=pty,
-        tcp=tcp,
-        allow_remote=anywhere,
-        subject=subject,
-        size=size,
-        seed=seed,
+
+@serve_app.command("dome", cls=RigCommand)
+@expand
+def serve_dome(context: typer.Context, common: ServeOptions) -> None:
+    """Serve a simulated dome with all its lights and cameras; the first lines are the addresses.
+
+    Example: skinrig serve dome --subject II
+    """
+    _serve(context, common)
+
+
+@serve_app.command("gradient", cls=RigCommand)
+@expand
+def serve_gradient(context: typer.Context, common: ServeOptions, site: Site = None) -> None:
+    """Serve a simulated gradient sphere, small only; the first lines are the addresses.
+
+    Example: skinrig serve gradient --site cheek
+    """
+    _serve(context, common, site)
+
+
+@serve_app.command("probe", cls=RigCommand)
+@expand
+def serve_probe(context: typer.Context, common: ServeOptions) -> None:
+    """Serve a simulated fibre probe on skin; the first lines are the addresses.
+
+    Example: skinrig serve probe --subject IV
+    """
+    _serve(context, common)
+
+
+def _serve(context: typer.Context, common: ServeOptions, site: str | None = None) -> None:
+    """Serve a rig until interrupted."""
+    from skinrig.simulating.serving import ServeOrder, serve_rig
+
+    order = ServeOrder(
+        pty=common.pty,
+        tcp=common.tcp,
+        allow_remote=common.allow_remote,
+        subject=common.subject,
+        size=common.size,
+        seed=common.seed,
         site=site,
-        resume=resume,
-        as_json=json,
+        resume=common.resume,
     )
+    serve_rig(str(context.info_name), order, Console(common.json))
 
 
 def verify(

@@ -8,18 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from skinrig.next_steps import CALIBRATIONS, WANTS
-
-
-def rigs(incomplete: str) -> list[str]:
-    """Return rigs that begin so.
-
-    Examples
-    --------
-    >>> rigs("d")
-    ['dome']
-    """
-    return beginning(CALIBRATIONS, incomplete)
+from skinrig.next_steps import CALIBRATION_BY_TARGET, DEFAULT_WANTS
 
 
 def several_rigs(incomplete: str) -> list[str]:
@@ -30,17 +19,23 @@ def several_rigs(incomplete: str) -> list[str]:
     >>> several_rigs("flash,d")
     ['flash,dome']
     """
-    return after_comma(CALIBRATIONS, incomplete)
+    return after_comma(CALIBRATION_BY_TARGET, incomplete)
 
 
-def targets(incomplete: str) -> list[str]:
-    """Return calibration targets of all rigs."""
-    return beginning({name for kinds in CALIBRATIONS.values() for name in kinds}, incomplete)
+def targets_of(rig: str) -> tuple[str, ...]:
+    """Return the calibration targets of a rig.
+
+    Examples
+    --------
+    >>> targets_of("probe")
+    ('phantom', 'dark')
+    """
+    return tuple(dict.fromkeys((*CALIBRATION_BY_TARGET[rig], "dark")))
 
 
 def calibrations(incomplete: str) -> list[str]:
     """Return kinds of calibration."""
-    kinds = {kind for kinds in CALIBRATIONS.values() for kind in kinds.values()}
+    kinds = {kind for kinds in CALIBRATION_BY_TARGET.values() for kind in kinds.values()}
     return beginning(kinds, incomplete)
 
 
@@ -52,7 +47,7 @@ def wants(incomplete: str) -> list[str]:
     >>> wants("melanin,hemo")
     ['melanin,hemoglobin']
     """
-    names = dict.fromkeys(name for text in WANTS.values() for name in text.split(","))
+    names = dict.fromkeys(name for text in DEFAULT_WANTS.values() for name in text.split(","))
     return after_comma(names, incomplete)
 
 

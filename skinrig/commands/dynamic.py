@@ -11,7 +11,7 @@ import typer
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 
 Weights = Annotated[
     str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
@@ -77,7 +77,9 @@ def fit_facial_color(
     states = ",".join(found.hemoglobin)
     console.say(f"{out}: hemoglobin rig of {states}")
     last = list(found.changes)[-1]
-    console.say(f"next: skinrig apply expression {named(out)} --weights {last}=1 --out {last}")
+    console.say(
+        f"next: skinrig apply expression {shell_quote(out)} --weights {last}=1 --out {last}"
+    )
     console.document(
         "skinrig.fit/1",
         {
@@ -149,7 +151,8 @@ def fit_microstructure(
     console = Console(json)
     found = fit(appearances, out=out, paper_table=paper_table, on_message=console.say)
     console.say(
-        f"next: skinrig apply microstructure {named(out)} --mesh MESH --weights SHAPE=1 --out DIR"
+        f"next: skinrig apply microstructure {shell_quote(out)} --mesh MESH --weights SHAPE=1 "
+        "--out DIR"
     )
     console.document(
         "skinrig.fit/1",
@@ -323,5 +326,54 @@ def _tell(console: Console, out: Path, done: Any) -> None:
             "maps": list(done.maps),
             "figures": done.figures,
             "left_out": [list(row) for row in done.left_out],
+        },
+    )
+
+
+@fit_app.command("reflectance", cls=Command)
+def fit_reflectance(
+    dome: Annotated[Path, typer.Argument(help="Maps of a dome session: normals, r_d, lobes.")],
+    out: NewMaps,
+    probe: Annotated[
+        Path | None, typer.Argument(help="Maps of a fibre probe session on the same subject.")
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            "--landmarks",
+            "--sites",
+            help="Table name,x,y of the probe's sites in texels of the dome's maps.",
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Put lobes, albedo, normals and translucency of a subject together as one model.
+
+    Example: skinrig fit reflectance appearance-dome appearance-probe --out model
+    """
+    from skinrig.fitting.reflectance import fit_reflectance as fit
+    from skinrig.fitting.reflectance import summary
+
+    console = Console(json)
+    found = fit(dome, probe, out=out, landmarks=landmarks)
+    rows = summary(found)
+    console.rows(("median over valid texels", "red", "green", "blue"), rows)
+    for site in found.placed.sites if found.placed is not None else ():
+        console.say(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
+    for text in found.assumed:
+        console.say(f"assumed: {text}")
+    for what, why in found.left_out:
+        console.say(f"left out: {what}: {why}")
+    valid = float(found.model.valid.mean())
+    console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
+    console.say(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
+    console.document(
+        "skinrig.fit/1",
+        {
+            "model": "reflectance",
+            "out": out,
+            "assumed": list(found.assumed),
+            "left_out": [list(row) for row in found.left_out],
+            "rows": [list(row) for row in rows],
         },
     )

@@ -10,7 +10,7 @@ import typer
 from skinrig.commands.options import Json, NewMaps, Seed
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 
 
 def edit(
@@ -90,7 +90,7 @@ def edit(
     for text in done.warnings:
         console.say(f"warning: {text}")
     console.say(f"{out}: {', '.join(done.changed) or 'nothing'} changed")
-    console.say(f"next: skinrig render {named(out)} --out pictures")
+    console.say(f"next: skinrig render {shell_quote(out)} --out pictures")
     console.document("skinrig.edit/1", {"out": out, **done.record})
 
 
@@ -154,7 +154,7 @@ def fit_traits(
     console.say(f"{out}: {len(names)} traits of {len(found.faces)} faces")
     first = names[0]
     console.say(
-        f"next: skinrig edit APPEARANCE --space {named(out)} --trait {first}=1 --out edited"
+        f"next: skinrig edit APPEARANCE --space {shell_quote(out)} --trait {first}=1 --out edited"
     )
     console.document(
         "skinrig.fit/1",

@@ -8,6 +8,8 @@ from typing import Any, Final, cast
 
 from typer.core import TyperCommand, TyperGroup
 
+from skinrig.errors import UnusableError, UsageError
+
 SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Begin", ("demo", "doctor")),
     (
@@ -90,6 +92,75 @@ class Subcommands(TyperGroup):
         found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
+
+
+class RigCommand(Command):
+    """A command of one rig, which refuses options of other rigs by their names."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the arguments; an option of another rig is a usage error that names the rigs."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:  # Typer does not export the class of unknown options
+            option = getattr(error, "option_name", None)
+            group = ctx.parent.command.commands if option and ctx.parent else {}
+            others = [rig for rig, command in group.items() if option in _options(command)]
+            if not others:
+                raise
+            raise UsageError(
+                f"{option}: the {self.name} rig knows nothing of it; leave it out (it is for "
+                f"{', '.join(others)})"
+            ) from error
+
+
+class RigGroup(Subcommands):
+    """Commands of one verb, one a rig; options may also stand before the rig."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Move the rig before the options, where Typer expects a command."""
+        options: dict[str, Any] = {}
+        for command in self.commands.values():
+            options |= _options(command)
+        place = 0
+        while place < len(args) and args[place].startswith("-"):
+            option = options.get(args[place])
+            place += 1 if option is None or option.is_flag else 2
+        if 0 < place < len(args):
+            args = [args[place], *args[:place], *args[place + 1 :]]
+        elif args and args[0].partition("=")[0] in options and not ctx.resilient_parsing:
+            ctx.fail(f"Missing argument 'RIG': {', '.join(self.commands)}")
+        return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Return the command of the rig that is named first."""
+        if args[0] in self.commands or ctx.resilient_parsing:
+            return cast(tuple[str | None, Any, list[str]], super().resolve_command(ctx, args))
+        return args[0], self.commands[self.kind_of(args[0])], args[1:]
+
+    def kind_of(self, rig: str) -> str:
+        """Return the command for a rig of another name than those of the commands."""
+        raise UnusableError(f"rig: got {rig!r}, expected one of {', '.join(self.commands)}")
+
+
+class RigFileGroup(RigGroup):
+    """Commands of one verb, one a rig, which also take a rig's own TOML file."""
+
+    def kind_of(self, rig: str) -> str:
+        """Return which of the four rigs a file describes."""
+        from capture.rig import load_rig
+
+        described = load_rig(rig)
+        if described.probe is not None:
+            return "probe"
+        kinds = {"gradient_sphere": "gradient", "dome": "dome"}
+        return next((kind for box, kind in kinds.items() if box in described.boxes), "flash")
+
+
+def _options(command: Any) -> dict[str, Any]:
+    """Return the options of a command by each of their spellings."""
+    return {
+        name: option for option in command.params for name in (*option.opts, *option.secondary_opts)
+    }
 
 
 def summary(command: Any) -> str:

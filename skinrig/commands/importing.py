@@ -10,7 +10,7 @@ import typer
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out
 from skinrig.console import Console, counted
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
     cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
@@ -47,7 +47,7 @@ def import_photos(
     console.say(
         f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
-    place = named(out)
+    place = shell_quote(out)
     if done.color_states:
         shown = "neutral" if "neutral" in done.color_states else done.color_states[0]
         state = "" if shown == "neutral" else f" --state {shown}"
@@ -91,8 +91,8 @@ def import_mesh(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
-    after = f"reconstruct {named(done.path)} --want normals --out appearance"
-    console.say(f"next: skinrig {after if done.reopened else f'verify {named(done.path)}'}")
+    after = f"reconstruct {shell_quote(done.path)} --want normals --out appearance"
+    console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
     console.document(
         "skinrig.import/1",
         {
@@ -141,7 +141,9 @@ def import_lp(
     for text in done.assumed:
         console.say(f"assumed: {text}")
     console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
-    console.say(f"next: skinrig reconstruct {named(out)} --want normals,albedo --out appearance")
+    console.say(
+        f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
+    )
     console.document(
         "skinrig.import/1",
         {

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from datetime import datetime
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from skinrig.commands import completion
 from skinrig.errors import UnusableError, UsageError
 
-Rig = Annotated[
-    str,
-    typer.Argument(
-        help="Name of a rig: flash, dome, gradient or probe.", autocompletion=completion.rigs
-    ),
-]
+if TYPE_CHECKING:
+    from skinrig.capturing.sequences import SequenceOrder
+
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
@@ -52,48 +52,37 @@ def page_to_write(context: typer.Context, out: Path | None) -> Path | None:
 STDOUT = "-"
 """The standard output where a file is named."""
 Page = Annotated[Path, typer.Option("-o", "--out", callback=page_to_write, help="The page.")]
+Subject = Annotated[
+    str,
+    typer.Option(
+        help="Whose skin: a preset, I to VI, palest or darkest, or a file NAME.toml.",
+        autocompletion=completion.subjects,
+    ),
+]
+Size = Annotated[
+    str, typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes)
+]
+Width = Annotated[int | None, typer.Option(help="Pixels across, instead of the size.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
+]
 Site = Annotated[
-    str | None,
-    typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),
+    str | None, typer.Option(help="Where the skin is from: forehead (default), cheek or chin.")
 ]
 Sites = Annotated[
     str | None,
     typer.Option(help="Where the probe is placed, joined by commas: forehead,cheek,chin."),
 ]
-Repeats = Annotated[
-    int, typer.Option(help="Placements of the probe a site and angle; pairs a state of the flash.")
-]
+Pairs = Annotated[int, typer.Option("--repeats", help="Image pairs a state.")]
+Placements = Annotated[int, typer.Option("--repeats", help="Placements a site and direction.")]
 AllBrackets = Annotated[
-    bool, typer.Option("--all-brackets", help="The probe's exposures that can show no more, too.")
+    bool, typer.Option("--all-brackets", help="Record every exposure, also such as show no more.")
 ]
 Angles = Annotated[
-    str | None,
-    typer.Option(
-        help="Angles of the caliper, degrees, joined by commas: 0,90; of the probe how many "
-        "directions of its head: 16."
-    ),
+    str | None, typer.Option(help="Angles of the caliper, degrees, joined by commas: 0,90.")
 ]
-Sequence = Annotated[
-    str | None,
-    typer.Option(
-        help="Of the flash rig, a sequence in time: an expression made and dropped by a sound, "
-        "such as smile, or exercise or alcohol, followed after the event."
-    ),
-]
-PromptPeriod = Annotated[
-    str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
-]
-ShotPeriod = Annotated[
-    str | None,
-    typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
-]
-Captures = Annotated[
-    int | None,
-    typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
-]
-Duration = Annotated[
-    str | None,
-    typer.Option(help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
+Directions = Annotated[
+    str | None, typer.Option("--angles", help="How many directions of the head: 16.")
 ]
 Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
 Consent = Annotated[
@@ -104,3 +93,90 @@ ConsentExpires = Annotated[
     datetime | None,
     typer.Option("--consent-expires", formats=["%Y-%m-%d"], help="Last day of the consent."),
 ]
+
+
+def target_of(rig: str) -> Any:
+    """Return the option --target of a rig."""
+    names = completion.targets_of(rig)
+    return typer.Option(
+        help=f"A target instead of a subject: {', '.join(names)}.",
+        autocompletion=lambda incomplete: completion.beginning(names, incomplete),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceOptions:
+    """Options of a sequence in time before the flash rig."""
+
+    sequence: Annotated[
+        str | None,
+        typer.Option(
+            help="A sequence in time: an expression made and dropped by a sound, such as smile, or "
+            "exercise or alcohol, followed after the event."
+        ),
+    ] = None
+    prompt_period: Annotated[
+        str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
+    ] = None
+    shot_period: Annotated[
+        str | None,
+        typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
+    ] = None
+    captures: Annotated[
+        int | None,
+        typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
+    ] = None
+    duration: Annotated[
+        str | None,
+        typer.Option(
+            help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."
+        ),
+    ] = None
+
+    def order(self) -> SequenceOrder | None:
+        """Return the sequence that is asked for; None without one."""
+        from skinrig.capturing.option_values import parse_sequence
+
+        return parse_sequence(
+            self.sequence, self.prompt_period, self.shot_period, self.captures, self.duration
+        )
+
+
+def expand(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of its dataclass parameters as options.
+
+    Parameters
+    ----------
+    function
+        Each parameter that is annotated with a dataclass gets an object of it. The fields of the
+        dataclass are options of the command, in its place.
+    """
+    types = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {name: kind for name, kind in types.items() if is_dataclass(kind)}
+    shown: list[Parameter] = []
+    for name, one in signature(function).parameters.items():
+        if name not in groups:
+            shown.append(one.replace(annotation=types[name], kind=Parameter.KEYWORD_ONLY))
+            continue
+        hints = get_type_hints(groups[name], include_extras=True)
+        for option in fields(groups[name]):
+            default = Parameter.empty if option.default is MISSING else option.default
+            shown.append(
+                Parameter(
+                    option.name,
+                    Parameter.KEYWORD_ONLY,
+                    default=default,
+                    annotation=hints[option.name],
+                )
+            )
+
+    def command(**given: Any) -> None:
+        made = {
+            name: kind(**{one.name: given.pop(one.name) for one in fields(kind)})
+            for name, kind in groups.items()
+        }
+        function(**made, **given)
+
+    command.__name__, command.__doc__ = function.__name__, function.__doc__
+    command.__signature__ = Signature(shown)  # type: ignore[attr-defined]
+    return command

@@ -1,75 +1,134 @@
-"""The command `skinrig plan`."""
+"""The commands that choose plans, one a rig."""
 
 from __future__ import annotations
 
 import json as json_text
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from skinrig import errors
-from skinrig.commands import completion
-from skinrig.commands.options import Json, Rig, file_to_write
+from skinrig.commands.help import RigCommand, RigGroup
+from skinrig.commands.options import Json, Subject, expand, file_to_write
 from skinrig.console import Console
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 from skinrig.written_units import written
 
+plan_app = typer.Typer(
+    cls=RigGroup,
+    subcommand_metavar="RIG [ARGS]...",
+    help="Choose the smallest plan that reaches an error, and say what it leaves out.",
+)
 
-def plan(
-    rig: Rig,
-    want: Annotated[
-        str,
-        typer.Option(
-            help="Medians that must be reached: dome normals<=1deg,r_d<=3%; flash melanin<=12%,"
-            "hemoglobin<=25%; gradient normals<=2deg; probe sigma_tr<=3%. Empty: what the whole "
-            "rig, or --forecast, will give."
-        ),
-    ] = "",
-    subject: Annotated[
-        str,
-        typer.Option(
-            help="Skin that is forecast: a preset, I to VI, or a file NAME.toml.",
-            autocompletion=completion.subjects,
-        ),
-    ] = "III",
-    width: Annotated[
-        int | None, typer.Option(help="Pixels across the cameras; default: the rig's own.")
-    ] = None,
-    most_lights: Annotated[
-        int | None, typer.Option(help="No more lights of the dome than these.")
-    ] = None,
+
+def _want(example: str) -> typer.models.OptionInfo:
+    """Return the option --want of a rig."""
+    return typer.Option(
+        help=f"Medians that must be reached: {example}. Empty: what the whole rig, or --forecast, "
+        "will give."
+    )
+
+
+PlanWidth = Annotated[
+    int | None, typer.Option("--width", help="Pixels across the cameras; default: the rig's own.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOptions:
+    """Options of every choice of a plan."""
+
+    subject: Subject = "III"
     valid_share: Annotated[
         float, typer.Option(help="Of what the whole rig gives an estimate, so much must keep it.")
-    ] = 0.9,
+    ] = 0.9
     forecast: Annotated[
         Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
-    ] = None,
+    ] = None
     out: Annotated[
         Path | None, typer.Option("--out", callback=file_to_write, help="File for the plan, JSON.")
-    ] = None,
+    ] = None
     confirm: Annotated[
         Path | None,
         typer.Option(help="Folder: simulate the plan, reconstruct, and compare with the forecast."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the face.")] = 0,
-    json: Json = False,
+    ] = None
+    seed: Annotated[int, typer.Option(help="Seed of the face.")] = 0
+    json: Json = False
+
+
+@plan_app.command("dome", cls=RigCommand)
+@expand
+def plan_dome(
+    common: PlanOptions,
+    want: Annotated[str, _want("normals<=1deg,r_d<=3%")] = "",
+    width: PlanWidth = None,
+    most_lights: Annotated[int | None, typer.Option(help="No more lights than these.")] = None,
 ) -> None:
-    """Choose the smallest plan that reaches an error, and say what it leaves out.
+    """Choose the dome's lights and cameras that reach an error, and say what is left out.
 
     Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
 
-    Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
-
     Example: skinrig plan dome --forecast plan.json
     """
-    from skinrig.planning.plans import choose, confirmed, lines
-    from skinrig.simulating.subject_records import unseen
+    _plan("dome", common, want, width, most_lights)
 
-    console = Console(json)
-    if not 0 < valid_share <= 1:
-        raise errors.UnusableError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
-    unused = unseen(subject, rig, console.progress)
+
+@plan_app.command("flash", cls=RigCommand)
+@expand
+def plan_flash(
+    common: PlanOptions,
+    want: Annotated[str, _want("melanin<=12%,hemoglobin<=25%")] = "",
+    width: PlanWidth = None,
+) -> None:
+    """Choose the flash rig's pairs and powers that reach an error, and say what is left out.
+
+    Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
+    """
+    _plan("flash", common, want, width)
+
+
+@plan_app.command("gradient", cls=RigCommand)
+@expand
+def plan_gradient(
+    common: PlanOptions, want: Annotated[str, _want("normals<=2deg")] = "", width: PlanWidth = None
+) -> None:
+    """Choose the gradient sphere's scan that reaches an error, and say what is left out.
+
+    Example: skinrig plan gradient --want "normals<=2.5deg" --out plan.json
+    """
+    _plan("gradient", common, want, width)
+
+
+@plan_app.command("probe", cls=RigCommand)
+@expand
+def plan_probe(common: PlanOptions, want: Annotated[str, _want("sigma_tr<=3%")] = "") -> None:
+    """Choose the probe's sites, placements and brackets that reach an error.
+
+    Example: skinrig plan probe --want "sigma_tr<=4%" --out plan.json
+    """
+    _plan("probe", common, want)
+
+
+def _plan(
+    rig: str,
+    common: PlanOptions,
+    want: str,
+    width: int | None = None,
+    most_lights: int | None = None,
+) -> None:
+    """Choose a plan, print it, and write it."""
+    from skinrig.planning.plans import choose, confirmed, lines
+    from skinrig.simulating.subject_records import unused_subject_keys
+
+    console = Console(common.json)
+    subject, seed = common.subject, common.seed
+    if not 0 < common.valid_share <= 1:
+        raise errors.UnusableError(
+            f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
+        )
+    unused = unused_subject_keys(subject, rig, console.progress)
     choice = choose(
         rig,
         want,
@@ -77,8 +136,8 @@ def plan(
         seed=seed,
         width_px=width,
         most_lights=most_lights,
-        valid_share=valid_share,
-        forecast=forecast,
+        valid_share=common.valid_share,
+        forecast=common.forecast,
     )
     for line in lines(choice):
         console.say(line)
@@ -86,20 +145,22 @@ def plan(
     if unused:
         document["subject_unused"] = list(unused)
     reached = choice.reached
-    if confirm is not None:
-        found = confirmed(choice, confirm, subject=subject, seed=seed, progress=console.progress)
+    if common.confirm is not None:
+        found = confirmed(
+            choice, common.confirm, subject=subject, seed=seed, progress=console.progress
+        )
         document["confirmation"] = found
         for row in found:
             console.say(
                 f"measured: {row['name']} {written(format(row['median'], '.3g'), row['unit'])}, "
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
-    if out is not None:
+    if (out := common.out) is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         part = out.with_name(f".{out.name}.part")
         part.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
         part.replace(out)
-        console.say(f"next: skinrig capture {rig} --plan {named(out)} --out session")
+        console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:
         raise typer.Exit(errors.LIMIT_MISSED)

@@ -12,7 +12,7 @@ from skinrig.commands import completion
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console, counted
 from skinrig.errors import UnusableError
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 
 
 def calibrate(
@@ -175,7 +175,7 @@ def reconstruct(
                 "work": [dict(w) for w in done.work],
             }
         )
-    console.say(f"next: skinrig report {named(out)}")
+    console.say(f"next: skinrig report {shell_quote(out)}")
     console.document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )

@@ -1,150 +1,155 @@
-"""The command that simulates captures."""
+"""The commands that simulate captures, one a rig."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skinrig.commands import completion
+from skinrig.commands.help import RigCommand, RigGroup
 from skinrig.commands.options import (
     AllBrackets,
     Angles,
-    Captures,
     Consent,
     ConsentExpires,
-    Duration,
+    Directions,
     Json,
     Out,
-    PromptPeriod,
-    Repeats,
-    Rig,
+    Pairs,
+    Placements,
+    Resume,
     Seed,
-    Sequence,
-    ShotPeriod,
+    SequenceOptions,
     Site,
     Sites,
+    Size,
     Steps,
+    Subject,
+    Width,
+    expand,
+    target_of,
 )
 from skinrig.console import Console, counted
 
+if TYPE_CHECKING:
+    from skinrig.simulating.orders import Order
 
-def simulate(
-    rig: Rig,
-    out: Out,
-    size: Annotated[
-        str, typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes)
-    ] = "small",
-    width: Annotated[
-        int | None, typer.Option(help="Pixels across, instead of the size; even but for gradient.")
-    ] = None,
-    lights: Annotated[
-        int | None, typer.Option(help="How many of the dome's lights; default 48, full all 150.")
-    ] = None,
-    views: Annotated[
-        int | None, typer.Option(help="How many of the dome's cameras; default 6, full all 16.")
-    ] = None,
-    move: Annotated[bool, typer.Option("--move", help="The face in the dome moves.")] = False,
-    seed: Seed = 0,
-    subject: Annotated[
-        str,
-        typer.Option(
-            help="Preset, I to VI, palest or darkest, or a file NAME.toml; of the dome also P01 to "
-            "P87 of the simulated population; of the probe also a medium, "
-            "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
-            "sigma_s', 1/mm, and AXIS in degrees.",
-            autocompletion=completion.subjects,
-        ),
-    ] = "III",
-    mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
-    target: Annotated[
-        str | None,
-        typer.Option(
-            help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
-            "of the dome charuco, mirror; of the gradient rig ball, flat; of the probe phantom.",
-            autocompletion=completion.targets,
-        ),
-    ] = None,
-    site: Site = None,
-    sites: Sites = None,
-    repeats: Repeats = 1,
-    angles: Angles = None,
-    all_brackets: AllBrackets = False,
-    steps: Steps = None,
-    state: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="State of the face, such as smile or exercise; repeatable for the flash rig.",
-            autocompletion=completion.states,
-        ),
-    ] = None,
+simulate_app = typer.Typer(
+    cls=RigGroup,
+    subcommand_metavar="RIG [ARGS]...",
+    help="Capture a simulated subject or target through the real drivers into SESSION/.",
+)
+
+States = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="State of the face, such as smile or exercise; repeatable.",
+        autocompletion=completion.states,
+    ),
+]
+OneState = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="State of the face, such as smile or exercise; one.", autocompletion=completion.states
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class SimulateOptions:
+    """Options of every simulation."""
+
+    out: Out
+    size: Size = "small"
+    seed: Seed = 0
+    plan: Annotated[
+        Path | None, typer.Option(help="What is captured of the subject, by `skinrig plan`.")
+    ] = None
+    consent: Consent = None
+    consent_expires: ConsentExpires = None
+    resume: Resume = False
+    json: Json = False
+
+    def ordered(self, subject: str, console: Console) -> dict[str, Any]:
+        """Return what every order has, by name."""
+        from skinrig.capturing.plan_choice import read_plan
+        from skinrig.consent import subject_of
+        from skinrig.simulating.orders import USES
+        from skinrig.simulating.subject_records import pseudonym
+
+        # a resumed session keeps what it was begun with, unless something else is said
+        person = None
+        if not self.resume or self.consent or self.consent_expires is not None:
+            name = pseudonym(subject, self.seed)
+            person = subject_of(name, self.consent or USES, self.consent_expires)
+        return {
+            "out": self.out,
+            "size": self.size,
+            "seed": self.seed,
+            "subject": subject,
+            "plan": None if self.plan is None else read_plan(self.plan),
+            "resume": self.resume,
+            "person": person,
+            "progress": console.progress,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class FaceOptions:
+    """Options of a simulated face."""
+
+    width: Annotated[int | None, typer.Option(help="Pixels across, instead of the size; even.")] = (
+        None
+    )
+    mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None
     movement: Annotated[
         bool,
         typer.Option(
             "--movement/--no-movement",
             help="Whether the face moves and wrinkles with its states, or its blood changes only.",
         ),
-    ] = True,
-    wrapped: Annotated[
-        bool,
-        typer.Option(
-            "--wrapped",
-            help="The dome's scan is a template wrapped onto the face: one texture for all states.",
-        ),
-    ] = False,
-    subsurface: Annotated[
-        bool,
-        typer.Option(
-            "--subsurface",
-            help="Light in the dome spreads sideways in the skin, even where no pixel shows it.",
-        ),
-    ] = False,
-    interreflections: Annotated[
-        bool,
-        typer.Option(
-            "--interreflections",
-            help="Light in the dome goes from skin to skin, even where no pixel shows it.",
-        ),
-    ] = False,
+    ] = True
     leave_out: Annotated[
         str | None,
         typer.Option(
-            help="What a scene of skin does not build although it changes pixels, joined by "
-            "commas. Flash rig: lateral, interreflections, spectral, optics, relief_shadows; dome: "
-            "subsurface for lateral, and the same; gradient rig: shadows, lateral, "
-            "interreflections, optics."
+            help="What of skin is not built although it changes pixels, joined by commas: lateral "
+            "(or subsurface), interreflections, spectral, optics, relief_shadows."
         ),
-    ] = None,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[=AMOUNT]",
-            help="Condition of the face in the dome, by up to 1 of it: cold, hot, "
-            "sweat, lotion, makeup, powder; repeatable.",
-            autocompletion=completion.conditions,
-        ),
-    ] = None,
+    ] = None
+
+    def ordered(self) -> dict[str, Any]:
+        """Return what orders of faces have, by name."""
+        from skinrig.capturing.option_values import parse_names
+
+        return {
+            "width_px": self.width,
+            "mesh": self.mesh,
+            "movement": self.movement,
+            "leave_out": parse_names(self.leave_out) or (),
+        }
+
+
+@simulate_app.command("flash", cls=RigCommand)
+@expand
+def simulate_flash(
+    common: SimulateOptions,
+    face: FaceOptions,
+    sequence: SequenceOptions,
+    subject: Subject = "III",
+    target: Annotated[str | None, target_of("flash")] = None,
+    repeats: Pairs = 1,
+    state: States = None,
     nearer: Annotated[
         float,
         typer.Option(
             metavar="MM",
-            help="How much nearer to the flash rig's camera than the white tile the face stands, "
-            "mm; below 0 farther.",
+            help="How much nearer to the camera than the white tile the face stands, mm; below 0 "
+            "farther.",
         ),
     ] = 0.0,
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            help="What is captured of the subject, by `skinrig plan`; its lights and cameras are "
-            "also those of the dome's targets."
-        ),
-    ] = None,
-    sequence: Sequence = None,
-    prompt_period: PromptPeriod = None,
-    shot_period: ShotPeriod = None,
-    captures: Captures = None,
-    duration: Duration = None,
     relaxation: Annotated[
         float | None,
         typer.Option(
@@ -152,72 +157,187 @@ def simulate(
             "alcohol 1200."
         ),
     ] = None,
-    consent: Consent = None,
-    consent_expires: ConsentExpires = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
-    ] = False,
-    json: Json = False,
 ) -> None:
-    """Capture a simulated subject or target through the real drivers into SESSION/.
+    """Simulate the flash rig: a face in one or more states, a sequence in time, or a target.
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.capturing.acquisition import (
-        amounts_of,
-        names_of,
-        numbers_of,
-        range_of,
-        read_plan,
-        sequence_of,
-    )
-    from skinrig.consent import subject_of
-    from skinrig.next_steps import after_session
-    from skinrig.simulating.orders import USES
-    from skinrig.simulating.simulation import simulate_session
-    from skinrig.simulating.subject_records import pseudonym
+    from skinrig.simulating.orders import FlashOrder
 
-    console = Console(json)
-    # a resumed session keeps what it was begun with, unless something else is said
-    said = not resume or consent or consent_expires is not None
-    done = simulate_session(
-        rig,
-        out,
-        size=size,
-        width_px=width,
-        seed=seed,
-        subject=subject,
-        mesh=mesh,
+    console = Console(common.json)
+    order = FlashOrder(
+        **common.ordered(subject, console),
+        **face.ordered(),
         target=target,
         states=tuple(state or ("neutral",)),
-        resume=resume,
+        repeats=repeats,
+        nearer_mm=nearer,
+        sequence=sequence.order(),
+        relaxation_s=relaxation,
+    )
+    _simulate(order, console, "sequence" if order.sequence is not None else target)
+
+
+@simulate_app.command("dome", cls=RigCommand)
+@expand
+def simulate_dome(
+    common: SimulateOptions,
+    face: FaceOptions,
+    subject: Annotated[
+        str,
+        typer.Option(
+            help="Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
+            "simulated population.",
+            autocompletion=completion.subjects,
+        ),
+    ] = "III",
+    target: Annotated[str | None, target_of("dome")] = None,
+    lights: Annotated[
+        int | None, typer.Option(help="How many lights; default 48, full all 150.")
+    ] = None,
+    views: Annotated[
+        int | None, typer.Option(help="How many cameras; default 6, full all 16.")
+    ] = None,
+    move: Annotated[bool, typer.Option("--move", help="The face moves.")] = False,
+    state: OneState = None,
+    wrapped: Annotated[
+        bool,
+        typer.Option(
+            "--wrapped",
+            help="The scan is a template wrapped onto the face: one texture for all states.",
+        ),
+    ] = False,
+    subsurface: Annotated[
+        bool,
+        typer.Option(
+            "--subsurface", help="Light spreads sideways in the skin, even where no pixel shows it."
+        ),
+    ] = False,
+    interreflections: Annotated[
+        bool,
+        typer.Option(
+            "--interreflections", help="Light goes from skin to skin, even where no pixel shows it."
+        ),
+    ] = False,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[=AMOUNT]",
+            help="Condition of the face, by up to 1 of it: cold, hot, sweat, lotion, makeup, "
+            "powder; repeatable.",
+            autocompletion=completion.conditions,
+        ),
+    ] = None,
+) -> None:
+    """Simulate the dome: a face in one state, with a scan of it, or a target.
+
+    Lights and cameras of a plan are those of targets, too.
+
+    Example: skinrig simulate dome --out session-dome --subject IV --condition sweat=0.5
+    """
+    from skinrig.capturing.option_values import parse_amounts
+    from skinrig.simulating.orders import DomeOrder
+
+    console = Console(common.json)
+    order = DomeOrder(
+        **common.ordered(subject, console),
+        **face.ordered(),
+        target=target,
         lights=lights,
         views=views,
         move=move,
-        site=site,
-        angles=numbers_of(angles, "--angles"),
-        steps=range_of(steps, "--steps"),
-        sites=names_of(sites),
-        repeats=repeats,
-        all_brackets=all_brackets,
-        movement=movement,
+        states=tuple(state or ("neutral",)),
         wrapped=wrapped,
-        progress=console.progress,
-        person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires)
-        if said
-        else None,
-        sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
-        relaxation_s=relaxation,
         subsurface=subsurface,
         interreflections=interreflections,
-        conditions=amounts_of(condition, "--condition"),
-        plan=None if plan is None else read_plan(plan),
-        leave_out=names_of(leave_out) or (),
-        nearer_mm=nearer,
+        conditions=parse_amounts(condition, "--condition"),
     )
-    console.say(
-        f"{done.session}: {counted(done.frames, 'frame')}"
-        + (f", truth in {done.truth}" if done.truth else "")
+    _simulate(order, console, target)
+
+
+@simulate_app.command("gradient", cls=RigCommand)
+@expand
+def simulate_gradient(
+    common: SimulateOptions,
+    subject: Subject = "III",
+    target: Annotated[str | None, target_of("gradient")] = None,
+    width: Width = None,
+    site: Site = None,
+    angles: Angles = None,
+    steps: Steps = None,
+    leave_out: Annotated[
+        str | None,
+        typer.Option(
+            help="What of skin is not built although it changes pixels, joined by commas: shadows, "
+            "lateral, interreflections, optics."
+        ),
+    ] = None,
+) -> None:
+    """Simulate the gradient sphere: a patch of skin in a caliper, or a target.
+
+    Example: skinrig simulate gradient --out session-gradient --site cheek --angles 0,90
+    """
+    from skinrig.capturing.option_values import parse_floats, parse_names, parse_range
+    from skinrig.simulating.orders import GradientOrder
+
+    console = Console(common.json)
+    order = GradientOrder(
+        **common.ordered(subject, console),
+        target=target,
+        width_px=width,
+        site=site,
+        angles=parse_floats(angles, "--angles"),
+        steps=parse_range(steps, "--steps"),
+        leave_out=parse_names(leave_out) or (),
     )
-    console.say(f"next: {after_session(rig, out, target if sequence is None else 'sequence')}")
+    _simulate(order, console, target)
+
+
+@simulate_app.command("probe", cls=RigCommand)
+@expand
+def simulate_probe(
+    common: SimulateOptions,
+    subject: Annotated[
+        str,
+        typer.Option(
+            help="Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
+            "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
+            "sigma_s', 1/mm, and AXIS in degrees.",
+            autocompletion=completion.subjects,
+        ),
+    ] = "III",
+    target: Annotated[str | None, target_of("probe")] = None,
+    sites: Sites = None,
+    repeats: Placements = 1,
+    angles: Directions = None,
+    all_brackets: AllBrackets = False,
+) -> None:
+    """Simulate the fibre probe: tissue at some sites, or a target.
+
+    Example: skinrig simulate probe --out session-probe --sites cheek
+    """
+    from skinrig.capturing.option_values import parse_floats, parse_names
+    from skinrig.simulating.orders import ProbeOrder
+
+    console = Console(common.json)
+    order = ProbeOrder(
+        **common.ordered(subject, console),
+        target=target,
+        sites=parse_names(sites),
+        repeats=repeats,
+        angles=parse_floats(angles, "--angles"),
+        all_brackets=all_brackets,
+    )
+    _simulate(order, console, target)
+
+
+def _simulate(order: Order, console: Console, target: str | None) -> None:
+    """Simulate an order, and print what was made and the next step."""
+    from skinrig.next_steps import after_session
+    from skinrig.simulating.simulation import simulate
+
+    done = simulate(order)
+    truth = f", truth in {done.truth}" if done.truth else ""
+    console.say(f"{done.session}: {counted(done.frames, 'frame')}{truth}")
+    console.say(f"next: {after_session(order.rig, order.out, target)}")
     console.document("skinrig.simulate/1", done.document())

@@ -237,7 +237,7 @@ def edited(
         record["before"] = before
     # the people whose traits were used are in the result, too
     used = () if library is None or not asked else (library,)
-    agreed = consent.carried(source, *used)
+    agreed = consent.merge_consent(source, *used)
     appearance = dataclasses.replace(
         source,
         maps=work.maps,
@@ -246,7 +246,7 @@ def edited(
         parameters={
             **source.parameters,
             "edit": record,
-            **({consent.KEY: agreed} if agreed else {}),
+            **({consent.CONSENT_KEY: agreed} if agreed else {}),
         },
     )
     return Edited(appearance, changed, record, tuple(work.warnings))

@@ -126,7 +126,7 @@ def fit_microstructure(
             files=files,
             parameters={
                 "sites": {site: fit.document() for site, fit in fits.items()},
-                "consent": consent.carried(*(one for _, one in everything)),
+                "consent": consent.merge_consent(*(one for _, one in everything)),
             },
             inputs=inputs,
             source="simulated" if "simulated" in sources else "measured",

@@ -81,12 +81,12 @@ def fit_reflectance(
     left_out = list(surface.left_out)
     files = dict(surface.files)
     sources = {surface.source}
-    agreed = consent.carried(surface)
+    agreed = consent.merge_consent(surface)
     if probe is not None:
         measured = store.read(probe)
         inputs["probe"] = _digest(probe)
         sources.add(measured.source)
-        agreed = consent.carried(surface, measured)
+        agreed = consent.merge_consent(surface, measured)
         try:
             placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
         except ValueError as error:
@@ -107,7 +107,7 @@ def fit_reflectance(
         parameters={
             **surface.parameters,
             "assumed": assumed,
-            consent.KEY: agreed,
+            consent.CONSENT_KEY: agreed,
             "appearances": [path.name for path in (dome, probe) if path is not None],
             KEY: _record(placed),
         },

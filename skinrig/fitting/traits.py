@@ -142,7 +142,7 @@ def fit_traits(
             inputs={"labels": face_textures.digest(labels)}
             | {f.name: face_textures.digest(f.path / store.DOCUMENT) for f in faces},
             left_out=[list(row) for row in left_out],
-            consent=consent.carried(*(face.appearance for face in faces)),
+            consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),
         {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
     )

@@ -128,7 +128,7 @@ def fit_wrinkles(
                 "rank_one_share": None if found_zones is None else found_zones.rank_one_share,
                 "distinct_zones": None if found_zones is None else found_zones.distinct,
                 "smoothing_mm": smoothing_mm,
-                "consent": consent.carried(*(one for _, one in read.values())),
+                "consent": consent.merge_consent(*(one for _, one in read.values())),
                 "truth": {
                     state: one.parameters.get("truth", "") for state, (_, one) in read.items()
                 },

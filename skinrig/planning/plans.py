@@ -237,7 +237,7 @@ def choose(
     if most_lights is not None and rig_name != "dome":
         raise OptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
-        from skinrig.capturing.acquisition import read_plan
+        from skinrig.capturing.plan_choice import read_plan
 
         plan = read_plan(forecast)
         if plan.rig != rig.name:

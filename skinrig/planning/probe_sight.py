@@ -59,12 +59,12 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE
     from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
     from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
-    from skinrig.simulating.probe import PHOTONS
+    from skinrig.simulating.probe import TRUTH_PHOTONS
 
     if rig.probe is None:
         raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
     tissue = subject_file.tissue(subject, seed=seed)
-    profiles = Profiles(rig, tissue, photons=PHOTONS["small"], seed=seed)
+    profiles = Profiles(rig, tissue, photons=TRUTH_PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
     reflectance = np.stack([one.reflectance_per_mm2 for one in made])
     block = expected_reflectance(packaged_certificate(), rig)

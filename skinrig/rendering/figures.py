@@ -82,7 +82,7 @@ class Subject:
             "normals_carried_along": self.laid.carried,
             "lobes": self.model.lobes.size,
             "assumed": list(self.model.assumed),
-            consent.KEY: consent.carried(self.appearance),
+            consent.CONSENT_KEY: consent.merge_consent(self.appearance),
             "measured_share": float(valid.sum() / max(self.laid.atlas.covered.sum(), 1)),
         }
 
@@ -435,7 +435,7 @@ def _record(
         **own,
         "appearances": [subject.path for subject in subjects],
         "assumed": list(told),
-        consent.KEY: consent.carried(*(subject.appearance for subject in subjects)),
+        consent.CONSENT_KEY: consent.merge_consent(*(subject.appearance for subject in subjects)),
         "unit": UNIT,
         "view": {
             "name": camera.serial,

@@ -17,7 +17,7 @@ from skinrig.reporting.sections import images as pictures_section
 def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield folder and record of each subject that was measured, see :mod:`skinrig.consent`."""
     for folder in found.appearances.values():
-        for record in consent.carried(store.read_document(folder)):
+        for record in consent.merge_consent(store.read_document(folder)):
             yield folder, record
     for folder in found.sessions:
         document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
@@ -26,7 +26,9 @@ def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
     for folder in found.pictures:
         path = pictures_section.folder_document(folder)
         if path is not None:
-            for record in json.loads(path.read_text(encoding="utf-8")).get(consent.KEY) or ():
+            for record in (
+                json.loads(path.read_text(encoding="utf-8")).get(consent.CONSENT_KEY) or ()
+            ):
                 yield folder, dict(record)
 
 
@@ -41,7 +43,7 @@ def section(sides: Sequence[Findings]) -> Iterator[page.Block]:
     rows: dict[str, list[str]] = {}
     for found in sides:
         for folder, record in records_of(found):
-            (line,) = consent.told([record])
+            (line,) = consent.format_consent([record])
             names = rows.setdefault(line, [])
             if folder.name not in names:
                 names.append(folder.name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -13,74 +13,47 @@ from capture.plan import Plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig, load_rig
-from model import store
 from model.skin import SkinAppearance
-from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, effects_of, open_session
-from skinrig.simulating.orders import OptionsError, Order, Simulated, SimulationError, truth_folder
+from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
+from skinrig.simulating.orders import (
+    DomeOrder,
+    OptionsError,
+    Simulated,
+    SimulationError,
+    truth_folder,
+)
 
 if TYPE_CHECKING:
     from rigsim.population.population import Member
 
-TEXELS = 512
+TEXTURE_TEXELS = 512
 """Along one side of a face's maps."""
 WIDTHS_PX = {"small": 320, "full": 1300}
-LIGHTS = {"small": 48, "full": None}
-VIEWS = {"small": 6, "full": None}
-SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
+LIGHT_COUNTS = {"small": 48, "full": None}
+VIEW_COUNTS = {"small": 6, "full": None}
+TEST_SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
 """Where the truth keeps pictures of the reflection."""
-BEHIND = -0.3
+MIN_FRONT_COSINE = -0.3
 """Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
-SCAN = "scan.ply"
-TRUE_MESH = "mesh.ply"
-BLEND_SHAPES = "expressions.npz"
+SCAN_FILE = "scan.ply"
+TRUE_MESH_FILE = "mesh.ply"
+BLEND_SHAPES_FILE = "expressions.npz"
 """The face at rest with the movement of each expression, see `rigsim.geometry.mesh.load_mesh`."""
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
 
-def simulate_dome(order: Order) -> Simulated:
-    """Simulate a capture with the dome; see `simulation.simulate_session`."""
-    targets = get_args(DomeTarget)
-    if order.target is not None and order.target not in targets:
-        raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
-    order.refuse(
-        "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False
-    )
-    state = _state(order)
+def simulate_dome(order: DomeOrder) -> Simulated:
+    """Simulate a capture with the dome; see `simulation.simulate`."""
+    _check_state(order)
     conditions = _conditions(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None
     plan = planned or _plan(rig, order.target, order.size)
-    figures = light_figures(plan, rig)
-    if order.progress is not None:
-        for line in light_lines(plan, rig):
-            order.progress(line)
-    shown = subject_records.of_manifest(order.subject)
-    asked = {
-        "rig": "dome",
-        "width_px": rig.views[0].width_px,
-        "subject": shown,
-        "target": order.target or "",
-        "mesh": str(order.mesh or ""),
-        "lights": len(rig.lights),
-        "views": len(rig.views),
-        "move": order.move,
-        "state": state,
-        "movement": order.movement,
-        "wrapped": order.wrapped,
-        "plan": "" if order.plan is None else order.plan.to_json(),
-    }
-    if order.target is None:
-        asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
-        if order.leave_out:
-            asked["leave_out"] = list(order.leave_out)
-    elif order.subsurface or order.interreflections or order.leave_out:
-        raise OptionsError("subsurface, interreflections: are of a face; a target has neither")
-    if conditions:
-        asked["conditions"] = conditions
+    light = announce_light(plan, rig, order)
+    asked = _asked(order, rig) | ({"conditions": conditions} if conditions else {})
     scene = _scene(rig, order, plan)
     session = open_session(order, plan, rig, asked, scene)
     try:
@@ -94,74 +67,69 @@ def simulate_dome(order: Order) -> Simulated:
         scene.show(int(text.rpartition(" ")[2]))
 
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
-    safe = order.target is not None or figures["open_eyes"] != "allowed"
-    rig_seconds = drive(
-        session, rig, scene, order.seed, prompt, order.progress, eyes="closed" if safe else "open"
-    )
+    safe = order.target is not None or light["open_eyes"] != "allowed"
+    rig_seconds = drive(order, session, rig, scene, prompt, eyes="closed" if safe else "open")
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
         appearance = scene.truth_appearance()
-        appearance = dataclasses.replace(
-            appearance,
-            parameters={
-                "kind": "truth",
-                "state": state,
-                "movement": order.movement,
-                "subsurface": scene.subsurface,
-                "interreflections": scene.interreflections,
-                **appearance.parameters,
-                **scan,
-                "landmarks_mm": _landmarks(scene.subject),
-                **subject_records.of_truth(order.subject, "dome", order.progress),
-            },
-            inputs={"session": session.content_hash},
+        parameters = appearance.parameters | scan | {"landmarks_mm": _landmarks(scene.subject)}
+        write_truth(
+            truth,
+            order,
+            session,
+            dataclasses.replace(appearance, parameters=parameters),
             files=_truth_files(scene, appearance, order.seed),
-            seed=order.seed,
+            state=order.state,
+            movement=order.movement,
+            subsurface=scene.subsurface,
+            interreflections=scene.interreflections,
         )
-        store.write(truth, appearance)
-    return Simulated(
-        order.out,
-        truth,
-        len(session.frames()),
-        rig_seconds,
-        tuple(scene.left_out),
-        light=figures,
-        effects=effects_of(scene),
-    )
+    return finish(order, session, scene, rig_seconds, truth, light=light)
 
 
-def _state(order: Order) -> str:
-    """Return the state of the one face that a session of the dome shows."""
+def _asked(order: DomeOrder, rig: Rig) -> dict[str, Any]:
+    """Return the settings of a simulation as its session's manifest keeps them."""
+    asked = {
+        "rig": "dome",
+        "width_px": rig.views[0].width_px,
+        "subject": subject_records.of_manifest(order.subject),
+        "target": order.target or "",
+        "mesh": str(order.mesh or ""),
+        "lights": len(rig.lights),
+        "views": len(rig.views),
+        "move": order.move,
+        "state": order.state,
+        "movement": order.movement,
+        "wrapped": order.wrapped,
+        "plan": "" if order.plan is None else order.plan.to_json(),
+    }
+    if order.target is None:
+        asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
+        if order.leave_out:
+            asked["leave_out"] = list(order.leave_out)
+    return asked
+
+
+def _check_state(order: DomeOrder) -> None:
+    """Raise for a state that no face has."""
     from rigsim.subject.perfusion import STATES
 
-    if len(order.states) != 1:
-        raise OptionsError(
-            f"states: got {', '.join(order.states) or 'none'}, expected one; a session of the dome "
-            "shows one face, capture each state into a session of its own"
-        )
-    if order.states[0] not in STATES:
-        raise SimulationError(
-            f"state: got {order.states[0]!r}, expected one of {', '.join(STATES)}"
-        )
-    if order.target is not None and order.states[0] != "neutral":
-        raise OptionsError(f"state: got {order.states[0]!r}, but a target has none")
-    return order.states[0]
+    if order.state not in STATES:
+        raise SimulationError(f"state: got {order.state!r}, expected one of {', '.join(STATES)}")
 
 
-def _conditions(order: Order) -> dict[str, float]:
+def _conditions(order: DomeOrder) -> dict[str, float]:
     """Return the conditions of the face, checked."""
     from rigsim.population.conditions import ConditionError, checked
 
-    if order.target is not None and order.conditions:
-        raise OptionsError(f"condition: got {', '.join(order.conditions)}, but a target has none")
     try:
         return checked(order.conditions)
     except ConditionError as error:
         raise SimulationError(str(error)) from error
 
 
-def _member(order: Order) -> Member | None:
+def _member(order: DomeOrder) -> Member | None:
     """Return the member of the simulated population that is asked for; None: a preset is."""
     from rigsim.population.population import PopulationError, member
 
@@ -181,13 +149,13 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
 
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
-        TRUE_MESH: binary_ply(mesh.vertices_mm, mesh.faces),
-        BLEND_SHAPES: _blend_shapes(scene.subject),
+        TRUE_MESH_FILE: binary_ply(mesh.vertices_mm, mesh.faces),
+        BLEND_SHAPES_FILE: _blend_shapes(scene.subject),
         TEST_FILE: make_test(
             scene,
             truth,
             rng=np.random.default_rng([seed, 8]),
-            sites={name: landmarks[name] for name in SITES},
+            sites={name: landmarks[name] for name in TEST_SITES},
         ),
     }
 
@@ -247,14 +215,14 @@ def small_dome(
             raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
         places = np.array([row.position_mm for row in rows])
         # few lights stand where they reach a face; many stand all around
-        use = np.flatnonzero(places[:, 2] >= BEHIND * np.linalg.norm(places, axis=1))
+        use = np.flatnonzero(places[:, 2] >= MIN_FRONT_COSINE * np.linalg.norm(places, axis=1))
         use = use if len(use) >= count else np.arange(len(rows))
-        kept[field] = [rows[use[k]].name for k in spread(places[use], count)]
+        kept[field] = [rows[use[k]].name for k in farthest_point_sample(places[use], count)]
     rig = rig.subset(lights=kept["lights"], views=kept["views"])
     return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
 
 
-def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
+def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]:
     """Return the numbers of ``count`` directions, each next one the farthest from those before.
 
     Parameters
@@ -278,21 +246,17 @@ def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
     return chosen
 
 
-def _rig(order: Order) -> Rig:
+def _rig(order: DomeOrder) -> Rig:
     """Return the dome with the lights, cameras and pixels of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
     if order.plan is None:
         return small_dome(
             load_rig("dome"),
-            lights=order.lights or LIGHTS[order.size],
-            views=order.views or VIEWS[order.size],
+            lights=order.lights or LIGHT_COUNTS[order.size],
+            views=order.views or VIEW_COUNTS[order.size],
             width_px=width_px,
         )
-    if (order.lights, order.views) != (None, None):
-        raise OptionsError("lights, views: a plan names its own; leave them out")
     dome = load_rig("dome")
-    if order.plan.rig != dome.name:
-        raise SimulationError(f"plan: got one of {order.plan.rig!r}, expected {dome.name!r}")
     lit = {name for step in order.plan.steps for name in lights_of(step)}
     seen = {name for step in order.plan.steps for name in step.cameras}
     return dome.subset(
@@ -317,7 +281,7 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     )
 
 
-def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
+def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
     from rigsim.as_built.dome import build
     from rigsim.needs.effects import SceneEffects, longest_on_s
     from rigsim.population import files as subject_file
@@ -333,18 +297,18 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
         return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
-        person = one.face(TEXELS)
+        person = one.face(TEXTURE_TEXELS)
         conditions = dict(one.applied) | conditions
     else:
         subject = subject_file.named(order.subject)
-        person = subject.face(seed=order.seed, size=TEXELS, mesh=order.mesh)
+        person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig,
         person,
         dome=built,
         motion=motion,
-        state=order.states[0],
+        state=order.state,
         movement=order.movement,
         seed=order.seed,
         conditions=conditions,
@@ -353,7 +317,7 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
     )
 
 
-def _light_of_skin(order: Order) -> dict[str, Any]:
+def _light_of_skin(order: DomeOrder) -> dict[str, Any]:
     """Return what of a face is built though it shows in no pixel, and what is not though it does.
 
     What changes pixels is built where nothing is asked for.
@@ -362,14 +326,14 @@ def _light_of_skin(order: Order) -> dict[str, Any]:
         "subsurface": order.subsurface or None,
         "interreflections": order.interreflections or None,
     }
-    without = order.without("dome")
+    without = order.scene_switches()
     for name in without:
         if asked.get(name):
             raise OptionsError(f"leave_out: {name} was asked for, too")
     return {**asked, **without}
 
 
-def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
+def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
     from rigsim.scanner.pods import Scanner, scan_face, wrap_template
     from rigsim.subject.perfusion import STATES
@@ -377,11 +341,11 @@ def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
     scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
-        rng = np.random.default_rng([order.seed, 7, STATES.index(order.states[0])])
+        rng = np.random.default_rng([order.seed, 7, STATES.index(order.state)])
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
         scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
-    if SCAN not in session.attachments():
+    if SCAN_FILE not in session.attachments():
         kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
-        session.attach(SCAN, scan.ply, about={"kind": kind, "unit": "mm"})
+        session.attach(SCAN_FILE, scan.ply, about={"kind": kind, "unit": "mm"})
     return {"scan_to_dome": scan.to_dome.tolist()}

@@ -4,34 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from capture.acquire import run_plan
-from capture.devices.box import Box
-from capture.devices.caliper import CaliperBox
 from capture.devices.camera import open_camera
-from capture.devices.dome import DomeBox, Eyes
-from capture.devices.flash import FlashBox
-from capture.devices.gradient_sphere import GradientSphereBox
-from capture.devices.port import Port
-from capture.devices.probe import ProbeBox
+from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
-from skinrig.simulating.orders import USES, Order, SimulationError
+from model import store
+from model.skin import SkinAppearance
+from skinrig.capturing.addresses import open_box
+from skinrig.capturing.light_safety import light_figures, light_lines
+from skinrig.simulating import subject_records
+from skinrig.simulating.orders import USES, Order, Simulated, SimulationError
 from skinrig.simulating.resumption import refusals
 from skinrig.simulating.shot_numbers import shots_made
-from skinrig.simulating.subject_records import pseudonym
-
-BOXES: Mapping[str, type[Box]] = {
-    "flash": FlashBox,
-    "dome": DomeBox,
-    "gradient_sphere": GradientSphereBox,
-    "caliper": CaliperBox,
-    "probe": ProbeBox,
-}
-"""Driver of each kind of box."""
 
 
 def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
@@ -48,9 +39,9 @@ def open_session(
         lines = refusals(session, asked, order.seed, order.person)
         if lines:
             session.release()
-            told = "".join(f"\n  {line}" for line in lines)
+            differing = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
-                f"{order.out}: cannot be gone on with as asked{told}\n"
+                f"{order.out}: cannot be gone on with as asked{differing}\n"
                 "  resume with the same settings, or name another folder"
             )
         return session
@@ -64,7 +55,7 @@ def open_session(
             **{name: f"rigsim {name} box" for name in rig.boxes},
             **{view.name: view.serial for view in rig.views},
         },
-        subject=order.person or Subject(pseudonym(order.subject, order.seed), USES),
+        subject=order.person or Subject(subject_records.pseudonym(order.subject, order.seed), USES),
         source="simulated",
         seed=order.seed,
         extra={"simulation": dict(asked), "effects": [dict(one) for one in effects_of(scene)]},
@@ -72,13 +63,71 @@ def open_session(
     )
 
 
+def announce_light(plan: Plan, rig: Rig, order: Order) -> Mapping[str, float | str]:
+    """Return figures of the LEDs' light, and report them before anything is captured."""
+    if order.progress is not None:
+        for line in light_lines(plan, rig):
+            order.progress(line)
+    return light_figures(plan, rig)
+
+
+def write_truth(
+    folder: Path,
+    order: Order,
+    session: Session,
+    appearance: SkinAppearance,
+    *,
+    files: Mapping[str, bytes] | None = None,
+    **about: Any,
+) -> None:
+    """Write the truth of a session, with its parameters and those of its simulation.
+
+    Parameters
+    ----------
+    folder
+        Of the truth.
+    order, session
+        What was simulated; the session is closed.
+    appearance
+        The truth as the scene has it.
+    files
+        What goes along.
+    about
+        Further parameters; those of the appearance replace them.
+    """
+    parameters = {
+        "kind": "truth",
+        "state": "neutral",
+        **about,
+        **appearance.parameters,
+        **subject_records.of_truth(order.subject, order.rig, order.progress),
+    }
+    inputs = {"session": session.content_hash}
+    truth = replace(appearance, parameters=parameters, inputs=inputs, seed=order.seed)
+    store.write(folder, truth if files is None else replace(truth, files=files))
+
+
+def finish(
+    order: Order, session: Session, scene: Any, rig_seconds: float, truth: Path | None, **more: Any
+) -> Simulated:
+    """Return what a simulation left behind; `more` are fields that only some rigs have."""
+    return Simulated(
+        order.out,
+        truth,
+        len(session.frames()),
+        rig_seconds,
+        tuple(scene.left_out),
+        effects=effects_of(scene),
+        **more,
+    )
+
+
 def drive(
+    order: Order,
     session: Session,
     rig: Rig,
     scene: Any,
-    seed: int,
-    prompt: Callable[[Any, str], None],
-    progress: Callable[[str], None] | None,
+    prompt: Callable[[Any, str], None] | None = None,
     *,
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
@@ -91,16 +140,14 @@ def drive(
 
     Parameters
     ----------
+    order
+        Of the simulation: the world's seed, and where progress goes.
     session, rig
         Open for writing; the rig as it is drawn.
     scene
         What the cameras see first.
-    seed
-        Of the world.
     prompt
-        Called with the world and what the operator is asked for.
-    progress
-        Called with one line now and then.
+        Called with the world and what the operator is asked for; None: nobody is needed.
     eyes
         What is said of the subject's eyes.
     force_limit_n
@@ -122,11 +169,13 @@ def drive(
     """
     from rigsim.world import World
 
-    world = World(rig, seed=seed, clock="virtual", scene=scene, shots_made=shots_made(session))
+    world = World(
+        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=shots_made(session)
+    )
     name = world.register(session.id)
     boxes = {
         # a number of fixed length: with drawn ones the lines would take a little longer or shorter
-        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock, first_seq=1))
+        kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
         for kind in rig.boxes
     }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
@@ -138,8 +187,8 @@ def drive(
             boxes=boxes,
             cameras=cameras,
             session=session,
-            progress=progress,
-            prompt=lambda text: prompt(world, text),
+            progress=order.progress,
+            prompt=lambda text: None if prompt is None else prompt(world, text),
             eyes=eyes,
             force_limit_n=force_limit_n,
             run_id=run_id,

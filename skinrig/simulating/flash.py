@@ -8,34 +8,18 @@ from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
 from model import store
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.driving import drive, finish, open_session
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_mm, truth_of
-from skinrig.simulating.orders import Order, Simulated, SimulationError, truth_folder
-
-TARGETS = ("white", "chart", "flat", "dark", "malus")
+from skinrig.simulating.orders import FlashOrder, Simulated, SimulationError, truth_folder
 
 
-def simulate_flash(order: Order) -> Simulated:
-    """Simulate a capture with the flash rig; see `simulation.simulate_session`."""
+def simulate_flash(order: FlashOrder) -> Simulated:
+    """Simulate a capture with the flash rig; see `simulation.simulate`."""
     if order.sequence is not None:
         from skinrig.simulating.sequence import simulate_sequence
 
         return simulate_sequence(order, order.sequence)
-    target, states, seed = order.target, order.states, order.seed
-    if target is not None and target not in TARGETS:
-        raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
-    order.refuse(
-        "flash",
-        lights=None,
-        views=None,
-        move=False,
-        site=None,
-        angles=None,
-        steps=None,
-        sites=None,
-        all_brackets=False,
-        wrapped=False,
-    )
+    target, states = order.target, order.states
     if target is None:
         from rigsim.subject.perfusion import STATES
 
@@ -45,11 +29,10 @@ def simulate_flash(order: Order) -> Simulated:
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    shown = subject_records.of_manifest(order.subject)
     asked = {
         "rig": "flash",
         "width_px": width,
-        "subject": shown,
+        "subject": subject_records.of_manifest(order.subject),
         "target": target or "",
         "mesh": str(order.mesh or ""),
         "states": list(states),
@@ -60,7 +43,7 @@ def simulate_flash(order: Order) -> Simulated:
         **({"nearer_mm": order.nearer_mm} if order.nearer_mm else {}),
     }
     # what cannot be built must fail before a folder is made
-    plan = order.plan or _plan(rig, target, states, order.repeats)
+    plan = order.plan or _plan(rig, order)
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, asked, first)
@@ -68,37 +51,28 @@ def simulate_flash(order: Order) -> Simulated:
     def prompt(world: Any, state: str) -> None:
         world.scene = scenes[state]
 
-    rig_seconds = drive(session, rig, first, seed, prompt, order.progress)
-    truth = None
-    if target is None:
-        truth = truth_folder(order.out)
-        told = subject_records.of_truth(order.subject, "flash", order.progress)
-        for state, scene in scenes.items():
-            folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-            appearance = truth_of(scene, seed, session.content_hash, state, about=told)
-            store.write(folder, appearance)
-    blur = () if target else tuple(float(width) for width in first.resolution_mm())
-    left_out = tuple(first.left_out)
-    return Simulated(
-        order.out,
-        truth,
-        len(session.frames()),
-        rig_seconds,
-        left_out,
-        blur,
-        effects=effects_of(first),
-    )
+    rig_seconds = drive(order, session, rig, first, prompt)
+    if target is not None:
+        return finish(order, session, first, rig_seconds, None)
+    truth = truth_folder(order.out)
+    about = subject_records.of_truth(order.subject, "flash", order.progress)
+    for state, scene in scenes.items():
+        folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
+        appearance = truth_of(scene, order.seed, session.content_hash, state, about=about)
+        store.write(folder, appearance)
+    blur_mm = tuple(float(width) for width in first.resolution_mm())
+    return finish(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
 
 
-def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:
-    if target is None:
-        return flash_plan(rig, states=states, repeats=repeats, interleave=True)
-    if target == "white":
-        return flash_plan(rig, states=("white",), repeats=max(4, repeats))
-    return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
+def _plan(rig: Rig, order: FlashOrder) -> Plan:
+    if order.target is None:
+        return flash_plan(rig, states=order.states, repeats=order.repeats, interleave=True)
+    if order.target == "white":
+        return flash_plan(rig, states=("white",), repeats=max(4, order.repeats))
+    return flash_calibration_plan(rig, order.target)  # type: ignore[arg-type]
 
 
-def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
+def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     from rigsim import targets
     from rigsim.needs.effects import SceneEffects
     from rigsim.population import files as subject_file
@@ -120,7 +94,7 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
             movement=order.movement,
             seed=seed,
             power=power,
-            effects=SceneEffects.from_switches(order.without("flash")),
+            effects=SceneEffects.from_switches(order.scene_switches()),
         )
         for state in order.states
     }

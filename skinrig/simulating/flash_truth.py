@@ -16,7 +16,7 @@ from skinrig.simulating.orders import SimulationError
 WIDTHS_PX = {"small": 768, "full": 3024}
 
 
-NEAREST_SHARE = 0.5
+MAX_STANCE_FRACTION = 0.5
 """Of the camera's distance: how far off the tile's place a face may stand, either way. Far beyond
 what a lens of f/11 shows with any sharpness."""
 
@@ -24,7 +24,7 @@ what a lens of f/11 shows with any sharpness."""
 def _stance_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
     """Return how far a face is off the tile's place that stands so much nearer to the camera."""
     view = rig.views[0]
-    most = NEAREST_SHARE * view.distance_mm
+    most = MAX_STANCE_FRACTION * view.distance_mm
     if not abs(nearer_mm) < most:
         raise SimulationError(
             f"nearer: got {nearer_mm:g} mm, expected between {-most:g} and {most:g} mm: the camera "

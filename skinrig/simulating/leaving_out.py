@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-SWITCHES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+SWITCHES_BY_RIG: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "flash": ("lateral", "interreflections", "spectral", "optics", "relief_shadows"),
         "dome": ("subsurface", "interreflections", "spectral", "optics", "relief_shadows"),
@@ -16,7 +16,7 @@ SWITCHES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 )
 """By rig: what can be left out, by the ``switch`` of its effect, see `rigsim.needs.effects`."""
 
-SAME: Final = frozenset({"lateral", "subsurface"})
+LATERAL_SWITCHES: Final = frozenset({"lateral", "subsurface"})
 """Names of light spreading sideways in skin: each rig's own, and the other's."""
 
 
@@ -45,10 +45,10 @@ def left_out_of(rig: str, names: Sequence[str]) -> dict[str, bool]:
     >>> left_out_of("flash", ["optics", "subsurface"])
     {'optics': False, 'lateral': False}
     """
-    known = SWITCHES[rig]
+    known = SWITCHES_BY_RIG[rig]
     out: dict[str, bool] = {}
     for name in names:
-        own = next((k for k in known if k == name or {k, name} <= SAME), None)
+        own = next((k for k in known if k == name or {k, name} <= LATERAL_SWITCHES), None)
         if own is None:
             expected = f"one of {', '.join(known)}" if known else "none: its scenes build all"
             raise ValueError(f"leave_out: got {name!r}, expected of the {rig} rig {expected}")
@@ -64,4 +64,4 @@ def may_be_left_out(switch: str) -> bool:
     >>> may_be_left_out("optics"), may_be_left_out("last_bounce")
     (True, False)
     """
-    return any(switch in known for known in SWITCHES.values())
+    return any(switch in known for known in SWITCHES_BY_RIG.values())

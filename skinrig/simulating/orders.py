@@ -1,28 +1,29 @@
-"""Orders of simulations: what is asked, and what was made."""
+"""Orders of simulations, one class a rig, and what a simulation returns."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, get_args
 
 from capture.plan import Plan
+from capture.plan.dome import DomeTarget
+from capture.plan.gradient import GradientTarget
+from capture.plan.probe import ProbeTarget
 from capture.session import Subject
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError
 from skinrig.simulating.leaving_out import left_out_of
 
-RIGS = ("flash", "dome", "gradient", "probe")
-
-
 SIZES = ("small", "full")
-
-
 USES = ("research", "publication")
 """What may be done with a face that is nobody's, unless said otherwise."""
+MIN_WIDTH_PX = 16
+_COUNTS = {"width_px": "width", "lights": "lights", "views": "views"}
+"""Fields that count something, and their names in messages."""
 
 
 class SimulationError(ValueError):
@@ -53,16 +54,7 @@ class Simulated:
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
-        return {
-            "session": self.session,
-            "truth": self.truth,
-            "frames": self.frames,
-            "rig_seconds": self.rig_seconds,
-            "left_out": self.left_out,
-            "blur_mm": self.blur_mm,
-            "light": dict(self.light),
-            "effects": [dict(effect) for effect in self.effects],
-        }
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 def truth_folder(session: Path) -> Path:
@@ -73,62 +65,88 @@ def truth_folder(session: Path) -> Path:
     >>> truth_folder(Path("demo/session-flash")).as_posix()
     'demo/truth-flash'
     """
-    name = session.name
-    short = name.removeprefix("session-") if name.startswith("session-") else name
-    return session.with_name(f"truth-{short}")
+    return session.with_name(f"truth-{session.name.removeprefix('session-')}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """What is to be simulated; see `simulate_session`."""
+    """What every simulation is asked for; each rig's order adds its own options.
+
+    Raises
+    ------
+    SimulationError
+        For a size, a seed, a target or a plan that the rig has not, and the like.
+    OptionsError
+        For options that do not go together.
+    """
+
+    rig: ClassVar[str]
+    targets: ClassVar[tuple[str, ...]]
+    """What can stand in the rig instead of a subject."""
 
     out: Path
-    size: str
-    seed: int
-    subject: str
-    mesh: str | Path | None
-    target: str | None
-    states: tuple[str, ...]
-    repeats: int
-    resume: bool
-    width_px: int | None
-    lights: int | None
-    views: int | None
-    move: bool
-    site: str | None
-    angles: tuple[float, ...] | None
-    steps: tuple[int, int] | None
-    sites: tuple[str, ...] | None
-    all_brackets: bool
-    movement: bool
-    wrapped: bool
-    created: datetime | None
-    person: Subject | None
-    progress: Callable[[str], None] | None
-    sequence: SequenceOrder | None = None
-    relaxation_s: float | None = None
-    subsurface: bool = False
-    interreflections: bool = False
-    conditions: Mapping[str, float] = field(default_factory=dict)
+    """The session's folder; the truth goes to ``truth-NAME`` beside ``session-NAME``."""
+    size: str = "small"
+    """"small" or "full"; each rig has its own meaning."""
+    seed: int = 0
+    """Of the subject, the sensor and the boxes."""
+    subject: str = "III"
+    """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
+    target: str | None = None
     plan: Plan | None = None
+    """What is captured of the subject instead of the rig's own plan."""
     leave_out: tuple[str, ...] = ()
-    nearer_mm: float = 0.0
+    """What of skin is not built although it changes pixels: `skinrig.simulating.leaving_out`."""
+    resume: bool = False
+    """Go on with a session that was interrupted; what is on disk is kept."""
+    created: datetime | None = None
+    """Date of the session; None: now."""
+    person: Subject | None = None
+    """Pseudonym and consent to record; None: one who agreed to :data:`USES`, or, where a session
+    is gone on with, as it was begun. Others than it was begun with are refused."""
+    progress: Callable[[str], None] | None = None
+    """Called with one line a frame."""
 
     def __post_init__(self) -> None:
+        for name, shown in _COUNTS.items():
+            number = getattr(self, name, None)
+            if number is not None and number < 1:
+                raise SimulationError(f"{shown}: got {number}, expected a number above 0, or none")
         if self.size not in SIZES:
             raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
         if self.seed < 0:
             raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
-        if self.width_px is not None and self.width_px < 16:
-            raise SimulationError(f"width: got {self.width_px}, expected 16 pixels or more")
+        width_px = getattr(self, "width_px", None)
+        if width_px is not None and width_px < MIN_WIDTH_PX:
+            raise SimulationError(f"width: got {width_px}, expected {MIN_WIDTH_PX} pixels or more")
+        if self.target is not None and self.target not in self.targets:
+            expected = ", ".join(self.targets)
+            raise SimulationError(f"target: got {self.target!r}, expected one of {expected}")
+        self.check()
+        self.scene_switches()
 
-    def refuse(self, rig: str, **unset: object) -> None:
-        """Raise where something was asked for that the rig does not know."""
-        for name, value in unset.items():
-            if getattr(self, name) != value:
-                raise OptionsError(f"{name}: the {rig} rig knows nothing of it; leave it out")
+    def check(self) -> None:
+        """Raise where options do not go together."""
+        if self.plan is None:
+            return
+        if self.plan.rig != self.rig:
+            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
+        if self.not_at_rest is not None:
+            raise OptionsError("plan: is for a subject; targets and sequences have their own")
 
-    def without(self, rig: str) -> dict[str, Any]:
+    @property
+    def not_at_rest(self) -> str | None:
+        """What is simulated instead of skin at rest or in a state; None for such skin."""
+        return None if self.target is None else "a target"
+
+    def refuse_beside(self, what: str, *names: str) -> None:
+        """Raise where something was asked for that `what` has not."""
+        unset = {one.name: one.default for one in fields(self)}
+        for name in names:
+            if getattr(self, name) != unset[name]:
+                raise OptionsError(f"{name}: the {what} rig knows nothing of it; leave it out")
+
+    def scene_switches(self) -> dict[str, Any]:
         """Return arguments of a scene of skin that leave out what is to be left out.
 
         Raises
@@ -138,31 +156,217 @@ class Order:
         """
         if not self.leave_out:
             return {}
-        if self.target is not None or self.sequence is not None:
-            what = "a sequence" if self.target is None else "a target"
-            raise OptionsError(f"leave_out: is of skin at rest or in a state, not of {what}")
+        if self.not_at_rest is not None:
+            raise OptionsError(
+                f"leave_out: is of skin at rest or in a state, not of {self.not_at_rest}"
+            )
         try:
-            return left_out_of(rig, self.leave_out)
+            return dict(left_out_of(self.rig, self.leave_out))
         except ValueError as exc:
             raise SimulationError(str(exc)) from exc
 
-    def check_stance(self, rig: str) -> None:
-        """Raise where a face stands off the tile's place that the rig cannot place."""
-        if self.nearer_mm == 0.0:
-            return
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlashOrder(Order):
+    """A face or a target before the flash rig; "small" is 768 pixels across, "full" 3024."""
+
+    rig: ClassVar[str] = "flash"
+    targets: ClassVar[tuple[str, ...]] = ("white", "chart", "flat", "dark", "malus")
+
+    width_px: int | None = None
+    """Pixels across, instead of ``size``."""
+    mesh: str | Path | None = None
+    """A face mesh to wear the skin instead of the procedural head."""
+    states: tuple[str, ...] = ("neutral",)
+    """Expressions and physiological states, captured one after the other."""
+    repeats: int = 1
+    """Image pairs a state."""
+    movement: bool = True
+    """Whether the face moves and wrinkles with its states; else they change the blood only."""
+    nearer_mm: float = 0.0
+    """How much nearer to the camera than the white tile's place the face stands, mm; below 0
+    farther. The flashes are then as much nearer, and the lens is focused on the tile."""
+    sequence: SequenceOrder | None = None
+    """A sequence in time instead of ``states``."""
+    relaxation_s: float | None = None
+    """Time constant of its blood, s; None: of the state, see `rigsim.subject.perfusion_course`."""
+
+    @property
+    def not_at_rest(self) -> str | None:
+        """What is simulated instead of skin at rest or in a state; None for such skin."""
+        if self.target is not None:
+            return "a target"
+        return None if self.sequence is None else "a sequence"
+
+    def check(self) -> None:
+        """Raise where options do not go together."""
         if not math.isfinite(self.nearer_mm):
             raise SimulationError(f"nearer: got {self.nearer_mm}, expected finite millimetres")
-        if rig != "flash":
-            raise OptionsError(f"nearer: the {rig} rig knows nothing of it; leave it out")
-        if self.target is not None or self.sequence is not None:
-            what = "a sequence" if self.target is None else "a target"
-            raise OptionsError(f"nearer: is of a face at rest or in a state, not of {what}")
+        if self.nearer_mm != 0.0 and self.not_at_rest is not None:
+            raise OptionsError(
+                f"nearer: is of a face at rest or in a state, not of {self.not_at_rest}"
+            )
+        Order.check(self)
+        if self.sequence is not None:
+            self.refuse_beside(self.rig, "target", "repeats", "states")
+        elif self.relaxation_s is not None:
+            raise OptionsError("relaxation: is for a sequence")
 
-    def check_plan(self, rig: str) -> None:
-        """Raise where a plan was handed over that is another rig's, or a target's or sequence's."""
-        if self.plan is None:
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DomeOrder(Order):
+    """A face or a target in the dome.
+
+    "small" is 6 cameras, 320 pixels across, and 48 lights; "full" is all that it has. The subject
+    may also be a member of the simulated population, P01 to P87
+    (`rigsim.population.population.table_1`), with what it wears. Lights and cameras of a plan are
+    those of targets, too.
+    """
+
+    rig: ClassVar[str] = "dome"
+    targets: ClassVar[tuple[str, ...]] = get_args(DomeTarget)
+
+    width_px: int | None = None
+    """Pixels across each camera, instead of ``size``."""
+    mesh: str | Path | None = None
+    """A face mesh to wear the skin instead of the procedural head."""
+    lights: int | None = None
+    """So many lights, spread evenly; None: as many as ``size`` says."""
+    views: int | None = None
+    """So many cameras, spread evenly; None: as many as ``size`` says."""
+    states: tuple[str, ...] = ("neutral",)
+    """The one state of the face."""
+    move: bool = False
+    """Whether the face drifts and twitches during the capture."""
+    movement: bool = True
+    """Whether the face moves and wrinkles with its state; else that changes the blood only."""
+    wrapped: bool = False
+    """Whether the scan of the face is a template wrapped onto it, of the same triangles and texture
+    coordinates in every state, so that maps of states share one texture."""
+    subsurface: bool = False
+    """True: light spreads sideways inside the skin even where that changes no pixel; False: where
+    it does, see `rigsim.needs.effects`."""
+    interreflections: bool = False
+    """True: light goes from skin to skin even where that changes no pixel; False: where it does."""
+    conditions: Mapping[str, float] = field(default_factory=dict)
+    """Conditions of the face with their amounts, see `rigsim.population.conditions`."""
+
+    @property
+    def state(self) -> str:
+        """The state of the face."""
+        return self.states[0]
+
+    def check(self) -> None:
+        """Raise where options do not go together; a dome's plan is for targets, too."""
+        if len(self.states) != 1:
+            raise OptionsError(
+                f"states: got {', '.join(self.states) or 'none'}, expected one; a session of the "
+                "dome shows one face, capture each state into a session of its own"
+            )
+        if self.plan is not None and (self.lights, self.views) != (None, None):
+            raise OptionsError("lights, views: a plan names its own; leave them out")
+        if self.plan is not None and self.plan.rig != self.rig:
+            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
+        if self.target is None:
             return
-        if self.plan.rig != rig:
-            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {rig!r}")
-        if self.target is not None or self.sequence is not None:
-            raise OptionsError("plan: is for a subject; targets and sequences have their own")
+        if self.state != "neutral":
+            raise OptionsError(f"state: got {self.state!r}, but a target has none")
+        if self.conditions:
+            raise OptionsError(
+                f"condition: got {', '.join(self.conditions)}, but a target has none"
+            )
+        if self.subsurface or self.interreflections:
+            raise OptionsError("subsurface, interreflections: are of a face; a target has neither")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GradientOrder(Order):
+    """A patch of skin in a caliper, or a target, in the gradient sphere.
+
+    "small" is the middle 256 pixels and one angle of the caliper; "full" is all 2048, which the
+    ball always takes, and all angles.
+    """
+
+    rig: ClassVar[str] = "gradient"
+    targets: ClassVar[tuple[str, ...]] = get_args(GradientTarget)
+
+    width_px: int | None = None
+    """Pixels across, instead of ``size``."""
+    site: str | None = None
+    """Where the skin is from: "forehead" (the default), "cheek", "chin"."""
+    angles: tuple[float, ...] | None = None
+    """Angles of the caliper, degrees; None: as ``size`` says."""
+    steps: tuple[int, int] | None = None
+    """First and last position of the caliper; None: all. Where the skin ends is found out."""
+
+    def check(self) -> None:
+        """Raise where options do not go together."""
+        Order.check(self)
+        if self.target is not None:
+            self.refuse_beside("target of the gradient", "site", "angles", "steps")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeOrder(Order):
+    """Tissue under the fibre probe, or a target; "full" has more photons in its truth.
+
+    The subject may also be "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
+    """
+
+    rig: ClassVar[str] = "probe"
+    targets: ClassVar[tuple[str, ...]] = get_args(ProbeTarget)
+
+    sites: tuple[str, ...] | None = None
+    """Where the probe is placed; None: forehead, cheek and chin."""
+    repeats: int = 1
+    """Placements a site and direction."""
+    angles: tuple[float, ...] | None = None
+    """One number: how many directions of the head; None: 1."""
+    all_brackets: bool = False
+    """Whether the probe takes exposures that can show no more."""
+
+    def check(self) -> None:
+        """Raise where options do not go together."""
+        Order.check(self)
+        if self.target is not None:
+            self.refuse_beside("target of the probe", "sites", "angles")
+
+
+ORDERS: Mapping[str, type[Order]] = {
+    kind.rig: kind for kind in (FlashOrder, DomeOrder, GradientOrder, ProbeOrder)
+}
+"""The class of each rig's orders."""
+
+
+def order_for(rig: str, **options: Any) -> Order:
+    """Return a rig's order out of options by name.
+
+    Parameters
+    ----------
+    rig
+        A key of :data:`ORDERS`.
+    options
+        Fields of its order; those of another rig's are refused, unless they ask for nothing.
+
+    Raises
+    ------
+    SimulationError
+        For an unknown rig, or as the order does.
+    OptionsError
+        For another rig's option.
+
+    Examples
+    --------
+    >>> order_for("dome", out=Path("session"), lights=12).rig
+    'dome'
+    """
+    if rig not in ORDERS:
+        raise SimulationError(f"rig: got {rig!r}, expected one of {', '.join(ORDERS)}")
+    own = {one.name for one in fields(ORDERS[rig])}
+    foreign = {one.name: one for kind in ORDERS.values() for one in fields(kind)}
+    for name in sorted(options.keys() & foreign.keys() - own):
+        default = foreign[name].default
+        if options.pop(name) not in ({} if default is MISSING else default, None):
+            shown = name.removesuffix("_mm")
+            raise OptionsError(f"{shown}: the {rig} rig knows nothing of it; leave it out")
+    return ORDERS[rig](**options)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 from capture.plan import Plan
 from capture.plan.probe import (
@@ -20,50 +18,30 @@ from capture.plan.probe import (
 from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
-from model import store
 from rigsim.scenes.probe.truth import appearance as ground_truth
-from skinrig.capturing.acquisition import directions_of
-from skinrig.capturing.light_safety import light_figures, light_lines
+from skinrig.capturing.plan_choice import directions_of
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, effects_of, open_session
-from skinrig.simulating.orders import Order, Simulated, SimulationError, truth_folder
+from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
+from skinrig.simulating.exposure_log import SceneLog
+from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
 
-PHOTONS = {"small": 60_000, "full": 2_000_000}
+TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
-NEAR_S = 1e-3
+MAX_LOG_LAG_S = 1e-3
 
 
-def simulate_probe(order: Order) -> Simulated:
-    """Simulate a capture with the fibre probe; see `simulation.simulate_session`.
+def simulate_probe(order: ProbeOrder) -> Simulated:
+    """Simulate a capture with the fibre probe; see `simulation.simulate`.
 
     Either size has all sites, brackets and pixels, which cost little; what "full" has more of are
     the photons of the truth.
     """
-    targets = get_args(ProbeTarget)
-    if order.target is not None and order.target not in targets:
-        raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
-    order.refuse(
-        "probe",
-        states=("neutral",),
-        movement=True,
-        mesh=None,
-        lights=None,
-        views=None,
-        move=False,
-        width_px=None,
-        site=None,
-        steps=None,
-        wrapped=False,
-    )
-    if order.target is not None:
-        order.refuse("target of the probe", sites=None, angles=None)
     rig = load_rig("probe")
-    plan = plan_of(rig, order)
-    shown = subject_records.of_manifest(order.subject)
+    plan = _plan(rig, order)
     asked = {
         "rig": "probe",
         "size": order.size,
-        "subject": shown,
+        "subject": subject_records.of_manifest(order.subject),
         "target": order.target or "",
         "sites": ",".join(order.sites or PROBE_SITES),
         "repeats": order.repeats,
@@ -74,10 +52,7 @@ def simulate_probe(order: Order) -> Simulated:
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
-    figures = light_figures(plan, rig)
-    if order.progress is not None:
-        for line in light_lines(plan, rig):
-            order.progress(line)
+    light = announce_light(plan, rig, order)
     session = open_session(order, plan, rig, asked, scene)
     try:
         log = HeadLog(scene, truth_folder(order.out), resume=order.resume, session=session)
@@ -86,42 +61,15 @@ def simulate_probe(order: Order) -> Simulated:
         raise
     # nobody has to place the head: the box is told where it is, and with it the world
     rig_seconds = drive(
-        session,
-        rig,
-        log,
-        order.seed,
-        lambda world, text: None,
-        order.progress,
-        run_id=log.run_id,
-        all_brackets=order.all_brackets,
+        order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
     )
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
         appearance = ground_truth(scene, log.probings(session))
-        appearance = dataclasses.replace(
-            appearance,
-            parameters={
-                "kind": "truth",
-                "state": "neutral",
-                "subject": order.subject,
-                **appearance.parameters,
-                **subject_records.of_truth(order.subject, "probe", order.progress),
-            },
-            inputs={"session": session.content_hash},
-            seed=order.seed,
-        )
-        store.write(truth, appearance)
+        write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
-    return Simulated(
-        order.out,
-        truth,
-        len(session.frames()),
-        rig_seconds,
-        tuple(scene.left_out),
-        light=figures,
-        effects=effects_of(scene),
-    )
+    return finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
@@ -136,8 +84,7 @@ def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
             raise SimulationError(str(error)) from error
 
 
-def plan_of(rig: Rig, order: Order) -> Plan:
-    """Return the plan of what is to be simulated."""
+def _plan(rig: Rig, order: ProbeOrder) -> Plan:
     if order.target is not None:
         return probe_calibration_plan(rig, cast(ProbeTarget, order.target), repeats=order.repeats)
     if order.plan is not None:
@@ -173,7 +120,7 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim.fiber.probe_tissue import PHANTOM_SITE as BLOCK
+    from rigsim.fiber.probe_tissue import PHANTOM as BLOCK
     from rigsim.fiber.probe_tissue import TissueError
     from rigsim.population import files as subject_file
     from rigsim.scenes.probe.scene import ProbeScene
@@ -182,14 +129,13 @@ def make_scene(
         tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    return ProbeScene(rig, tissue, seed=seed, photons=PHOTONS[size])
+    return ProbeScene(rig, tissue, seed=seed, photons=TRUTH_PHOTONS[size])
 
 
-class HeadLog:
+class HeadLog(SceneLog):
     """A scene that notes under which suction the head was lit, beside the session.
 
-    The gauge that a session tells of has a zero of its own; the truth wants the suction that was
-    there, also of series that were captured before an interruption, and no session may hold it.
+    The gauge that a session records has a zero of its own; the truth needs the actual suction.
 
     Parameters
     ----------
@@ -209,30 +155,16 @@ class HeadLog:
     """
 
     def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
-        self._scene = scene
-        self._path = truth.with_name(f".{truth.name}.heads.jsonl")
-        if not resume:
-            self._path.unlink(missing_ok=True)
-        entries = self._read()
-        if any(session.frames(kind) for kind in ("fibres", PHANTOM_SITE)) and not entries:
-            raise SimulationError(
-                f"{self._path}: is gone, and with it the truth of what was captured before; "
-                "simulate the session anew"
-            )
-        self.run_id = f"sim{1 + max((int(entry['run']) for entry in entries), default=0)}"
+        path = truth.with_name(f".{truth.name}.heads.jsonl")
+        captured = any(session.frames(kind) for kind in ("fibres", PHANTOM_SITE))
+        super().__init__(scene, path, resume=resume, captured=captured)
 
     def exposure(
         self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int, head: Any
     ) -> Any:
         """Expose the scene, and note the suction of what is lit."""
         if pops:
-            entry = {
-                "run": int(self.run_id.removeprefix("sim")),
-                "t_s": pops[0].t_on_s,
-                "suction_mbar": head.suction_mbar,
-            }
-            with self._path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(entry) + "\n")
+            self.note(pops[0].t_on_s, {"suction_mbar": head.suction_mbar})
         return self._scene.exposure(
             view_name, pops=pops, exposure_s=exposure_s, seed=seed, head=head
         )
@@ -241,7 +173,7 @@ class HeadLog:
         """Return the placements that the session has series of, in the plan's order."""
         from rigsim.scenes.probe.scene import Probing
 
-        entries = self._read()
+        entries = self.read()
         by_run: dict[int, list[tuple[float, float]]] = {}
         for entry in entries:
             row = (float(entry["t_s"]), float(entry["suction_mbar"]))
@@ -255,7 +187,9 @@ class HeadLog:
                 record = frames[step.id]
                 run = int(str(record.actual["run"]).removeprefix("sim"))
                 time_s = float(record.line.t_box_s or 0.0)
-                near = [mbar for t_s, mbar in by_run.get(run, []) if abs(t_s - time_s) < NEAR_S]
+                near = [
+                    mbar for t_s, mbar in by_run.get(run, []) if abs(t_s - time_s) < MAX_LOG_LAG_S
+                ]
                 if not near:
                     raise SimulationError(f"{self._path}: tells nothing of the step {step.id}")
                 suctions.setdefault(placement, []).append(near[0])
@@ -263,14 +197,3 @@ class HeadLog:
             Probing(place.site, place.repeat, place.angle_deg, sum(found) / len(found))
             for place, found in suctions.items()
         ]
-
-    def remove(self) -> None:
-        """Remove the log: the truth is written."""
-        self._path.unlink(missing_ok=True)
-
-    def _read(self) -> list[Mapping[str, Any]]:
-        if not self._path.is_file():
-            return []
-        lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
-        # a last line may be cut off; its frame was not committed
-        return [json.loads(line) for line in lines if line.endswith("}\n")]

@@ -17,20 +17,27 @@ from model import store
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, effects_of, open_session
+from skinrig.simulating.driving import drive, finish, open_session
+from skinrig.simulating.exposure_log import ExposureLog
 from skinrig.simulating.flash_truth import (
     WIDTHS_PX,
     landmarks_at_superpixels,
     to_superpixels,
     truth_of,
 )
-from skinrig.simulating.orders import OptionsError, Order, Simulated, SimulationError, truth_folder
+from skinrig.simulating.orders import (
+    FlashOrder,
+    OptionsError,
+    Simulated,
+    SimulationError,
+    truth_folder,
+)
 
 COURSE_FILE = "perfusion_course.json"
 """In the truth: the blood of each frame at its own time."""
 LANDMARKS_FILE = "landmarks.csv"
 """In the truth: named points of the face at rest, px of its superpixels."""
-POINTS = {
+COURSE_LANDMARKS = {
     "forehead": "forehead",
     "cheek": "cheek left",
     "nose": "nose tip",
@@ -38,17 +45,17 @@ POINTS = {
     "temple": "temple left",
 }
 """The five places of Jimenez et al. 2010, figure 7, and the landmarks they lie on."""
-RADIUS_SHARE = 0.02
+DISC_RADIUS_FRACTION = 0.02
 """Radius of a place's disc, of the picture's width."""
-TEXELS = (256, 512)
-"""Of the face's texture: for pictures up to `COARSE_PX` across, and for larger ones."""
-COARSE_PX = 384
-RESUMED_AFTER_S = 10.0
+TEXTURE_TEXELS_BY_WIDTH = (256, 512)
+"""Of the face's texture: for pictures up to `MAX_COARSE_WIDTH_PX` across, and for larger ones."""
+MAX_COARSE_WIDTH_PX = 384
+INTERRUPTION_S = 10.0
 """Time on the host's clock that a simulated interruption takes, s."""
 
 
-def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
-    """Simulate a sequence with the flash rig; see `simulation.simulate_session`."""
+def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
+    """Simulate a sequence with the flash rig; see `simulation.simulate`."""
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
     from rigsim.subject.perfusion import STATES
@@ -57,30 +64,15 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     if sequence.state not in STATES or sequence.state == "neutral":
         expected = ", ".join(state for state in STATES if state != "neutral")
         raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")
-    order.refuse(
-        "flash",
-        target=None,
-        lights=None,
-        views=None,
-        move=False,
-        site=None,
-        angles=None,
-        steps=None,
-        sites=None,
-        all_brackets=False,
-        repeats=1,
-        states=("neutral",),
-    )
     width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
     rig = load_rig("flash").resized(width)
     constant_s = order.relaxation_s
     if constant_s is not None and not 0 < constant_s < np.inf:
         raise SimulationError(f"relaxation: got {constant_s}, expected seconds > 0")
-    shown = subject_records.of_manifest(order.subject)
     asked = {
         "rig": "flash",
         "width_px": width,
-        "subject": shown,
+        "subject": subject_records.of_manifest(order.subject),
         "mesh": str(order.mesh or ""),
         "sequence": sequence.document(),
         "relaxation_s": constant_s,
@@ -93,11 +85,13 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         raise OptionsError(f"reaction: is for prompts, and {sequence.state} follows an event")
     if sequence.prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
-        told: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
-        course: Any = PromptedCourse(sequence.state, seed=seed, **told)
+        known: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
+        course: Any = PromptedCourse(sequence.state, seed=seed, **known)
     else:
         course = EventCourse(sequence.state, constant_s)
-    texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
+    texels = (
+        TEXTURE_TEXELS_BY_WIDTH[0] if width <= MAX_COARSE_WIDTH_PX else TEXTURE_TEXELS_BY_WIDTH[1]
+    )
     subject = subject_file.named(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
@@ -105,7 +99,7 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         for line in sequence_lines(plan):
             order.progress(line)
     truth = truth_folder(order.out)
-    log: _Log | None = None
+    log: ExposureLog | None = None
 
     def note(flash: FlashTime) -> None:
         if log is not None:  # nothing flashes before the session is open
@@ -113,9 +107,9 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
 
     scene = FlashCourseScene(rig, person, course, seed=seed, movement=order.movement, on_flash=note)
     session = open_session(order, plan, rig, asked, scene)
-    log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
+    log = ExposureLog(truth.with_name(f"{truth.name}.flashes.jsonl"), resume=order.resume)
     before_s = _event_s(session)
-    begun_s = time.time() if before_s is None else _last_s(session) + RESUMED_AFTER_S
+    begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
     if before_s is not None and not sequence.prompted:
         course.tell(before_s - begun_s, sequence.state)  # it was over before this world began
 
@@ -126,39 +120,12 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     def signal(world: Any, text: str) -> None:
         course.tell(world.now, text)
 
-    rig_seconds = drive(
-        session, rig, scene, seed, prompt, order.progress, signal=signal, begun_s=begun_s
-    )
-    told = subject_records.of_truth(order.subject, "flash", order.progress)
-    _write_truth(truth, scene, session, sequence, log.read(), seed, told)
+    rig_seconds = drive(order, session, rig, scene, prompt, signal=signal, begun_s=begun_s)
+    about = subject_records.of_truth(order.subject, "flash", order.progress)
+    flashes = {str(entry["token"]): entry for entry in log.read()}
+    _write_truth(truth, scene, session, sequence, flashes, seed, about)
     log.remove()
-    left_out = tuple(scene.left_out)
-    return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, left_out, effects=effects_of(scene)
-    )
-
-
-class _Log:
-    """What each flash met, kept beside the session until the truth can be written."""
-
-    def __init__(self, path: Path, *, fresh: bool) -> None:
-        self._path = path
-        if fresh:
-            path.unlink(missing_ok=True)
-
-    def add(self, entry: Mapping[str, Any]) -> None:
-        with self._path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(dict(entry)) + "\n")
-
-    def read(self) -> dict[str, dict[str, Any]]:
-        """Return the entries by the flash's token."""
-        if not self._path.is_file():
-            return {}
-        lines = self._path.read_text(encoding="utf-8").splitlines()
-        return {entry["token"]: entry for entry in map(json.loads, lines)}
-
-    def remove(self) -> None:
-        self._path.unlink(missing_ok=True)
+    return finish(order, session, scene, rig_seconds, truth)
 
 
 def _event_s(session: Session) -> float | None:
@@ -184,10 +151,12 @@ def _write_truth(
 ) -> None:
     """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
     poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
-    radius_px = RADIUS_SHARE * session.rig.views[0].width_px / 2
+    radius_px = DISC_RADIUS_FRACTION * session.rig.views[0].width_px / 2
     places = {pose: landmarks_at_superpixels(scene.landmarks_px(pose)) for pose in poses}
     points = {
-        pose: {name: places[pose][of] for name, of in POINTS.items() if of in places[pose]}
+        pose: {
+            name: places[pose][of] for name, of in COURSE_LANDMARKS.items() if of in places[pose]
+        }
         for pose in poses
     }
     frames = []

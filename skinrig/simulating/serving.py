@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,12 @@ from capture.session import Session
 from skinrig.arrays import UInt16Array
 from skinrig.console import Console
 from skinrig.errors import INTERRUPTED, UsageError
-from skinrig.next_steps import named
+from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.orders import SIZES, OptionsError, SimulationError
 from skinrig.simulating.shot_numbers import shots_made
-from skinrig.simulating.subject_records import unseen
+from skinrig.simulating.subject_records import unused_subject_keys
 
 if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
@@ -31,19 +32,34 @@ PROBE_PHOTONS = 20_000
 farthest fibres; `skinrig simulate probe` has its truth from ten times as many and more."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServeOrder:
+    """What a served rig is asked for."""
+
+    pty: bool = False
+    """Boxes on pseudo terminals; cameras are on TCP in either case."""
+    tcp: str = "127.0.0.1:0"
+    """HOST:PORT; port 0 chooses a free one."""
+    allow_remote: bool = False
+    """Permit an address that other machines reach."""
+    subject: str = "III"
+    size: str = "small"
+    seed: int = 0
+    site: str | None = None
+    """Of the gradient rig's skin."""
+    resume: Path | None = None
+    """Session of which an earlier server of the same seed made the frames that there are: noise is
+    drawn by the number of a shot, and shots are counted on from those. None: from 0 on."""
+
+    def __post_init__(self) -> None:
+        if self.size not in SIZES:
+            raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
+        if not re.fullmatch(r".+:\d+", self.tcp):
+            raise UsageError(f"--tcp: got {self.tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
+
+
 def serve_rig(
-    rig_name: str,
-    *,
-    pty: bool,
-    tcp: str,
-    allow_remote: bool,
-    subject: str,
-    size: str,
-    seed: int,
-    site: str | None = None,
-    resume: Path | None = None,
-    seconds: float | None = None,
-    as_json: bool = False,
+    rig_name: str, order: ServeOrder, console: Console, *, seconds: float | None = None
 ) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
 
@@ -56,65 +72,33 @@ def serve_rig(
     ----------
     rig_name
         "flash", or a rig's TOML file.
-    pty
-        Boxes on pseudo terminals; cameras are on TCP in either case.
-    tcp
-        HOST:PORT; port 0 chooses a free one.
-    allow_remote
-        Permit an address that other machines reach.
-    subject, size, seed, site
-        As for a simulation.
-    resume
-        Session of which an earlier server of the same seed made the frames that there are: noise is
-        drawn by the number of a shot, and shots are counted on from those. None: from 0 on.
+    order
+        What is served.
+    console
+        With ``as_json`` the addresses are one JSON document, with the next step.
     seconds
         How long; None serves until Ctrl-C.
-    as_json
-        Whether the addresses are one JSON document, with the next step.
     """
     from rigsim.world.serve import serve
 
-    if size not in SIZES:
-        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
-    if not re.fullmatch(r".+:\d+", tcp):
-        raise UsageError(f"--tcp: got {tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
     rig = load_rig(rig_name)
-    made = _shots_made(resume, rig)
-    if site is not None and rig.caliper is None:
+    made = _shots_made(order.resume, rig)
+    if order.site is not None and rig.caliper is None:
         raise OptionsError("site: only the gradient rig knows of it; leave it out")
-    # a rig's own file may have any name: what it sees hangs on what it is built of
-    kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
-    unseen(subject, kind, lambda text: print(text, file=sys.stderr))
-    if "gradient_sphere" in rig.boxes:
-        if size != "small":
-            raise SimulationError(
-                f"size: got {size!r}, expected small: larger pictures take longer to make than the "
-                "caliper waits for its host; skinrig simulate gradient makes them"
-            )
-        rig = rig.cropped(GRADIENT_WIDTH_PX)
-        scene = gradient.make_scene(rig, site=site, subject=subject, seed=seed)
-        # what all states share is made before anybody asks, so that no client waits for it
-        scene.lighting()
-    elif rig.probe is not None:
-        scene = _probe_scene(rig, rig.probe, subject, seed)
-    else:
-        dome = "dome" in rig.boxes
-        width = (simulating_dome if dome else flash).WIDTHS_PX[size]
-        rig = rig.resized(width) if width != rig.views[0].width_px else rig
-        scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
+    rig, scene = _served(rig, order)
     with serve(
-        rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene, shots_made=made
+        rig,
+        pty=order.pty,
+        tcp=order.tcp,
+        allow_remote=order.allow_remote,
+        seed=order.seed,
+        scene=scene,
+        shots_made=made,
     ) as served:
-        boxes = " ".join("--port " + named(f"{n}={served.addresses[n]}") for n in rig.boxes)
-        cameras = " ".join(
-            "--camera " + named(f"{v.name}={served.addresses[v.name]}") for v in rig.views
-        )
-        more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
-        out = "session" if resume is None else f"{named(resume)} --resume"
-        after = f"skinrig capture {named(rig_name)} {boxes} {cameras}{more} --out {out}"
-        if as_json:
+        after = _next_step(rig_name, rig, served.addresses, order.resume)
+        if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": after}
-            Console(as_json).document("skinrig.serve/1", addresses)
+            console.document("skinrig.serve/1", addresses)
         else:
             for name, url in served.addresses.items():
                 print(f"{name} {url}", flush=True)
@@ -123,9 +107,43 @@ def serve_rig(
             served.wait(seconds)
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
-            if as_json:  # its one document stands there already
+            if console.as_json:  # its one document stands there already
                 raise SystemExit(INTERRUPTED) from None
             raise
+
+
+def _served(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
+    """Return a rig as it is served, and what stands in it."""
+    subject, seed = order.subject, order.seed
+    # a rig's own file may have any name: what it sees hangs on what it is built of
+    kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
+    unused_subject_keys(subject, kind, lambda text: print(text, file=sys.stderr))
+    if kind == "gradient":
+        if order.size != "small":
+            raise SimulationError(
+                f"size: got {order.size!r}, expected small: larger pictures take longer to make "
+                "than the caliper waits for its host; skinrig simulate gradient makes them"
+            )
+        rig = rig.cropped(GRADIENT_WIDTH_PX)
+        scene = gradient.make_scene(rig, site=order.site, subject=subject, seed=seed)
+        # what all states share is made before anybody asks, so that no client waits for it
+        scene.lighting()
+        return rig, scene
+    if rig.probe is not None:
+        return rig, _probe_scene(rig, rig.probe, subject, seed)
+    dome = "dome" in rig.boxes
+    width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
+    rig = rig.resized(width) if width != rig.views[0].width_px else rig
+    return rig, (_dome_scene if dome else _flash_scene)(rig, subject, seed)
+
+
+def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | None) -> str:
+    """Return the command that captures from a served rig."""
+    boxes = " ".join("--port " + shell_quote(f"{name}={urls[name]}") for name in rig.boxes)
+    cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.views)
+    more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
+    out = "session" if resume is None else f"{shell_quote(resume)} --resume"
+    return f"skinrig capture {shell_quote(rig_name)} {boxes} {cameras}{more} --out {out}"
 
 
 def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:

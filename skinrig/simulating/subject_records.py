@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-SUFFIX = ".toml"
+SUBJECT_FILE_SUFFIX = ".toml"
 """Of a subject's file, see `rigsim.population.files`."""
 
 
@@ -18,7 +18,7 @@ def pseudonym(subject: str, seed: int) -> str:
     >>> pseudonym("III", 0), pseudonym("homogeneous:0.04,1.5", 2), pseudonym("people/ann.toml", 0)
     ('simulated-III-0', 'simulated-homogeneous-0.04-1.5-2', 'simulated-ann-0')
     """
-    said = Path(subject).stem if subject.endswith(SUFFIX) else subject
+    said = Path(subject).stem if subject.endswith(SUBJECT_FILE_SUFFIX) else subject
     name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in said)
     return f"simulated-{name}-{seed}"
 
@@ -30,7 +30,9 @@ def of_manifest(subject: str) -> str | dict[str, Any]:
     return subject_file.record(subject)
 
 
-def unseen(subject: str, rig: str, tell: Callable[[str], None] | None = None) -> tuple[str, ...]:
+def unused_subject_keys(
+    subject: str, rig: str, tell: Callable[[str], None] | None = None
+) -> tuple[str, ...]:
     """Return the keys of a subject's file of which a rig sees nothing; none of a preset.
 
     Parameters
@@ -71,5 +73,5 @@ def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> 
     return {
         "subject": Path(subject).stem,
         "subject_file": subject_file.record(subject),
-        "subject_unused": list(unseen(subject, rig, progress)),
+        "subject_unused": list(unused_subject_keys(subject, rig, progress)),
     }

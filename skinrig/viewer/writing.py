@@ -53,10 +53,10 @@ def compose(
         scene = from_appearance.scene(
             appearances, mesh=mesh, landmarks=landmarks, calibration=calibration, size=size
         )
-        agreed = consent.carried(*map(store.read_document, appearances))
+        agreed = consent.merge_consent(*map(store.read_document, appearances))
         if not agreed:
             return scene
-        told = {**scene.provenance, consent.KEY: consent.told(agreed)}
+        told = {**scene.provenance, consent.CONSENT_KEY: consent.format_consent(agreed)}
         return dataclasses.replace(scene, provenance=told)
     if landmarks is not None:
         raise SceneError(

@@ -25,6 +25,7 @@ def registered(typer_app, before=()):
 WORDS = sorted(registered(app))
 COMMANDS = sorted({words[0] for words in WORDS})
 ROOT = Path(__file__).parents[2]
+RIG_GROUPS = ("plan", "simulate", "capture", "serve")
 
 
 @pytest.mark.parametrize("words", WORDS, ids=" ".join)
@@ -33,7 +34,11 @@ def test_every_command_explains_itself_with_an_example(words, capsys):
     assert f"Example: skinrig {' '.join(words)}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("group", [[], ["fit"], ["apply"], ["analyse"], ["import"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "group",
+    [[], ["fit"], ["apply"], ["analyse"], ["import"], *([name] for name in RIG_GROUPS)],
+    ids=" ".join,
+)
 def test_help_lists_each_command_with_its_whole_summary(group, capsys):
     assert main([*group, "--help"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
@@ -63,6 +68,73 @@ def test_the_promised_commands_are_there():
         "demo",
     }
     assert promised <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("verb", RIG_GROUPS)
+def test_help_of_a_rig_lists_its_own_options_only(verb, capsys):
+    shown = {}
+    for rig in ("flash", "dome", "gradient", "probe"):
+        assert main([verb, rig, "--help"]) == 0
+        shown[rig] = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
+    owners = {
+        "--site": {"gradient"},
+        "--sites": {"probe"},
+        "--state": {"flash"} if verb == "capture" else {"flash", "dome"},
+        "--sequence": {"flash"},
+        "--condition": {"dome"},
+        "--steps": {"gradient"},
+        "--all-brackets": {"probe"},
+        "--most-lights": {"dome"},
+        "--force-limit": {"gradient"},
+    }
+    for option, rigs in owners.items():
+        assert {rig for rig in shown if option in shown[rig]} in (rigs, set()), option
+
+
+@pytest.mark.parametrize(
+    ("argv", "rigs"),
+    [
+        (["simulate", "flash", "--out", "x", "--steps", "-1..2"], "gradient"),
+        (["simulate", "--steps", "-1..2", "flash", "--out", "x"], "gradient"),
+        (["capture", "probe", "--dry-run", "--sequence", "smile"], "flash"),
+        (["plan", "gradient", "--most-lights", "3"], "dome"),
+        (["serve", "dome", "--site", "cheek"], "gradient"),
+    ],
+)
+def test_an_option_of_another_rig_names_option_and_rigs(argv, rigs, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    rig = next(word for word in argv if word in ("flash", "dome", "gradient", "probe"))
+    option = next(
+        word for word in argv if word.startswith("--") and word[2:5] not in ("out", "dry")
+    )
+    told = capsys.readouterr().err
+    assert f"{option}: the {rig} rig knows nothing of it; leave it out (it is for {rigs})" in told
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["capture", "--dry-run", "--plan-out", "plan.json", "flash"],
+        ["capture", "--plan-out", "dome", "flash", "--dry-run"],
+        ["capture", "flash", "--dry-run"],
+    ],
+)
+def test_options_may_stand_before_the_rig(argv, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*argv, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["plan"]["rig"] == "flash"
+
+
+def test_a_rigs_own_file_is_captured_by_the_command_of_its_kind(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = ROOT / "capture" / "rigs" / "probe.toml"
+    (tmp_path / "mine.toml").write_text(shipped.read_text("utf-8"), encoding="utf-8")
+    assert main(["capture", "mine.toml", "--dry-run", "--sites", "cheek", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["plan"]["rig"] == "probe"
+    assert main(["capture", "mine.toml", "--dry-run", "--eyes", "closed"]) == 2
+    assert "--eyes: the probe rig knows nothing of it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -185,9 +257,10 @@ def test_an_interrupted_command_is_told_of_resuming_where_it_can():
     resumable = {
         name
         for name, command in commands.items()
-        if any("--resume" in option.opts for option in command.params)
+        for one in (getattr(command, "commands", None) or {name: command}).values()
+        if any("--resume" in option.opts for option in one.params)
     }
-    assert resumable == set(errors.RESUMED)
+    assert resumable == set(errors.RESUMABLE_COMMANDS)
     told = {name: errors.interruption([name, "--json"]) for name in commands}
     assert {name for name, text in told.items() if "--resume" in text} == resumable
 

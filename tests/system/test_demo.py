@@ -90,8 +90,8 @@ def test_the_dome_alone_goes_from_targets_to_a_report(
 ):
     monkeypatch.setattr("skinrig.demo_rigs.DOME_WIDTH_PX", 200)
     # fewer lights and cameras than the demo's own: how accurate a dome is, other tests say
-    monkeypatch.setitem(dome.LIGHTS, "small", 32)
-    monkeypatch.setitem(dome.VIEWS, "small", 4)
+    monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 32)
+    monkeypatch.setitem(dome.VIEW_COUNTS, "small", 4)
     out = tmp_path / "demo"
     assert main(["demo", "--rigs", "dome", "--out", str(out), "--json"]) == 0
     document, report = shown(out, capsys)

@@ -17,6 +17,7 @@ from capture.devices import wire
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.flash import FlashUnit
 from skinrig.cli import app
+from skinrig.commands.help import RigFileGroup, RigGroup
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -220,6 +221,8 @@ def resolve(argv):
     command = command_line()
     words = list(argv)
     while hasattr(command, "commands"):
+        if isinstance(command, RigFileGroup) and words and words[0].endswith(".toml"):
+            words[0] = "flash"
         assert words, f"skinrig {' '.join(argv)}: names no command"
         assert words[0] in command.commands, f"skinrig {' '.join(argv)}: no such command"
         command = command.commands[words.pop(0)]
@@ -236,8 +239,16 @@ def test_commands_in_shell_blocks_parse_with_nothing_missing(page):
 @named([page for page in GUIDES if inline_commands(page)])
 def test_commands_in_the_text_exist_and_have_the_options_named(page):
     for argv in inline_commands(page):
-        command, words = resolve(argv)
-        known = {name for parameter in command.params for name in parameter.opts}
+        group = command_line().commands.get(argv[0])
+        if isinstance(group, RigGroup) and (len(argv) == 1 or argv[1].startswith("-")):
+            # of any rig: each option is one of some rig's
+            words, rigs = argv[1:], [*group.commands.values()]
+        elif isinstance(group, RigGroup) and argv[1] == "RIG":
+            words, rigs = argv[2:], [*group.commands.values()]
+        else:
+            command, words = resolve(argv)
+            rigs = [command]
+        known = {name for one in rigs for parameter in one.params for name in parameter.opts}
         unknown = [word for word in words if word.startswith("-") and word not in known]
         assert not unknown, f"skinrig {' '.join(argv)}: {unknown}"
 

@@ -30,6 +30,8 @@ def offered(words):
     ("words", "expected"),
     [
         ("simulate d", ["dome"]),
+        ("simulate dome --target ch", ["charuco"]),
+        ("simulate dome --condi", ["--condition"]),
         ("calibrate ge", ["geometry"]),
         ("demo --rigs flash,p", ["flash,probe"]),
         ("reconstruct session --want normals,r", ["normals,r_d"]),
@@ -43,7 +45,6 @@ def test_tab_completes_names(words, expected):
 @pytest.mark.parametrize(
     ("complete", "typed", "one"),
     [
-        (completion.targets, "ch", "charuco"),
         (completion.subjects, "dark", "darkest"),
         (completion.states, "sm", "smile"),
         (completion.conditions, "lo", "lotion"),

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from skinrig.cli import main
-from skinrig.next_steps import CALIBRATIONS, OPENER, after_session, suggest, welcome
+from skinrig.next_steps import CALIBRATION_BY_TARGET, OPEN_COMMAND, after_session, suggest, welcome
 from skinrig.reporting.page import document
-from skinrig.workspace import look
+from skinrig.workspace import scan
 
 
 def session(path, rig="flash", kinds=("dark", "subject"), target=""):
@@ -33,7 +33,7 @@ def appearance(path, session="", kind="appearance", files=()):
 
 
 def commands(folder=Path()):
-    return [step.command for step in suggest(look(folder), folder)]
+    return [step.command for step in suggest(scan(folder), folder)]
 
 
 def report_page():
@@ -103,7 +103,7 @@ def test_a_demo_below_is_found():
     Path("demo/report.html").write_text(report_page())
     text = welcome(Path(), "1")
     assert "In demo: 1 session, 1 report" in text
-    assert f"{OPENER} {Path('demo/report.html')}" in text
+    assert f"{OPEN_COMMAND} {Path('demo/report.html')}" in text
 
 
 def test_a_live_page_and_a_page_of_others_are_no_reports():
@@ -111,9 +111,9 @@ def test_a_live_page_and_a_page_of_others_are_no_reports():
     live = report_page().replace("img-src data:;", "script-src 'sha256-x'; img-src data:;")
     Path("face.html").write_text(live)
     Path("notes.html").write_text("<html>about reports</html>")
-    assert not look(Path()).reports
+    assert not scan(Path()).reports
     Path("zone.html").write_text(report_page())
-    assert look(Path()).reports == (Path("zone.html"),)
+    assert scan(Path()).reports == (Path("zone.html"),)
 
 
 def test_damaged_documents_do_not_stop_it():
@@ -125,7 +125,8 @@ def test_damaged_documents_do_not_stop_it():
 
 
 @pytest.mark.parametrize(
-    ("rig", "target"), [(rig, target) for rig, kinds in CALIBRATIONS.items() for target in kinds]
+    ("rig", "target"),
+    [(rig, target) for rig, kinds in CALIBRATION_BY_TARGET.items() for target in kinds],
 )
 def test_each_target_leads_to_a_calibration_that_exists(rig, target, capsys):
     words = after_session(rig, "session", target).split()
@@ -153,7 +154,7 @@ def test_a_path_with_spaces_is_quoted_so_that_the_command_can_be_pasted():
         after_session("flash", "my smiles", "sequence"),
     ]:
         words = shlex.split(command)
-        assert words[0] in ("skinrig", OPENER)
+        assert words[0] in ("skinrig", OPEN_COMMAND)
         assert not {"my", "o'clock"} & set(words), command
 
 

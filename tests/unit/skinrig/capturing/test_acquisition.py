@@ -146,11 +146,11 @@ def test_a_device_that_is_held_is_asked_for_again_and_said_so_once(error):
     def sleep(seconds):
         now[0] += seconds
 
-    found = addresses.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+    found = addresses.open_with_retry(open_device, said.append, clock=lambda: now[0], sleep=sleep)
     assert (found, len(said)) == ("camera", 1)
     failures[:] = [error] * 99
     with pytest.raises(type(error)):
-        addresses.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+        addresses.open_with_retry(open_device, said.append, clock=lambda: now[0], sleep=sleep)
     assert now[0] == pytest.approx(3 * 0.5 + 10.0)
 
 
@@ -159,7 +159,7 @@ def test_a_device_that_is_broken_is_not_asked_for_again():
         raise CameraError("broken")
 
     with pytest.raises(CameraError, match="broken"):
-        addresses.patiently(open_device, print, sleep=lambda seconds: pytest.fail("waited"))
+        addresses.open_with_retry(open_device, print, sleep=lambda seconds: pytest.fail("waited"))
 
 
 def test_addresses_of_the_wrong_form_are_usage_errors():

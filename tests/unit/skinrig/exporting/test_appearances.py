@@ -22,7 +22,7 @@ LAST = date(2030, 1, 1)
 
 @pytest.fixture
 def measured(patch, tmp_path):
-    face = patch.face(source="measured", parameters={consent.KEY: [patch.consent]})
+    face = patch.face(source="measured", parameters={consent.CONSENT_KEY: [patch.consent]})
     return store.write(tmp_path / "measured", face)
 
 
@@ -68,15 +68,17 @@ def test_consent_of_every_part_of_a_moving_face_counts():
     told = {"pseudonym": "a", "consent_scope": ["research", "film"], "consent_expires": None}
     other = {"pseudonym": "b", "consent_scope": ["research"], "consent_expires": None}
     parts = {
-        "facial_color": {"source": "measured", consent.KEY: [told]},
-        "wrinkles": {"source": "measured", consent.KEY: [other]},
+        "facial_color": {"source": "measured", consent.CONSENT_KEY: [told]},
+        "wrinkles": {"source": "measured", consent.CONSENT_KEY: [other]},
     }
     face = SkinAppearance({}, "measured", {"kind": "dynamic", "parts": parts})
     assert consent.recorded(face) == [told, other]
     consent.require(face, "research", where="x")
     with pytest.raises(ConsentError, match="subject b has not agreed"):
         consent.require(face, "film", where="x")
-    del parts["wrinkles"][consent.KEY]  # one part of a simulated face that was measured silently
+    del parts["wrinkles"][
+        consent.CONSENT_KEY
+    ]  # one part of a simulated face that was measured silently
     mixed = SkinAppearance({}, "simulated", {"kind": "dynamic", "parts": parts})
     with pytest.raises(ConsentError, match="does not record"):
         consent.require(mixed, "research", where="x")
@@ -84,7 +86,9 @@ def test_consent_of_every_part_of_a_moving_face_counts():
 
 def test_what_is_made_of_silent_measurements_agrees_to_nothing():
     made = SkinAppearance(
-        {}, "simulated", {consent.KEY: consent.carried(SkinAppearance({}, "measured"))}
+        {},
+        "simulated",
+        {consent.CONSENT_KEY: consent.merge_consent(SkinAppearance({}, "measured"))},
     )
     with pytest.raises(ConsentError, match="unknown has not agreed"):
         consent.require(made, "research", where="x")
@@ -92,7 +96,7 @@ def test_what_is_made_of_silent_measurements_agrees_to_nothing():
 
 def test_a_damaged_date_is_no_consent(patch):
     told = {**patch.consent, "consent_expires": "soon"}
-    face = SkinAppearance({}, "measured", {consent.KEY: [told]})
+    face = SkinAppearance({}, "measured", {consent.CONSENT_KEY: [told]})
     with pytest.raises(ConsentError, match="got 'soon'"):
         consent.require(face, "research", where="x")
 
@@ -189,13 +193,13 @@ def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_
         made.close()
 
     def told():
-        return store.read(tmp_path / "maps").parameters.get(consent.KEY)
+        return store.read(tmp_path / "maps").parameters.get(consent.CONSENT_KEY)
 
     reconstruct(tmp_path / "s", want=["diffuse"], out=tmp_path / "maps")
     expected = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2030-01-01"}
     assert told() == [expected]
     found = store.read(tmp_path / "maps")
-    old = {k: v for k, v in found.parameters.items() if k != consent.KEY}
+    old = {k: v for k, v in found.parameters.items() if k != consent.CONSENT_KEY}
     store.write(tmp_path / "maps", dataclasses.replace(found, parameters=old))
     assert told() is None
     outcome = reconstruct(tmp_path / "s", want=["diffuse"], out=tmp_path / "maps")
@@ -224,7 +228,7 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
         "maps": sorted(maps),
         "files": ["facial_color.json"],
         "source": "measured",
-        consent.KEY: [{"pseudonym": "rig", **told}],
+        consent.CONSENT_KEY: [{"pseudonym": "rig", **told}],
     }
     made = SkinAppearance(
         maps,
@@ -236,7 +240,7 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
     onto = SkinAppearance(
         {"hemoglobin": maps["hemoglobin"], "melanin": maps["melanin"]},
         "measured",
-        {consent.KEY: [{"pseudonym": "other", **told}]},
+        {consent.CONSENT_KEY: [{"pseudonym": "other", **told}]},
     )
     expression = applying.Expression({"smile": 1.0}, onto=applying.OtherFace(onto))
     applying.apply_expression(tmp_path / "moving", expression, out=tmp_path / "shown")

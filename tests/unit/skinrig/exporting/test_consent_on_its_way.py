@@ -33,7 +33,7 @@ def dome(patch, tmp_path):
     """Return what writes a measured dome's maps with somebody's consent."""
 
     def write(name, record=NARROW, **more):
-        told = {} if record is None else {consent.KEY: [record]}
+        told = {} if record is None else {consent.CONSENT_KEY: [record]}
         return store.write(
             tmp_path / name, patch.face(source="measured", parameters={**told, **more})
         )
@@ -49,7 +49,7 @@ def refused_beyond(folder, tmp_path, to):
     assert not (tmp_path / "out").exists()
     export_appearance(folder, tmp_path / "out", to=to, use="research", today=DAY)
     told = next((tmp_path / "out").glob("*.json"))
-    assert json.loads(told.read_text())[consent.KEY] == [NARROW]
+    assert json.loads(told.read_text())[consent.CONSENT_KEY] == [NARROW]
 
 
 def test_a_fitted_reflectance_leaves_within_the_consent_alone(dome, tmp_path):
@@ -60,9 +60,11 @@ def test_a_fitted_reflectance_leaves_within_the_consent_alone(dome, tmp_path):
 def test_a_model_of_two_sessions_needs_the_consent_of_both(dome, tmp_path):
     """A dome of one subject and a probe of another: neither alone may be overruled."""
     fit_reflectance(dome("dome"), out=tmp_path / "model")
-    both = consent.carried(*(store.read(dome(n, r)) for n, r in (("a", NARROW), ("b", OTHER))))
+    both = consent.merge_consent(
+        *(store.read(dome(n, r)) for n, r in (("a", NARROW), ("b", OTHER)))
+    )
     model = store.read(tmp_path / "model")
-    mixed = dataclasses.replace(model, parameters={**model.parameters, consent.KEY: both})
+    mixed = dataclasses.replace(model, parameters={**model.parameters, consent.CONSENT_KEY: both})
     for use, who in (("research", "P007"), ("teaching", "P042")):
         with pytest.raises(ConsentError, match=f"{who} has not agreed"):
             consent.require(mixed, use, where="x", today=DAY)
@@ -73,7 +75,7 @@ def smiling(patch, tmp_path):
     """Return what writes the same dome with other relief."""
 
     def write(name, record=NARROW):
-        told = {} if record is None else {consent.KEY: [record]}
+        told = {} if record is None else {consent.CONSENT_KEY: [record]}
         face = patch.face(source="measured", parameters={**told, "state": "smile"})
         old = face.maps["normals"]
         relief = SkinMap(patch.bumpy(old.values, seed=9), "1", old.stderr, old.valid)
@@ -88,7 +90,7 @@ def test_fitted_wrinkles_leave_within_the_consent_alone(dome, smiling, tmp_path)
     faces = [dome("n", state="neutral"), smiling("s")]
     fit_wrinkles(faces, out=tmp_path / "moving", size=32, mask_size=16)
     (part,) = parts_of(store.read(tmp_path / "moving")).values()
-    assert part[consent.KEY] == [NARROW]
+    assert part[consent.CONSENT_KEY] == [NARROW]
     refused_beyond(tmp_path / "moving", tmp_path, "metahuman")
 
 
@@ -103,7 +105,7 @@ def test_fitted_microstructure_leaves_within_the_consent_alone(tmp_path, rng):
     caliper = SkinAppearance(
         {"height_a000_n0": SkinMap(rng.normal(0.0, 9.0, (32, 32)), "um")},
         "measured",
-        {"states": ["a000_n0"], "pixel_um": 6.0, consent.KEY: [NARROW]},
+        {"states": ["a000_n0"], "pixel_um": 6.0, consent.CONSENT_KEY: [NARROW]},
         files={"kernels.json": b'{"fits": []}'},
     )
     store.write(tmp_path / "cheek", caliper)
@@ -172,7 +174,7 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
         store.write(
             path,
             dataclasses.replace(
-                one, source="measured", parameters={**one.parameters, consent.KEY: [record]}
+                one, source="measured", parameters={**one.parameters, consent.CONSENT_KEY: [record]}
             ),
         )
     space = tmp_path / "traits.npz"
@@ -196,9 +198,9 @@ def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_pat
     from skinrig.viewer.packing import arrays as packing
 
     scene = writing.compose([dome("dome")], size=64)
-    assert scene.provenance[consent.KEY] == ["P042: research, until 2030-01-01"]
-    assert packing.pack(scene).header["provenance"][consent.KEY] == list(
-        scene.provenance[consent.KEY]
+    assert scene.provenance[consent.CONSENT_KEY] == ["P042: research, until 2030-01-01"]
+    assert packing.pack(scene).header["provenance"][consent.CONSENT_KEY] == list(
+        scene.provenance[consent.CONSENT_KEY]
     )
 
 
@@ -206,7 +208,7 @@ def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_pat
 def test_a_page_of_a_simulated_face_names_nobody(face_folder):
     from skinrig.viewer import writing
 
-    assert consent.KEY not in writing.compose([face_folder], size=64).provenance
+    assert consent.CONSENT_KEY not in writing.compose([face_folder], size=64).provenance
 
 
 def consent_of(html):
@@ -222,7 +224,7 @@ def test_a_report_names_whom_it_shows_and_for_what_it_may_be_handed_on(dome, tmp
     dome("shown/other", OTHER)
     (shown / "pictures").mkdir()
     (shown / "pictures" / "render.json").write_text(
-        json.dumps({"schema": "skinrig.render/1", consent.KEY: [NARROW]})
+        json.dumps({"schema": "skinrig.render/1", consent.CONSENT_KEY: [NARROW]})
     )
     html = report.build([shown])
     section = consent_of(html)
@@ -257,4 +259,4 @@ def test_a_report_on_a_session_names_its_subject(tmp_path):
 def test_a_rendering_bears_the_consent_of_whom_it_shows(dome):
     from skinrig.rendering.figures import Subject as Rendered
 
-    assert Rendered.of(dome("dome")).record()[consent.KEY] == [NARROW]
+    assert Rendered.of(dome("dome")).record()[consent.CONSENT_KEY] == [NARROW]

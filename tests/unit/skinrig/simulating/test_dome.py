@@ -11,7 +11,7 @@ from capture.rig import load_rig
 from capture.session import Session, verify
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.cli import main
-from skinrig.simulating.dome import small_dome, spread
+from skinrig.simulating.dome import farthest_point_sample, small_dome
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 
@@ -22,7 +22,7 @@ SMALL_POSES = 10
 def test_what_is_kept_of_a_dome_is_spread_evenly():
     places = np.array([light.position_mm for light in DOME.lights])
     way = places / np.linalg.norm(places, axis=1)[:, None]
-    chosen = spread(places, 24)
+    chosen = farthest_point_sample(places, 24)
     assert len(set(chosen)) == 24
     cosines = way[chosen] @ way[chosen].T
     np.fill_diagonal(cosines, -1.0)

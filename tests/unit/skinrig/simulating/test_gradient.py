@@ -5,8 +5,9 @@ import pytest
 from capture.plan.gradient import gradient_calibration_plan, gradient_plan
 from capture.rig import load_rig
 from capture.session import verify
-from skinrig.capturing.acquisition import choose_plan, needed_boxes, numbers_of, range_of
 from skinrig.capturing.light_safety import light_figures, light_lines
+from skinrig.capturing.option_values import parse_floats, parse_range
+from skinrig.capturing.plan_choice import choose_plan, needed_boxes
 from skinrig.errors import UsageError
 from skinrig.simulating.gradient import make_scene
 from skinrig.simulating.orders import SimulationError
@@ -40,23 +41,25 @@ def test_a_plan_of_skin_needs_both_boxes_and_one_of_a_target_the_sphere():
 
 
 def test_angles_and_steps_are_read_from_the_command_line():
-    plan = choose_plan(RIG, None, None, angles=numbers_of("0,90", ""), steps=range_of("-1..2", ""))
+    plan = choose_plan(
+        RIG, None, None, angles=parse_floats("0,90", ""), steps=parse_range("-1..2", "")
+    )
     assert {(s.index["angle"], s.index["caliper"]) for s in plan.steps if s.kind != "dark"} == {
         (angle, step) for angle in (0, 90) for step in range(-1, 3)
     }
-    assert numbers_of(None, "") is range_of(None, "") is None
+    assert parse_floats(None, "") is parse_range(None, "") is None
 
 
 @pytest.mark.parametrize("text", ["-2", "2..", "a..b", "..", "1,2"])
 def test_a_range_that_is_none_is_a_usage_error(text):
     with pytest.raises(UsageError, match=r"--steps: got .* expected FIRST\.\.LAST"):
-        range_of(text, "--steps")
+        parse_range(text, "--steps")
 
 
 @pytest.mark.parametrize("text", ["", "x", "0,,90", "0;90"])
 def test_angles_that_are_none_are_a_usage_error(text):
     with pytest.raises(UsageError, match="--angles"):
-        numbers_of(text, "--angles")
+        parse_floats(text, "--angles")
 
 
 def test_angles_are_for_skin_in_a_caliper_only(tmp_path):

@@ -8,14 +8,14 @@ from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session
 from rigsim.needs.effects import SceneEffects
-from skinrig.simulating.leaving_out import SWITCHES
+from skinrig.simulating.leaving_out import SWITCHES_BY_RIG
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 
 
 @pytest.mark.parametrize("rig", ["flash", "dome", "gradient"])
 def test_every_name_is_an_effect_that_scenes_take(rig):
-    for name in SWITCHES[rig]:
+    for name in SWITCHES_BY_RIG[rig]:
         asked = dataclasses.asdict(SceneEffects.from_switches({name: False}))
         assert list(asked.values()).count(False) == 1
 

@@ -1,4 +1,4 @@
-"""`skinrig view`: a face in the browser, drawn live."""
+"""The commands that show what was measured: one page, or a face drawn live."""
 
 from __future__ import annotations
 
@@ -7,11 +7,71 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import Json, Page
+from skinrig.commands.options import STDOUT, Json, Page, file_to_write
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
-MOST_PORT = 65_535
+MAX_PORT = 65_535
+
+
+def report(
+    paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", callback=file_to_write, help="The page; - is the standard output."
+        ),
+    ] = Path("report.html"),
+    compare: Annotated[
+        bool | None,
+        typer.Option(
+            "--compare/--no-compare",
+            help="Put two runs side by side; default: where PATHS are exactly two of one kind.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write one self-contained HTML page about what lies at PATHS.
+
+    Two sets of maps, two benchmarks, two folders of pictures or two of runs are compared; truths
+    beside them serve both. Anything else is shown one after the other.
+
+    Example: skinrig report demo -o report.html
+
+    Example: skinrig report monday tuesday -o difference.html
+    """
+    from skinrig.report import make
+    from skinrig.reporting.folders import write_page
+
+    piped = str(out) == STDOUT
+    if piped and json:
+        raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
+    console = Console(json)
+    talk = Console(json or piped)  # where the page goes nothing else does
+    done = make(paths, compare=compare)
+    if piped:
+        typer.echo(done.html, nl=False)
+    else:
+        write_page(out, done.html)
+    size = len(done.html.encode())
+    if done.compared is None:
+        talk.say(done.verdict)
+    else:
+        talk.say(f"compared {' with '.join(done.compared)}; --no-compare shows all of both")
+    if not piped:
+        talk.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
+    missed = sum(not check.passed for check in done.checks)
+    console.document(
+        "skinrig.report/1",
+        {
+            "path": out,
+            "bytes": size,
+            "checks": len(done.checks),
+            "missed": missed,
+            "compared": done.compared,
+        },
+    )
 
 
 def view(
@@ -76,8 +136,8 @@ def view(
     from skinrig.viewer.writing import compose, serve, write
 
     console = Console(json)
-    if port is not None and not 0 <= port <= MOST_PORT:
-        raise UnusableError(f"--port: got {port}, expected 0 to {MOST_PORT}")
+    if port is not None and not 0 <= port <= MAX_PORT:
+        raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}")
     if displacement is not None and port is None:
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
     scene = compose(
