@@ -12,8 +12,7 @@ from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import flash
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import map_names, page
+from skinrig.reporting import map_images, map_names, page
 
 IDENTIFIABILITY_NOISE = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
@@ -33,7 +32,7 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
         if true_map is None and skin_map.stderr is None:
             alone.append(_alone(key, skin_map))
             continue
-        yield from map_pictures.map_panel(
+        yield from map_images.map_panel(
             map_names.heading(key),
             page.short_unit(skin_map.unit),
             estimate=skin_map.values,
@@ -55,7 +54,7 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
         max(abs(low), abs(high)) < MAX_ROUNDING_ERROR
     ):  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
-    return map_pictures.scalar_picture(
+    return map_images.scalar_image(
         map_names.heading(key),
         skin_map.values,
         low=low,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
+from skinrig.evaluating.subsurface import number
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
@@ -82,10 +82,10 @@ def section(
             (
                 state_words(fit["name"]),
                 fit["stretch_s"],
-                *(_value(fit.get(key)) for key in _PARAMETER_KEYS),
-                _value(fit["distance_before"]),
-                _value(fit["distance"]),
-                _value(fit.get("noise_floor")),
+                *(number(fit.get(key)) for key in _PARAMETER_KEYS),
+                number(fit["distance_before"]),
+                number(fit["distance"]),
+                number(fit.get("noise_floor")),
                 fit.get("near_best_count", 0),
                 "yes" if fit["valid"] else "no",
             )
@@ -103,7 +103,7 @@ def section(
         for fit in fits:
             if fit["valid"]:
                 points.setdefault(fit["angle_deg"], []).append(
-                    (fit["stretch_s"], _value(fit[key]), _value(fit[error]))
+                    (fit["stretch_s"], number(fit[key]), number(fit[error]))
                 )
         series = [
             figures.Curve(
@@ -121,7 +121,7 @@ def section(
                 figures.Curve(
                     f"lines, {table['name']}",
                     line["stretch"],
-                    [_value(v) for v in line[key]],
+                    [number(v) for v in line[key]],
                     marks=False,
                 )
             )
@@ -135,7 +135,7 @@ def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:
     if not found:
         return
     rows = [
-        (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
+        (angle, number(alpha), number(alpha_error), number(sigma), number(sigma_error))
         for angle, alpha, alpha_error, sigma, sigma_error in zip(
             found["angle_deg"],
             found["alpha_offset"],
@@ -153,14 +153,10 @@ def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:
     )
     yield page.note(
         "Chance of such differences where the direction does not matter: alpha "
-        f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
+        f"{100 * number(found['p_alpha']):.2g} %, sigma {100 * number(found['p_sigma']):.2g} %."
     )
 
 
 def _told(fit: Mapping[str, Any]) -> bool:
     """Return whether a strain changes the histogram by more than twice what chance does."""
-    return _value(fit["distance_before"]) > 2.0 * _value(fit["noise_floor"])
-
-
-def _value(value: object) -> float:
-    return math.nan if value is None else float(str(value))
+    return number(fit["distance_before"]) > 2.0 * number(fit["noise_floor"])

@@ -18,8 +18,7 @@ from reconstruction.pipeline.probe.stages import (
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.subsurface import number, numbers
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
 MAX_PLOTTED_MEASUREMENTS = 3
@@ -355,7 +354,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     found = appearance.maps.get("translucency")
     if found is None:
         return
-    pictures = []
+    images = []
     for c, channel in enumerate(CHANNELS):
         values = found.values[..., c]
         inside = values if found.valid is None else values[found.valid]
@@ -365,8 +364,8 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         if found.stderr is not None:
             spread = found.stderr[..., c]
             shown.append(("standard error", spread, 0.0, spread.max(), "magma"))
-        pictures += [
-            map_pictures.scalar_picture(
+        images += [
+            map_images.scalar_image(
                 title,
                 drawn,
                 low=float(low),
@@ -383,7 +382,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
         "them the error grows to what people differ by."
     )
-    yield page.Images(pictures)
+    yield page.Images(images)
 
 
 def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
