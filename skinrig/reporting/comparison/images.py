@@ -138,26 +138,16 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
         yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            yield page.table(
+            yield page.records(
+                order,
                 (
-                    "picture",
-                    "values",
-                    "RMS of B − A over A, %",
-                    "mean B over A",
-                    "largest |B − A|",
-                    "equal",
+                    ("picture", lambda one: one.name),
+                    ("values", lambda one: one.kind),
+                    ("RMS of B − A over A, %", lambda one: 100 * one.relative_rms),
+                    ("mean B over A", lambda one: one.mean_ratio),
+                    ("largest |B − A|", lambda one: one.largest),
+                    ("equal", lambda one: "yes" if one.equal else "no"),
                 ),
-                [
-                    (
-                        one.name,
-                        one.kind,
-                        100 * one.relative_rms,
-                        one.mean_ratio,
-                        one.largest,
-                        "yes" if one.equal else "no",
-                    )
-                    for one in order
-                ],
                 caption="Linear values in the unit of the renderings; codes over 255, which follow "
                 "the brightness that each picture was shown with",
             )

@@ -105,38 +105,25 @@ def errors(
                 )
             )
     yield page.Heading("Errors by melanin band")
-    yield page.table(
+    yield page.records(
+        rows,
         (
-            "map",
-            "truth",
-            "band",
-            "pixels",
-            "masked, %",
-            "median |error|, %",
-            "68 % interval",
-            "bias, %",
-            "68 % coverage, %",
-            "by noise alone, %",
-            "median standard error, %",
-            "bound, %",
-        ),
-        [
+            ("map", lambda row: row.name),
+            ("truth", lambda row: row.against),
+            ("band", lambda row: row.band_name),
+            ("pixels", lambda row: row.pixels),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("median |error|, %", lambda row: 100 * row.median_relative),
             (
-                row.name,
-                row.against,
-                row.band_name,
-                row.pixels,
-                100 * row.masked,
-                100 * row.median_relative,
-                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.bias,
-                100 * row.coverage.share,
-                100 * row.noise_coverage,
-                100 * row.median_stderr,
-                100 * row.median_bound,
-            )
-            for row in rows
-        ],
+                "68 % interval",
+                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+            ),
+            ("bias, %", lambda row: 100 * row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
+            ("by noise alone, %", lambda row: 100 * row.noise_coverage),
+            ("median standard error, %", lambda row: 100 * row.median_stderr),
+            ("bound, %", lambda row: 100 * row.median_bound),
+        ),
         caption="Relative errors against what the subject is made of (sharp) and against what "
         "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
     )

@@ -188,45 +188,33 @@ def _errors(
             )
         )
     yield page.Heading("Blood of each state: error by way")
-    yield page.table(
+    yield page.records(
+        states,
         (
-            "state",
-            "way",
-            "median |error|, %",
-            "68 % interval",
-            "rms, points",
-            "bias, %",
-            "68 % coverage, %",
-            "pixels",
-        ),
-        [
+            ("state", lambda row: row.state),
+            ("way", lambda row: row.way),
+            ("median |error|, %", lambda row: 100 * row.median_relative),
             (
-                row.state,
-                row.way,
-                100 * row.median_relative,
-                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.rms,
-                100 * row.bias,
-                100 * row.coverage,
-                row.pixels,
-            )
-            for row in states
-        ],
+                "68 % interval",
+                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+            ),
+            ("rms, points", lambda row: 100 * row.rms),
+            ("bias, %", lambda row: 100 * row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
+            ("pixels", lambda row: row.pixels),
+        ),
         caption="Against the true blood of each state, by way of getting it; pixels that every "
         "way tells",
     )
-    yield page.table(
+    yield page.records(
+        changes,
         (
-            "state",
-            "true change, points",
-            "found, points",
-            "rms of the map, points",
-            "68 % coverage, %",
+            ("state", lambda row: row.state),
+            ("true change, points", lambda row: 100 * row.true),
+            ("found, points", lambda row: 100 * row.found),
+            ("rms of the map, points", lambda row: 100 * row.rms),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
         ),
-        [
-            (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
-            for row in changes
-        ],
         caption="Change of blood from the neutral state, one melanin for all states; over those of "
         "these pixels whose change was found",
     )

@@ -13,15 +13,6 @@ from skinrig.evaluating.subsurface import number
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
-_PARAMETER_KEYS = (
-    "alpha",
-    "alpha_stderr",
-    "alpha_95",
-    "sigma_um",
-    "sigma_stderr_um",
-    "sigma_95_um",
-)
-
 
 def section(
     name: str, appearance: SkinAppearance, checks: list[page.Check]
@@ -62,38 +53,32 @@ def section(
             "size differ by more than half of what the strain changes, so that the distance left "
             "by the kernel is not judged."
         )
-    yield page.table(
+    yield page.records(
+        fits,
         (
-            "state",
-            "r",
-            "alpha",
-            "standard error",
-            "95 % half width",
-            "sigma, um",
-            "standard error, um",
-            "95 % half width, um",
-            "distance before",
-            "after",
-            "other skin of this size",
-            "nearly as good",
-            "fitted",
+            ("state", lambda fit: state_words(fit["name"])),
+            ("r", lambda fit: fit["stretch_s"]),
+            ("alpha", lambda fit: number(fit.get("alpha"))),
+            ("standard error", lambda fit: number(fit.get("alpha_stderr"))),
+            ("95 % half width", lambda fit: number(fit.get("alpha_95"))),
+            ("sigma, um", lambda fit: number(fit.get("sigma_um"))),
+            ("standard error, um", lambda fit: number(fit.get("sigma_stderr_um"))),
+            ("95 % half width, um", lambda fit: number(fit.get("sigma_95_um"))),
+            ("distance before", lambda fit: number(fit["distance_before"])),
+            ("after", lambda fit: number(fit["distance"])),
+            ("other skin of this size", lambda fit: number(fit.get("noise_floor"))),
+            ("nearly as good", lambda fit: fit.get("near_best_count", 0)),
+            ("fitted", lambda fit: "yes" if fit["valid"] else "no"),
         ),
-        [
-            (
-                state_words(fit["name"]),
-                fit["stretch_s"],
-                *(number(fit.get(key)) for key in _PARAMETER_KEYS),
-                number(fit["distance_before"]),
-                number(fit["distance"]),
-                number(fit.get("noise_floor")),
-                fit.get("near_best_count", 0),
-                "yes" if fit["valid"] else "no",
-            )
-            for fit in fits
-        ],
         caption="Kernels fitted to histograms of normals; distances before and after each. "
         "Kernel errors are not Gaussian: 95 % half widths differ from 1.96 standard errors",
     )
+    yield page.Plots(_plots(fits, document.get("tables", [])))
+    yield from _direction(document.get("direction"))
+
+
+def _plots(fits: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Draw strength and width of kernels over the stretch of the skin."""
     plots = []
     for key, error, title in (
         ("alpha", "alpha_stderr", "kernel strength alpha"),
@@ -115,7 +100,7 @@ def section(
             )
             for angle, rows in points.items()
         ]
-        for table in document.get("tables", []):
+        for table in tables:
             line = table["lines"]
             series.append(
                 figures.Curve(
@@ -127,8 +112,7 @@ def section(
             )
         if series:
             plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
-    yield page.Plots(plots)
-    yield from _direction(document.get("direction"))
+    return plots
 
 
 def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:

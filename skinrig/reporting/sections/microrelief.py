@@ -187,38 +187,22 @@ def _relief_errors(
         "corrected, and standard errors, which know noise alone, are then too small."
     )
     yield page.one_skin(truth.parameters)
-    yield page.table(
+    yield page.records(
+        rows,
         (
-            "state",
-            "pixels",
-            "masked, %",
-            "mean error, °",
-            "median, °",
-            "68 % interval",
-            "unblurred truth, °",
-            "median standard error, °",
-            "68 % coverage, %",
-            "height rms, um",
-            "relief rms, um",
-            "of relief, %",
+            ("state", lambda row: state_words(row.state)),
+            ("pixels", lambda row: row.pixels),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("mean error, °", lambda row: row.mean_deg),
+            ("median, °", lambda row: row.median_deg),
+            ("68 % interval", lambda row: f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}"),
+            ("unblurred truth, °", lambda row: row.unblurred_deg),
+            ("median standard error, °", lambda row: row.stderr_deg),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
+            ("height rms, um", lambda row: row.height_um),
+            ("relief rms, um", lambda row: row.relief_um),
+            ("of relief, %", lambda row: 100 * row.height_relative),
         ),
-        [
-            (
-                state_words(row.state),
-                row.pixels,
-                100 * row.masked,
-                row.mean_deg,
-                row.median_deg,
-                f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}",
-                row.unblurred_deg,
-                row.stderr_deg,
-                100 * row.coverage,
-                row.height_um,
-                row.relief_um,
-                100 * row.height_relative,
-            )
-            for row in rows
-        ],
         caption="Every state against its truth; angles of normals in degrees",
     )
 
@@ -255,42 +239,27 @@ def _strain(
                 worst=state_words(worst.state),
             )
         )
-    rows = [
-        (
-            state_words(state["name"]),
-            number(state["reading_mm"]),
-            number(state["force_n"]),
-            number(state["reading_ratio"]),
-            number(state["stretch_s"]),
-            round(number(state["stretch_s_stderr"]), 6),
-            true[state["name"]].truth if state["name"] in true else math.nan,
-            round(number(state["slip"]), 6),
-            number(state["stretch_t"]),
-            round(math.degrees(number(state["shear_rad"])), 4),
-            round(math.degrees(number(state["rotation_rad"])), 4),
-            state["windows"],
-            "yes" if state["valid"] else "no",
-        )
-        for state in document["states"]
-    ]
     yield page.Heading("Strain of the skin, from its pigment")
-    yield page.table(
+    yield page.records(
+        document["states"],
         (
-            "state",
-            "jaws, mm",
-            "force, N",
-            "caliper's ratio",
-            "skin's r",
-            "standard error",
-            "true r",
-            "slip",
-            "r across",
-            "shear, °",
-            "rotation, °",
-            "windows",
-            "measured",
+            ("state", lambda state: state_words(state["name"])),
+            ("jaws, mm", lambda state: number(state["reading_mm"])),
+            ("force, N", lambda state: number(state["force_n"])),
+            ("caliper's ratio", lambda state: number(state["reading_ratio"])),
+            ("skin's r", lambda state: number(state["stretch_s"])),
+            ("standard error", lambda state: round(number(state["stretch_s_stderr"]), 6)),
+            (
+                "true r",
+                lambda state: true[state["name"]].truth if state["name"] in true else math.nan,
+            ),
+            ("slip", lambda state: round(number(state["slip"]), 6)),
+            ("r across", lambda state: number(state["stretch_t"])),
+            ("shear, °", lambda state: round(math.degrees(number(state["shear_rad"])), 4)),
+            ("rotation, °", lambda state: round(math.degrees(number(state["rotation_rad"])), 4)),
+            ("windows", lambda state: state["windows"]),
+            ("measured", lambda state: "yes" if state["valid"] else "no"),
         ),
-        rows,
         caption="Stretch ratio r of the skin between the jaws, and what the caliper reads",
     )
 

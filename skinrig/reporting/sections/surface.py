@@ -231,36 +231,21 @@ def _errors(
             f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
             f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
         )
-    yield page.table(
+    yield page.records(
+        found,
         (
-            "map",
-            "unit",
-            "points",
-            "masked, %",
-            "mean |error|",
-            "median",
-            "68 % interval",
-            "95th percentile",
-            "bias",
-            "68 % coverage, %",
-            "median standard error",
+            ("map", lambda row: words(row.name)),
+            ("unit", lambda row: unit_sign(row.unit)),
+            ("points", lambda row: row.points),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("mean |error|", lambda row: row.mean),
+            ("median", lambda row: row.median),
+            ("68 % interval", lambda row: f"{row.interval[0]:.3g} – {row.interval[1]:.3g}"),
+            ("95th percentile", lambda row: row.high),
+            ("bias", lambda row: row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
+            ("median standard error", lambda row: row.median_stderr),
         ),
-        [
-            (
-                words(row.name),
-                unit_sign(row.unit),
-                row.points,
-                100 * row.masked,
-                row.mean,
-                row.median,
-                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}",
-                row.high,
-                row.bias,
-                100 * row.coverage.share,
-                row.median_stderr,
-            )
-            for row in found
-        ],
         caption="Texel by texel against the nearest true point; angles in degrees",
     )
     yield page.table(
