@@ -12,7 +12,7 @@ from typing import ClassVar, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from skinrig.drawing import templates
+from skinrig.drawing import png, templates
 from skinrig.written_units import written
 
 T = TypeVar("T")
@@ -351,8 +351,6 @@ def _anchor(heading: str, taken: set[str]) -> str:
 
 def _bars() -> str:
     """Return the style of the color scales' bars, of the same colors as the pictures."""
-    from skinrig.drawing import png
-
     rules = []
     for scale, name in png.SCALE_CLASSES.items():
         stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
+from skinrig.evaluating.flash import BANDS
 from skinrig.reporting import consents, map_images, page
 from skinrig.reporting.comparison import checks as check_comparison
 from skinrig.reporting.comparison import conditions, truth_errors
@@ -247,8 +248,6 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
 
 def _by_band(pair: Pair) -> Iterator[page.Block]:
     """Yield differences of chromophores by band of the melanin that both find on average."""
-    from skinrig.evaluating.flash import BANDS
-
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
         return

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
 from skinrig.arrays import BoolArray, FloatArray
@@ -89,8 +90,6 @@ def _beside_truth(
         parts.append(_normal_image("estimate", normals, state))
         good = valid_of(normals)
         if true is not None:
-            from model import metrics
-
             good = good & valid_of(true)
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
             parts.append(_angle_image("error", np.nan_to_num(error), good, state))
