@@ -11,8 +11,7 @@ from typing import Any
 from model import store
 from model.skin import SkinAppearance
 from skinrig.appearances.dynamic import parts_of
-from skinrig.reporting import consents, page, provenance, unjudged
-from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import consents, map_images, page, provenance, unjudged
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
@@ -30,7 +29,7 @@ from skinrig.reporting.sections import (
     session,
     subsurface,
 )
-from skinrig.reporting.sections import images as pictures_section
+from skinrig.reporting.sections import images as image_section
 from skinrig.reporting.sections import surface as surface_section
 
 __all__ = ["Report", "ReportError", "build", "make"]
@@ -173,7 +172,7 @@ def _maps(
         else:
             yield from _appearance_section(name, appearance, found.truth_of(appearance), checks)
     for folder in found.pictures:
-        yield from pictures_section.section(folder, checks)
+        yield from image_section.section(folder, checks)
 
 
 def _documents(found: Findings, checks: list[page.Check]) -> Iterator[page.Block]:
@@ -191,13 +190,13 @@ def _appearance_section(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
 ) -> Iterator[page.Block]:
     yield page.Heading(f"Maps: {name}", level=2)
-    pictures = [
-        map_pictures.color_picture(f"{label}, linear sRGB", appearance.maps[key].values)
+    images = [
+        map_images.color_image(f"{label}, linear sRGB", appearance.maps[key].values)
         for key, label in (("picture", "crossed polarizers"), ("specular_picture", "specular"))
         if key in appearance.maps
     ]
-    if pictures:
-        yield page.Images(pictures)
+    if images:
+        yield page.Images(images)
     if "position" in appearance.maps:
         yield from surface_section.section(name, appearance, truth, checks)
     elif microrelief.is_microrelief(appearance):

@@ -11,7 +11,7 @@ from model import store
 from skinrig import consent
 from skinrig.reporting import page
 from skinrig.reporting.folders import Findings
-from skinrig.reporting.sections import images as pictures_section
+from skinrig.reporting.sections import images as image_section
 
 
 def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -24,7 +24,7 @@ def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
         if document.get("source") == "measured":
             yield folder, dict(document["subject"])
     for folder in found.pictures:
-        path = pictures_section.folder_document(folder)
+        path = image_section.folder_document(folder)
         if path is not None:
             for record in (
                 json.loads(path.read_text(encoding="utf-8")).get(consent.CONSENT_KEY) or ()

@@ -13,7 +13,7 @@ from typing import Any
 from capture.calibration.store import SCHEMA as CALIBRATION_SCHEMA
 from model import store
 from model.skin import SkinAppearance
-from skinrig.reporting.sections import images as pictures_section
+from skinrig.reporting.sections import images as image_section
 
 
 class ReportError(ValueError):
@@ -122,7 +122,7 @@ def _sort_in(entry: Path, found: Findings) -> None:
         (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
     elif (entry / "session.json").is_file():
         found.sessions.append(entry)
-    elif entry.is_dir() and pictures_section.folder_document(entry) is not None:
+    elif entry.is_dir() and image_section.folder_document(entry) is not None:
         found.pictures.append(entry)
     elif entry.is_dir() and (
         entry.name.startswith("calibration") or any(map(_is_of_a_calibration, entry.glob("*.json")))

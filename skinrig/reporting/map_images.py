@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from model.skin import SkinMap
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting import page
@@ -15,6 +16,12 @@ from skinrig.written_units import written
 
 SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
+
+
+def valid_of(skin_map: SkinMap) -> BoolArray:
+    """Return where a map has values, (H, W)."""
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
@@ -26,7 +33,7 @@ def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
     return image[step // 2 :: step, step // 2 :: step]
 
 
-def scalar_picture(
+def scalar_image(
     title: str,
     values: FloatArray,
     *,
@@ -38,7 +45,7 @@ def scalar_picture(
     width: int = 280,
     of: str = "",
 ) -> page.Image:
-    """Return a figure of a map with its color scale.
+    """Return an image of a map with its color scale.
 
     Parameters
     ----------
@@ -81,26 +88,26 @@ def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
 
 
-def color_picture(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
-    """Return a figure of a linear sRGB image, (H, W, 3)."""
+def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
+    """Return a linear sRGB image, (H, W, 3), for the page."""
     small = shrink(np.asarray(linear), width).astype(float)
     finite = np.isfinite(small).all(axis=2)
     seen = ""
     if finite.any():
         middle = np.median(small[finite], axis=0)
         seen = f": median linear red, green, blue {', '.join(number(float(v)) for v in middle)}"
-    return plain_picture(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
+    return plain_image(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
 
 
-def plain_picture(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
-    """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
+def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
+    """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
 
 
-def normal_picture(
+def normal_image(
     title: str, normals: FloatArray, *, valid: BoolArray, width: int = 280, of: str = "normals"
 ) -> page.Image:
-    """Return a figure of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
+    """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
     small = shrink(normals, width).astype(float)
     mask = shrink(valid, width).astype(bool)
     image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
@@ -115,8 +122,8 @@ def normal_picture(
     return _stored(title, png.encode(image), alt, image.shape[:2])
 
 
-def stored_picture(title: str, data: bytes, *, alt: str = "") -> page.Image:
-    """Return a figure of a PNG file's bytes, as they are."""
+def stored_image(title: str, data: bytes, *, alt: str = "") -> page.Image:
+    """Return the bytes of a PNG file for the page as they are."""
     return _stored(title, data, alt or title, None)
 
 
@@ -172,7 +179,7 @@ def map_panel(
         title: str, values: FloatArray, ends: tuple[float, float], scale: str = "viridis"
     ) -> None:
         parts.append(
-            scalar_picture(
+            scalar_image(
                 title,
                 values,
                 low=ends[0],

@@ -5,16 +5,17 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from skinrig.drawing import templates
+from skinrig.drawing import png, templates
 from skinrig.written_units import written
 
+T = TypeVar("T")
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
 """Characters up to which a cell's text is not broken over lines."""
@@ -257,6 +258,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
     )
 
 
+def records(
+    entries: Iterable[T], columns: Sequence[tuple[str, Callable[[T], object]]], *, caption: str
+) -> Table:
+    """Return a table with one row an entry; a column has a title and takes a cell from an entry."""
+    rows = [[cell_of(entry) for _, cell_of in columns] for entry in entries]
+    return table([title for title, _ in columns], rows, caption=caption)
+
+
 def facts(values: Mapping[str, object], *, caption: str) -> Table:
     """Return a two-column table of names and values."""
     return table(("what", "value"), list(values.items()), caption=caption)
@@ -342,8 +351,6 @@ def _anchor(heading: str, taken: set[str]) -> str:
 
 def _bars() -> str:
     """Return the style of the color scales' bars, of the same colors as the pictures."""
-    from skinrig.drawing import png
-
     rules = []
     for scale, name in png.SCALE_CLASSES.items():
         stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))

@@ -92,7 +92,7 @@ def scene(
         )
     ]
     if whole is not None:
-        left_out = [*whole.told(), *left_out]
+        left_out = [*whole.summary(), *left_out]
     if surface is None:
         left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
     found = assemble(

@@ -70,18 +70,15 @@ def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
         return " and ".join(dict.fromkeys(bounds))
 
     yield page.Heading("Checks of both", level=2)
-    yield page.table(
-        ("check", a.label, b.label, "difference", "limit", "changed"),
-        [
-            (
-                row.name,
-                told(row.a),
-                told(row.b),
-                row.difference,
-                limit(row),
-                row.changed or ("no" if row.a and row.b else "only in one"),
-            )
-            for row in rows
-        ],
+    yield page.records(
+        rows,
+        (
+            ("check", lambda row: row.name),
+            (a.label, lambda row: told(row.a)),
+            (b.label, lambda row: told(row.b)),
+            ("difference", lambda row: row.difference),
+            ("limit", lambda row: limit(row)),
+            ("changed", lambda row: row.changed or ("no" if row.a and row.b else "only in one")),
+        ),
         caption="Verdicts that changed stand first; limits that follow a bound may differ",
     )

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from model import store
 from skinrig.arrays import Float64Array
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page, provenance
+from skinrig.reporting import map_images, page, provenance
 from skinrig.reporting.comparison.runs import Run
-from skinrig.reporting.sections import images as pictures_section
+from skinrig.reporting.sections import images as image_section
 
 MAX_DRAWN_IMAGES = 4
 """Pictures of a folder that are drawn: those that differ most."""
@@ -32,7 +31,7 @@ SCALE_PERCENTILE = 98.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PictureDifference:
+class ImageDifference:
     """One picture of two runs.
 
     Attributes
@@ -85,7 +84,7 @@ def pairs(a: Run, b: Run) -> list[tuple[str, Path, Path]]:
     return [(name, path, other[name]) for name, path in one.items() if name in other]
 
 
-def compared(a: Path, b: Path) -> tuple[list[PictureDifference], list[tuple[str, str]]]:
+def compared(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, str]]]:
     """Return the pictures of two folders, and those that cannot be subtracted with the reason.
 
     Parameters
@@ -119,7 +118,7 @@ def compared(a: Path, b: Path) -> tuple[list[PictureDifference], list[tuple[str,
         if not (np.isfinite(one).all() and np.isfinite(other).all()):
             refused.append((name, "holds values that are not finite"))
             continue
-        found.append(PictureDifference(name, "linear" if linear else "8-bit codes", one, other))
+        found.append(ImageDifference(name, "linear" if linear else "8-bit codes", one, other))
     return found, refused
 
 
@@ -139,26 +138,16 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
         yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            yield page.table(
+            yield page.records(
+                order,
                 (
-                    "picture",
-                    "values",
-                    "RMS of B − A over A, %",
-                    "mean B over A",
-                    "largest |B − A|",
-                    "equal",
+                    ("picture", lambda one: one.name),
+                    ("values", lambda one: one.kind),
+                    ("RMS of B − A over A, %", lambda one: 100 * one.relative_rms),
+                    ("mean B over A", lambda one: one.mean_ratio),
+                    ("largest |B − A|", lambda one: one.largest),
+                    ("equal", lambda one: "yes" if one.equal else "no"),
                 ),
-                [
-                    (
-                        one.name,
-                        one.kind,
-                        100 * one.relative_rms,
-                        one.mean_ratio,
-                        one.largest,
-                        "yes" if one.equal else "no",
-                    )
-                    for one in order
-                ],
                 caption="Linear values in the unit of the renderings; codes over 255, which follow "
                 "the brightness that each picture was shown with",
             )
@@ -182,22 +171,22 @@ def alone(a: Run, b: Run) -> list[tuple[str, str]]:
     return [(n, a.label) for n in sorted(one - other)] + [(n, b.label) for n in sorted(other - one)]
 
 
-def _drawn(a: Run, b: Run, one: PictureDifference) -> Iterator[page.Image]:
+def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
     """Draw A | B | B − A: linear ones at one brightness for both."""
     bright = float(np.percentile(np.concatenate([one.a, one.b]), SCALE_PERCENTILE)) or 1.0
     for label, values in ((a.label, one.a), (b.label, one.b)):
         shown = np.broadcast_to(values, (*values.shape[:2], 3))
         if one.kind == "linear":
             shown = np.clip(shown / bright, 0.0, 1.0)
-            yield map_pictures.color_picture(label, shown, width=200, of=one.name)
+            yield map_images.color_image(label, shown, width=200, of=one.name)
         else:
-            small = map_pictures.shrink(np.rint(MAX_CODE * shown).astype(np.uint8), 200)
-            yield map_pictures.plain_picture(
+            small = map_images.shrink(np.rint(MAX_CODE * shown).astype(np.uint8), 200)
+            yield map_images.plain_image(
                 label, np.ascontiguousarray(small), alt=f"{one.name}, {label}"
             )
     every = np.ones(one.difference.shape, bool)
-    reach = map_pictures.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
-    yield map_pictures.scalar_picture(
+    reach = map_images.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
+    yield map_images.scalar_image(
         "B − A, mean of the channels",
         one.difference,
         low=-reach,
@@ -223,7 +212,7 @@ def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
 
 
 def _document(folder: Path) -> Mapping[str, Any]:
-    path = pictures_section.folder_document(folder)
+    path = image_section.folder_document(folder)
     told = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
     return {key: value for key, value in told.items() if key not in IGNORED_ENTRIES}
 

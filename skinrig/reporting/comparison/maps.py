@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model import metrics
 from model.skin import SkinMap
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.reporting.page import short_unit
@@ -148,8 +149,6 @@ def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
 
 def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     from scipy.special import ndtri
-
-    from model import metrics
 
     good_a, good_b = _known(a), _known(b)
     both = good_a & good_b

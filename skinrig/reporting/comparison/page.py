@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
-from skinrig.reporting import consents, page
-from skinrig.reporting import map_images as map_pictures
+from skinrig.evaluating.flash import BANDS
+from skinrig.reporting import consents, map_images, page
 from skinrig.reporting.comparison import checks as check_comparison
 from skinrig.reporting.comparison import conditions, truth_errors
-from skinrig.reporting.comparison import images as picture_comparison
+from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison.maps import MapDifference
 from skinrig.reporting.comparison.runs import Pair, Run, alone
 from skinrig.reporting.map_names import heading, melanin_band, words
@@ -49,7 +49,7 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
         sentences.append(
             f"{len(disagree)} of {told} maps differ beyond their combined standard errors."
         )
-    drawn = picture_comparison.sentence(a, b)
+    drawn = image_comparison.sentence(a, b)
     if drawn:
         sentences.append(drawn)
     if not sentences:
@@ -90,8 +90,8 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     yield from conditions.benchmarks(a, b)
     yield from conditions.seconds(a, b)
     yield from conditions.moved_calibrations(a, b)
-    yield from picture_comparison.section(a, b)
-    missing = [*alone(a, b), *picture_comparison.alone(a, b)]
+    yield from image_comparison.section(a, b)
+    missing = [*alone(a, b), *image_comparison.alone(a, b)]
     if missing:
         yield page.Heading("Only in one", level=2)
         yield page.table(
@@ -135,7 +135,7 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     if pair.refused:
         table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
         yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
-    yield from _pictures(a, b, pair)
+    yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)
     yield from conditions.settings(a, b, pair)
@@ -167,7 +167,7 @@ def _difference_row(one: MapDifference) -> tuple[object, ...]:
     )
 
 
-def _pictures(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+def _images(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     """Yield A | B | difference | difference over the combined standard error."""
     told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
     order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
@@ -200,15 +200,15 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
         if one.unit == "°":
-            yield map_pictures.normal_picture(
+            yield map_images.normal_image(
                 label, image, valid=mask, width=IMAGE_WIDTH_PX, of=one.name
             )
         elif image.ndim == 3:
-            yield map_pictures.color_picture(
+            yield map_images.color_image(
                 label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name
             )
         else:
-            yield map_pictures.scalar_picture(
+            yield map_images.scalar_image(
                 label,
                 image,
                 low=low,
@@ -219,9 +219,9 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
                 of=one.name,
             )
     image, mask = laid(one.difference)
-    reach = map_pictures.reach_of(image, mask, 98) or 1.0
+    reach = map_images.reach_of(image, mask, 98) or 1.0
     signed = one.unit != "°"
-    yield map_pictures.scalar_picture(
+    yield map_images.scalar_image(
         "B − A" if signed else "angle between them",
         image,
         low=-reach if signed else 0.0,
@@ -234,7 +234,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
     )
     if one.sigmas is not None:
         image, mask = laid(one.sigmas)
-        yield map_pictures.scalar_picture(
+        yield map_images.scalar_image(
             "in combined standard errors",
             image,
             low=-MAX_SHOWN_SIGMAS if signed else 0.0,
@@ -248,8 +248,6 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
 
 def _by_band(pair: Pair) -> Iterator[page.Block]:
     """Yield differences of chromophores by band of the melanin that both find on average."""
-    from skinrig.evaluating.flash import BANDS
-
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
         return

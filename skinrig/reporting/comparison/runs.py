@@ -15,6 +15,7 @@ from skinrig.reporting import folders, page
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison.maps import MapDifference
 from skinrig.reporting.folders import Findings, ReportError
+from skinrig.reporting.sections import bench
 from skinrig.reporting.sections import images as pictures
 
 Kind = Literal["maps", "benchmark", "pictures", "run", "truth", "other"]
@@ -69,8 +70,6 @@ def kind_of(path: Path) -> Kind:
 
 
 def _is_bench(path: Path) -> bool:
-    from skinrig.reporting.sections import bench
-
     try:
         return bench.is_bench(folders.read_json(path))
     except ReportError:

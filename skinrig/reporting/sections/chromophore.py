@@ -12,8 +12,7 @@ from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import flash
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import map_names, page
+from skinrig.reporting import map_images, map_names, page
 
 IDENTIFIABILITY_NOISE = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
@@ -33,7 +32,7 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
         if true_map is None and skin_map.stderr is None:
             alone.append(_alone(key, skin_map))
             continue
-        yield from map_pictures.map_panel(
+        yield from map_images.map_panel(
             map_names.heading(key),
             page.short_unit(skin_map.unit),
             estimate=skin_map.values,
@@ -55,7 +54,7 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
         max(abs(low), abs(high)) < MAX_ROUNDING_ERROR
     ):  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
-    return map_pictures.scalar_picture(
+    return map_images.scalar_image(
         map_names.heading(key),
         skin_map.values,
         low=low,
@@ -106,38 +105,25 @@ def errors(
                 )
             )
     yield page.Heading("Errors by melanin band")
-    yield page.table(
+    yield page.records(
+        rows,
         (
-            "map",
-            "truth",
-            "band",
-            "pixels",
-            "masked, %",
-            "median |error|, %",
-            "68 % interval",
-            "bias, %",
-            "68 % coverage, %",
-            "by noise alone, %",
-            "median standard error, %",
-            "bound, %",
-        ),
-        [
+            ("map", lambda row: row.name),
+            ("truth", lambda row: row.against),
+            ("band", lambda row: row.band_name),
+            ("pixels", lambda row: row.pixels),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("median |error|, %", lambda row: 100 * row.median_relative),
             (
-                row.name,
-                row.against,
-                row.band_name,
-                row.pixels,
-                100 * row.masked,
-                100 * row.median_relative,
-                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.bias,
-                100 * row.coverage.share,
-                100 * row.noise_coverage,
-                100 * row.median_stderr,
-                100 * row.median_bound,
-            )
-            for row in rows
-        ],
+                "68 % interval",
+                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+            ),
+            ("bias, %", lambda row: 100 * row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
+            ("by noise alone, %", lambda row: 100 * row.noise_coverage),
+            ("median standard error, %", lambda row: 100 * row.median_stderr),
+            ("bound, %", lambda row: 100 * row.median_bound),
+        ),
         caption="Relative errors against what the subject is made of (sharp) and against what "
         "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
     )

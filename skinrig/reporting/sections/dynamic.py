@@ -9,15 +9,15 @@ import numpy as np
 
 from model import microstructure
 from model.microstructure import KernelTable
-from model.skin import SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.appearances.dynamic import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
-from skinrig.arrays import BoolArray, Float64Array, FloatArray
+from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
+from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.sections import facial_color
 
 MAX_SHOWN_EXPRESSIONS = 4
@@ -76,13 +76,13 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     layer = model.layers[0]
     masks = np.moveaxis(np.asarray(layer.masks, float), 0, 2)
     tints = ZONE_COLORS[np.arange(masks.shape[2]) % len(ZONE_COLORS)]
-    pictures = [map_pictures.color_picture("zones", masks @ tints, width=WIDTH_PX)]
+    images = [map_images.color_image("zones", masks @ tints, width=WIDTH_PX)]
     shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
     for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
         shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
     for title, normals in shown.items():
         every = np.ones(normals.shape[:2], bool)
-        pictures.append(map_pictures.normal_picture(title, normals, valid=every, width=WIDTH_PX))
+        images.append(map_images.normal_image(title, normals, valid=every, width=WIDTH_PX))
     table: Any = layer.table
     rows = []
     for name, row in table.rows.items():
@@ -100,7 +100,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     sums = zone_sums(together, table)
     clamps = [(clamp, *(float(v) for v in clamped(sums, clamp))) for clamp in ("unit", "signed")]
     yield page.Heading("Wrinkles")
-    yield page.Images(pictures)
+    yield page.Images(images)
     yield page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
     yield page.table(
         ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
@@ -118,7 +118,7 @@ def _normals(derivatives: Any) -> Float64Array:
 
 
 def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[page.Block]:
-    rows, alphas, sigmas, pictures = [], [], [], []
+    rows, alphas, sigmas, images = [], [], [], []
     for site, entry in part["sites"].items():
         table = KernelTable.from_json(appearance.files[entry["table"]].decode())
         low, high = table.stretch_range
@@ -127,9 +127,9 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         alphas.append(figures.Curve(site, r.tolist(), alpha.tolist(), marks=False))
         sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
-        spread = 2.5 * float(np.std(relief.values[_valid(relief)]))
-        pictures.append(
-            map_pictures.scalar_picture(
+        spread = 2.5 * float(np.std(relief.values[valid_of(relief)]))
+        images.append(
+            map_images.scalar_image(
                 f"{site}: neutral relief",
                 relief.values,
                 low=-spread,
@@ -150,7 +150,7 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
             )
         )
     yield page.Heading("Microstructure")
-    yield page.Images(pictures)
+    yield page.Images(images)
     yield page.Plots(
         [
             figures.curves("strength", "stretch ratio", "alpha", alphas),
@@ -162,8 +162,3 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         rows,
         caption="Sites with microstructure",
     )
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

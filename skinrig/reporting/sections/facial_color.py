@@ -10,12 +10,11 @@ import numpy as np
 from model.facial_color import HemoglobinRig
 from model.skin import SkinAppearance, SkinMap
 from skinrig.applying.expression import colors, hemoglobin_rig
-from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.evaluating.flash import BANDS
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
+from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import melanin_band
 
 MAX_SHOWN_STATES = 4
@@ -96,7 +95,7 @@ def section(
             continue
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
-        yield from map_pictures.map_panel(
+        yield from map_images.map_panel(
             f"blood of {state}, by the rig",
             "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
@@ -155,13 +154,13 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
     asked |= {state: {state: 1.0} for state in names[:MAX_SHOWN_STATES]}
     if len(names) > 1:
         asked[f"{names[0]} + {names[1]}"] = {names[0]: 1.0, names[1]: 1.0, "neutral": -1.0}
-    pictures = []
+    images = []
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
         seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
         color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        pictures.append(map_pictures.color_picture(title, color, width=WIDTH_PX))
-    yield page.Images(pictures)
+        images.append(map_images.color_image(title, color, width=WIDTH_PX))
+    yield page.Images(images)
     yield page.note("Diffuse color without shading, linear sRGB under D65.")
 
 
@@ -189,45 +188,33 @@ def _errors(
             )
         )
     yield page.Heading("Blood of each state: error by way")
-    yield page.table(
+    yield page.records(
+        states,
         (
-            "state",
-            "way",
-            "median |error|, %",
-            "68 % interval",
-            "rms, points",
-            "bias, %",
-            "68 % coverage, %",
-            "pixels",
-        ),
-        [
+            ("state", lambda row: row.state),
+            ("way", lambda row: row.way),
+            ("median |error|, %", lambda row: 100 * row.median_relative),
             (
-                row.state,
-                row.way,
-                100 * row.median_relative,
-                f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.rms,
-                100 * row.bias,
-                100 * row.coverage,
-                row.pixels,
-            )
-            for row in states
-        ],
+                "68 % interval",
+                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
+            ),
+            ("rms, points", lambda row: 100 * row.rms),
+            ("bias, %", lambda row: 100 * row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
+            ("pixels", lambda row: row.pixels),
+        ),
         caption="Against the true blood of each state, by way of getting it; pixels that every "
         "way tells",
     )
-    yield page.table(
+    yield page.records(
+        changes,
         (
-            "state",
-            "true change, points",
-            "found, points",
-            "rms of the map, points",
-            "68 % coverage, %",
+            ("state", lambda row: row.state),
+            ("true change, points", lambda row: 100 * row.true),
+            ("found, points", lambda row: 100 * row.found),
+            ("rms of the map, points", lambda row: 100 * row.rms),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
         ),
-        [
-            (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
-            for row in changes
-        ],
         caption="Change of blood from the neutral state, one melanin for all states; over those of "
         "these pixels whose change was found",
     )
@@ -315,10 +302,5 @@ def _worst(state: str, banded: list[tuple[object, ...]]) -> str:
 def _mean(skin_map: SkinMap | None) -> float:
     if skin_map is None:
         return float("nan")
-    good = _valid(skin_map)
+    good = valid_of(skin_map)
     return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

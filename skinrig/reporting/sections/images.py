@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
 
 DOCUMENT_FILES = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
@@ -59,7 +58,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
         )
     for one in document.get("datasets", ()):
         yield from _data_set(one)
-    yield from _pictures(folder)
+    yield from _images(folder)
     if document.get("assumed"):
         yield page.Heading("Assumed")
         yield page.table(
@@ -140,7 +139,7 @@ def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
     )
 
 
-def _pictures(folder: Path) -> Iterator[page.Block]:
+def _images(folder: Path) -> Iterator[page.Block]:
     figures = []
     kept = []
     for path in sorted(folder.glob("*.png")):
@@ -148,7 +147,7 @@ def _pictures(folder: Path) -> Iterator[page.Block]:
         if len(data) > MAX_IMAGE_BYTES:
             kept.append(path.name)
             continue
-        figures.append(map_pictures.stored_picture(path.stem.replace("-", " "), data))
+        figures.append(map_images.stored_image(path.stem.replace("-", " "), data))
     yield page.Images(figures)
     if kept:
         yield page.note(f"Too large for here: {', '.join(kept)}.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,17 +9,9 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
+from skinrig.evaluating.subsurface import number
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
-
-_PARAMETER_KEYS = (
-    "alpha",
-    "alpha_stderr",
-    "alpha_95",
-    "sigma_um",
-    "sigma_stderr_um",
-    "sigma_95_um",
-)
 
 
 def section(
@@ -62,38 +53,32 @@ def section(
             "size differ by more than half of what the strain changes, so that the distance left "
             "by the kernel is not judged."
         )
-    yield page.table(
+    yield page.records(
+        fits,
         (
-            "state",
-            "r",
-            "alpha",
-            "standard error",
-            "95 % half width",
-            "sigma, um",
-            "standard error, um",
-            "95 % half width, um",
-            "distance before",
-            "after",
-            "other skin of this size",
-            "nearly as good",
-            "fitted",
+            ("state", lambda fit: state_words(fit["name"])),
+            ("r", lambda fit: fit["stretch_s"]),
+            ("alpha", lambda fit: number(fit.get("alpha"))),
+            ("standard error", lambda fit: number(fit.get("alpha_stderr"))),
+            ("95 % half width", lambda fit: number(fit.get("alpha_95"))),
+            ("sigma, um", lambda fit: number(fit.get("sigma_um"))),
+            ("standard error, um", lambda fit: number(fit.get("sigma_stderr_um"))),
+            ("95 % half width, um", lambda fit: number(fit.get("sigma_95_um"))),
+            ("distance before", lambda fit: number(fit["distance_before"])),
+            ("after", lambda fit: number(fit["distance"])),
+            ("other skin of this size", lambda fit: number(fit.get("noise_floor"))),
+            ("nearly as good", lambda fit: fit.get("near_best_count", 0)),
+            ("fitted", lambda fit: "yes" if fit["valid"] else "no"),
         ),
-        [
-            (
-                state_words(fit["name"]),
-                fit["stretch_s"],
-                *(_value(fit.get(key)) for key in _PARAMETER_KEYS),
-                _value(fit["distance_before"]),
-                _value(fit["distance"]),
-                _value(fit.get("noise_floor")),
-                fit.get("near_best_count", 0),
-                "yes" if fit["valid"] else "no",
-            )
-            for fit in fits
-        ],
         caption="Kernels fitted to histograms of normals; distances before and after each. "
         "Kernel errors are not Gaussian: 95 % half widths differ from 1.96 standard errors",
     )
+    yield page.Plots(_plots(fits, document.get("tables", [])))
+    yield from _direction(document.get("direction"))
+
+
+def _plots(fits: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Draw strength and width of kernels over the stretch of the skin."""
     plots = []
     for key, error, title in (
         ("alpha", "alpha_stderr", "kernel strength alpha"),
@@ -103,7 +88,7 @@ def section(
         for fit in fits:
             if fit["valid"]:
                 points.setdefault(fit["angle_deg"], []).append(
-                    (fit["stretch_s"], _value(fit[key]), _value(fit[error]))
+                    (fit["stretch_s"], number(fit[key]), number(fit[error]))
                 )
         series = [
             figures.Curve(
@@ -115,27 +100,26 @@ def section(
             )
             for angle, rows in points.items()
         ]
-        for table in document.get("tables", []):
+        for table in tables:
             line = table["lines"]
             series.append(
                 figures.Curve(
                     f"lines, {table['name']}",
                     line["stretch"],
-                    [_value(v) for v in line[key]],
+                    [number(v) for v in line[key]],
                     marks=False,
                 )
             )
         if series:
             plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
-    yield page.Plots(plots)
-    yield from _direction(document.get("direction"))
+    return plots
 
 
 def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:
     if not found:
         return
     rows = [
-        (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
+        (angle, number(alpha), number(alpha_error), number(sigma), number(sigma_error))
         for angle, alpha, alpha_error, sigma, sigma_error in zip(
             found["angle_deg"],
             found["alpha_offset"],
@@ -153,14 +137,10 @@ def _direction(found: Mapping[str, Any] | None) -> Iterator[page.Block]:
     )
     yield page.note(
         "Chance of such differences where the direction does not matter: alpha "
-        f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
+        f"{100 * number(found['p_alpha']):.2g} %, sigma {100 * number(found['p_sigma']):.2g} %."
     )
 
 
 def _told(fit: Mapping[str, Any]) -> bool:
     """Return whether a strain changes the histogram by more than twice what chance does."""
-    return _value(fit["distance_before"]) > 2.0 * _value(fit["noise_floor"])
-
-
-def _value(value: object) -> float:
-    return math.nan if value is None else float(str(value))
+    return number(fit["distance_before"]) > 2.0 * number(fit["noise_floor"])

@@ -7,13 +7,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.evaluating.subsurface import number
+from skinrig.reporting import map_images, page
+from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import state_words
 from skinrig.reporting.sections import kernel
 
@@ -45,7 +47,7 @@ def section(
     checks
         Judgements are added to it.
     """
-    yield from _pictures(appearance, truth)
+    yield from _images(appearance, truth)
     if truth is not None:
         yield from _relief_errors(name, appearance, truth, checks)
     yield from _strain(name, appearance, truth, checks)
@@ -54,7 +56,7 @@ def section(
     yield from kernel.section(name, appearance, checks)
 
 
-def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
+def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
     states = evaluation.states_of(appearance)
     order = sorted(states, key=_by_step)
     first = "a000_n0" if "a000_n0" in states else order[0]
@@ -84,18 +86,16 @@ def _beside_truth(
     if normals is not None:
         parts = []
         if true is not None:
-            parts.append(_normal_picture("truth", true, state))
-        parts.append(_normal_picture("estimate", normals, state))
-        good = _valid(normals)
+            parts.append(_normal_image("truth", true, state))
+        parts.append(_normal_image("estimate", normals, state))
+        good = valid_of(normals)
         if true is not None:
-            from model import metrics
-
-            good = good & _valid(true)
+            good = good & valid_of(true)
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
-            parts.append(_angle_picture("error", np.nan_to_num(error), good, state))
+            parts.append(_angle_image("error", np.nan_to_num(error), good, state))
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
-            parts.append(_angle_picture("standard error", spread, _valid(normals), state))
+            parts.append(_angle_image("standard error", spread, valid_of(normals), state))
         yield page.Heading(f"normals, {state_words(state)}")
         yield page.Images(parts)
     height = appearance.maps.get(f"height_{state}")
@@ -103,48 +103,50 @@ def _beside_truth(
         relief = None
         if truth is not None:
             relief = evaluation.true_relief(appearance, truth, state)
-        yield from map_pictures.map_panel(
+        yield from map_images.map_panel(
             f"height, {state_words(state)}",
             "um",
             estimate=height.values,
             standard_error=height.stderr,
             truth=relief,
-            valid=_valid(height),
+            valid=valid_of(height),
             width=280,
         )
 
 
 def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> page.Image:
     if skin_map.values.ndim == 3:
-        return map_pictures.normal_picture(
-            title, skin_map.values, valid=_valid(skin_map), width=WIDTH_PX
+        return map_images.normal_image(
+            title, skin_map.values, valid=valid_of(skin_map), width=WIDTH_PX
         )
-    heights = [m.values[_valid(m)] for k, m in appearance.maps.items() if k.startswith("height_a")]
+    heights = [
+        m.values[valid_of(m)] for k, m in appearance.maps.items() if k.startswith("height_a")
+    ]
     reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
-    return map_pictures.scalar_picture(
+    return map_images.scalar_image(
         title,
         skin_map.values,
         low=-reach,
         high=reach,
         scale="RdBu_r",
-        valid=_valid(skin_map),
+        valid=valid_of(skin_map),
         unit="um",
         width=WIDTH_PX,
     )
 
 
-def _normal_picture(title: str, skin_map: SkinMap, state: str) -> page.Image:
-    return map_pictures.normal_picture(
-        title, skin_map.values, valid=_valid(skin_map), of=f"normals, {state_words(state)}"
+def _normal_image(title: str, skin_map: SkinMap, state: str) -> page.Image:
+    return map_images.normal_image(
+        title, skin_map.values, valid=valid_of(skin_map), of=f"normals, {state_words(state)}"
     )
 
 
-def _angle_picture(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> page.Image:
-    return map_pictures.scalar_picture(
+def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> page.Image:
+    return map_images.scalar_image(
         title,
         degrees,
         low=0.0,
-        high=map_pictures.reach_of(degrees, valid, 98),
+        high=map_images.reach_of(degrees, valid, 98),
         scale="magma",
         valid=valid,
         unit="°",
@@ -184,38 +186,22 @@ def _relief_errors(
         "corrected, and standard errors, which know noise alone, are then too small."
     )
     yield page.one_skin(truth.parameters)
-    yield page.table(
+    yield page.records(
+        rows,
         (
-            "state",
-            "pixels",
-            "masked, %",
-            "mean error, °",
-            "median, °",
-            "68 % interval",
-            "unblurred truth, °",
-            "median standard error, °",
-            "68 % coverage, %",
-            "height rms, um",
-            "relief rms, um",
-            "of relief, %",
+            ("state", lambda row: state_words(row.state)),
+            ("pixels", lambda row: row.pixels),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("mean error, °", lambda row: row.mean_deg),
+            ("median, °", lambda row: row.median_deg),
+            ("68 % interval", lambda row: f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}"),
+            ("unblurred truth, °", lambda row: row.unblurred_deg),
+            ("median standard error, °", lambda row: row.stderr_deg),
+            ("68 % coverage, %", lambda row: 100 * row.coverage),
+            ("height rms, um", lambda row: row.height_um),
+            ("relief rms, um", lambda row: row.relief_um),
+            ("of relief, %", lambda row: 100 * row.height_relative),
         ),
-        [
-            (
-                state_words(row.state),
-                row.pixels,
-                100 * row.masked,
-                row.mean_deg,
-                row.median_deg,
-                f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}",
-                row.unblurred_deg,
-                row.stderr_deg,
-                100 * row.coverage,
-                row.height_um,
-                row.relief_um,
-                100 * row.height_relative,
-            )
-            for row in rows
-        ],
         caption="Every state against its truth; angles of normals in degrees",
     )
 
@@ -252,42 +238,27 @@ def _strain(
                 worst=state_words(worst.state),
             )
         )
-    rows = [
-        (
-            state_words(state["name"]),
-            _value(state["reading_mm"]),
-            _value(state["force_n"]),
-            _value(state["reading_ratio"]),
-            _value(state["stretch_s"]),
-            round(_value(state["stretch_s_stderr"]), 6),
-            true[state["name"]].truth if state["name"] in true else math.nan,
-            round(_value(state["slip"]), 6),
-            _value(state["stretch_t"]),
-            round(math.degrees(_value(state["shear_rad"])), 4),
-            round(math.degrees(_value(state["rotation_rad"])), 4),
-            state["windows"],
-            "yes" if state["valid"] else "no",
-        )
-        for state in document["states"]
-    ]
     yield page.Heading("Strain of the skin, from its pigment")
-    yield page.table(
+    yield page.records(
+        document["states"],
         (
-            "state",
-            "jaws, mm",
-            "force, N",
-            "caliper's ratio",
-            "skin's r",
-            "standard error",
-            "true r",
-            "slip",
-            "r across",
-            "shear, °",
-            "rotation, °",
-            "windows",
-            "measured",
+            ("state", lambda state: state_words(state["name"])),
+            ("jaws, mm", lambda state: number(state["reading_mm"])),
+            ("force, N", lambda state: number(state["force_n"])),
+            ("caliper's ratio", lambda state: number(state["reading_ratio"])),
+            ("skin's r", lambda state: number(state["stretch_s"])),
+            ("standard error", lambda state: round(number(state["stretch_s_stderr"]), 6)),
+            (
+                "true r",
+                lambda state: true[state["name"]].truth if state["name"] in true else math.nan,
+            ),
+            ("slip", lambda state: round(number(state["slip"]), 6)),
+            ("r across", lambda state: number(state["stretch_t"])),
+            ("shear, °", lambda state: round(math.degrees(number(state["shear_rad"])), 4)),
+            ("rotation, °", lambda state: round(math.degrees(number(state["rotation_rad"])), 4)),
+            ("windows", lambda state: state["windows"]),
+            ("measured", lambda state: "yes" if state["valid"] else "no"),
         ),
-        rows,
         caption="Stretch ratio r of the skin between the jaws, and what the caliper reads",
     )
 
@@ -310,7 +281,7 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
         panels.append(
-            map_pictures.scalar_picture(
+            map_images.scalar_image(
                 state_words(state["name"]),
                 shown,
                 low=0.0,
@@ -353,12 +324,3 @@ def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
 def _by_step(state: str) -> tuple[str, int]:
     angle, step = state.split("_")
     return angle, int(step[1:]) * (-1 if step[0] == "m" else 1)
-
-
-def _value(value: object) -> float:
-    return math.nan if value is None else float(str(value))
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -11,6 +11,7 @@ import numpy as np
 from model.skin import SkinAppearance
 from reconstruction.pipeline.flash.sequence import CURVES_FILE
 from skinrig.drawing import figures
+from skinrig.evaluating.subsurface import number
 from skinrig.reporting import page
 
 PLACE_COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
@@ -39,12 +40,12 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
 
 def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
     key, axis = ("phase_s", "phase, s") if cycle_s is not None else ("time_s", "time, s")
-    when = np.array([_number(frame[key]) for frame in told["frames"]])
+    when = np.array([number(frame[key]) for frame in told["frames"]])
     order = np.argsort(when)
     curves = []
-    for number, (place, one) in enumerate(told["curves"].items()):
-        values = 100.0 * np.array([_number(v) for v in one["hemoglobin"]])
-        errors = 100.0 * np.array([_number(v) for v in one["stderr"]])
+    for index, (place, one) in enumerate(told["curves"].items()):
+        values = 100.0 * np.array([number(v) for v in one["hemoglobin"]])
+        errors = 100.0 * np.array([number(v) for v in one["stderr"]])
         curves.append(
             figures.Curve(
                 place,
@@ -52,7 +53,7 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
                 values[order].tolist(),
                 errors[order].tolist(),
                 line=cycle_s is None,
-                color=PLACE_COLORS[number % len(PLACE_COLORS)],
+                color=PLACE_COLORS[index % len(PLACE_COLORS)],
             )
         )
     plot = figures.curves(
@@ -70,11 +71,11 @@ def _table(told: Mapping[str, Any]) -> Iterator[page.Block]:
         rows.append(
             (
                 place,
-                100 * _number(fit["start"]),
-                100 * _number(fit["end"]),
+                100 * number(fit["start"]),
+                100 * number(fit["end"]),
                 fit["text"],
                 "" if seen is None else _words(seen),
-                float("nan") if repeat is None else 100 * _number(repeat["sd"]),
+                float("nan") if repeat is None else 100 * number(repeat["sd"]),
             )
         )
     yield page.table(
@@ -98,7 +99,3 @@ def _words(transition: Mapping[str, Any]) -> str:
     power = transition.get("power")
     certain = "" if power is None else f" (would be seen with a chance of {100 * power:.0f} %)"
     return "yes" if transition["seen"] else f"no{certain}"
-
-
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)

@@ -18,8 +18,7 @@ from reconstruction.pipeline.probe.stages import (
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.subsurface import number, numbers
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
 MAX_PLOTTED_MEASUREMENTS = 3
@@ -206,26 +205,16 @@ def _errors(
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.by_method([row for row in rows if row.kind == kind])
         yield page.Heading(f"Error of sigma_tr against the truth, {kind} tissue")
-        yield page.table(
+        yield page.records(
+            found,
             (
-                "method",
-                "fits",
-                "median |error|, %",
-                "worst, %",
-                "bias, %",
-                "68 % interval covers, %",
+                ("method", lambda row: METHOD_NAMES[row.method]),
+                ("fits", lambda row: row.fits),
+                ("median |error|, %", lambda row: 100 * row.median),
+                ("worst, %", lambda row: 100 * row.worst),
+                ("bias, %", lambda row: 100 * row.bias),
+                ("68 % interval covers, %", lambda row: 100 * row.coverage),
             ),
-            [
-                (
-                    METHOD_NAMES[row.method],
-                    row.fits,
-                    100 * row.median,
-                    100 * row.worst,
-                    100 * row.bias,
-                    100 * row.coverage,
-                )
-                for row in found
-            ],
             caption=f"By method, {kind} tissue",
         )
         yield from _by_channel([row for row in rows if row.kind == kind])
@@ -241,26 +230,16 @@ def _errors(
     profiles = evaluation.compare_profiles(appearance, truth)
     if profiles:
         yield page.Heading("Profiles against the truth")
-        yield page.table(
+        yield page.records(
+            profiles,
             (
-                "measurement",
-                "channel",
-                "fibres",
-                "median |error|, %",
-                "worst, %",
-                "68 % interval covers, %",
+                ("measurement", lambda row: _words_of_name(row.name)),
+                ("channel", lambda row: row.channel),
+                ("fibres", lambda row: row.fibres),
+                ("median |error|, %", lambda row: 100 * row.median),
+                ("worst, %", lambda row: 100 * row.worst),
+                ("68 % interval covers, %", lambda row: 100 * row.coverage),
             ),
-            [
-                (
-                    _words_of_name(row.name),
-                    row.channel,
-                    row.fibres,
-                    100 * row.median,
-                    100 * row.worst,
-                    100 * row.coverage,
-                )
-                for row in profiles
-            ],
             caption="Over fibres whose signal is ten times its standard error",
         )
 
@@ -282,38 +261,25 @@ def _anisotropy(appearance: SkinAppearance) -> Iterator[page.Block]:
     document = evaluation.document_of(appearance, ANISOTROPY_FILE)
     if document is None or not document["sites"]:
         return
-    rows = [
-        (
-            entry["site"],
-            entry["repeat"],
-            entry["channel"],
-            entry["directions"],
-            number(entry["ratio"]),
-            number(entry["ratio_stderr"]),
-            number(entry["axis_deg"]),
-            number(entry["axis_stderr_deg"]),
-            number(entry["p_value"]),
-            number(entry["worst_direction_percent"]),
-            "yes" if entry["valid"] else entry["reason"],
-        )
-        for entry in document["sites"]
-    ]
     yield page.Heading("Dependence on direction")
-    yield page.table(
+    yield page.records(
+        document["sites"],
         (
-            "site",
-            "repeat",
-            "channel",
-            "directions",
-            "ratio",
-            "standard error",
-            "axis, °",
-            "standard error, °",
-            "chance if isotropic",
-            "one direction is off by up to, %",
-            "valid",
+            ("site", lambda entry: entry["site"]),
+            ("repeat", lambda entry: entry["repeat"]),
+            ("channel", lambda entry: entry["channel"]),
+            ("directions", lambda entry: entry["directions"]),
+            ("ratio", lambda entry: number(entry["ratio"])),
+            ("standard error", lambda entry: number(entry["ratio_stderr"])),
+            ("axis, °", lambda entry: number(entry["axis_deg"])),
+            ("standard error, °", lambda entry: number(entry["axis_stderr_deg"])),
+            ("chance if isotropic", lambda entry: number(entry["p_value"])),
+            (
+                "one direction is off by up to, %",
+                lambda entry: number(entry["worst_direction_percent"]),
+            ),
+            ("valid", lambda entry: "yes" if entry["valid"] else entry["reason"]),
         ),
-        rows,
         caption="sigma_tr along the long axis over that across it",
     )
 
@@ -322,30 +288,18 @@ def _sites(appearance: SkinAppearance) -> Iterator[page.Block]:
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if fitted is None or not fitted.get("sites"):
         return
-    rows = [
-        (
-            entry["site"],
-            entry["channel"],
-            entry["measurements"],
-            number(entry["sigma_tr_per_mm"]),
-            number(entry["sigma_tr_stderr"]),
-            number(entry["translucency_mm"]),
-            number(entry["translucency_stderr_mm"]),
-        )
-        for entry in fitted["sites"]
-    ]
     yield page.Heading("Sites")
-    yield page.table(
+    yield page.records(
+        fitted["sites"],
         (
-            "site",
-            "channel",
-            "measurements",
-            "sigma_tr, 1/mm",
-            "standard error",
-            "translucency, mm",
-            "standard error",
+            ("site", lambda entry: entry["site"]),
+            ("channel", lambda entry: entry["channel"]),
+            ("measurements", lambda entry: entry["measurements"]),
+            ("sigma_tr, 1/mm", lambda entry: number(entry["sigma_tr_per_mm"])),
+            ("standard error", lambda entry: number(entry["sigma_tr_stderr"])),
+            ("translucency, mm", lambda entry: number(entry["translucency_mm"])),
+            ("standard error", lambda entry: number(entry["translucency_stderr_mm"])),
         ),
-        rows,
         caption="Mean of each site's measurements; translucency is 1/sigma_tr",
     )
 
@@ -355,7 +309,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     found = appearance.maps.get("translucency")
     if found is None:
         return
-    pictures = []
+    images = []
     for c, channel in enumerate(CHANNELS):
         values = found.values[..., c]
         inside = values if found.valid is None else values[found.valid]
@@ -365,8 +319,8 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         if found.stderr is not None:
             spread = found.stderr[..., c]
             shown.append(("standard error", spread, 0.0, spread.max(), "magma"))
-        pictures += [
-            map_pictures.scalar_picture(
+        images += [
+            map_images.scalar_image(
                 title,
                 drawn,
                 low=float(low),
@@ -383,7 +337,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
         "them the error grows to what people differ by."
     )
-    yield page.Images(pictures)
+    yield page.Images(images)
 
 
 def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

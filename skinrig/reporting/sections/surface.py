@@ -6,14 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from model.skin import SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from skinrig.appearances.front_view import WIDTH_PX, FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.evaluating.surface_bands import Banded, errors_by_band
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page
+from skinrig.reporting import map_images, page
+from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign
 
@@ -42,7 +42,7 @@ def section(
         Judgements are added to it.
     """
     place = appearance.maps["position"]
-    rows, columns = np.nonzero(_valid(place))
+    rows, columns = np.nonzero(valid_of(place))
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
         yield page.note("No texel of these maps is valid.")
@@ -53,7 +53,7 @@ def section(
     if truth is not None:
         pairs = evaluation.match(appearance, truth)
         true_place = truth.maps["position"]
-        usable = _valid(true_place)
+        usable = valid_of(true_place)
         if "mask" in truth.maps:
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
@@ -66,7 +66,7 @@ def section(
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
-        good = _valid(skin_map)[rows, columns]
+        good = valid_of(skin_map)[rows, columns]
         width = WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
@@ -107,12 +107,12 @@ def _shown(
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-        return map_pictures.scalar_picture(
+        return map_images.scalar_image(
             _title(title, key), image, low=low, high=high, valid=valid, of=key, width=width
         )
     if "normals" in key:
-        return map_pictures.normal_picture(title, image, valid=valid, of=key, width=width)
-    return map_pictures.color_picture(
+        return map_images.normal_image(title, image, valid=valid, of=key, width=width)
+    return map_images.color_image(
         title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
     )
 
@@ -135,9 +135,9 @@ def _error(
     points = appearance.maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
     image, valid = FrontView.of(points, box).picture(np.nan_to_num(error), valid=good)
-    reach = map_pictures.reach_of(error, good, 95)
+    reach = map_images.reach_of(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
-        return map_pictures.scalar_picture(
+        return map_images.scalar_image(
             "error",
             image,
             low=0.0,
@@ -148,7 +148,7 @@ def _error(
             of=key,
             width=width,
         )
-    return map_pictures.scalar_picture(
+    return map_images.scalar_image(
         "estimate − truth",
         image,
         low=-reach,
@@ -181,8 +181,8 @@ def _spread(
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.picture(stderr, valid=good)
-    reach = map_pictures.reach_of(image, valid, 98)
-    return map_pictures.scalar_picture(
+    reach = map_images.reach_of(image, valid, 98)
+    return map_images.scalar_image(
         _title("standard error", key),
         image,
         low=0.0,
@@ -231,36 +231,21 @@ def _errors(
             f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
             f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
         )
-    yield page.table(
+    yield page.records(
+        found,
         (
-            "map",
-            "unit",
-            "points",
-            "masked, %",
-            "mean |error|",
-            "median",
-            "68 % interval",
-            "95th percentile",
-            "bias",
-            "68 % coverage, %",
-            "median standard error",
+            ("map", lambda row: words(row.name)),
+            ("unit", lambda row: unit_sign(row.unit)),
+            ("points", lambda row: row.points),
+            ("masked, %", lambda row: 100 * row.masked),
+            ("mean |error|", lambda row: row.mean),
+            ("median", lambda row: row.median),
+            ("68 % interval", lambda row: f"{row.interval[0]:.3g} – {row.interval[1]:.3g}"),
+            ("95th percentile", lambda row: row.high),
+            ("bias", lambda row: row.bias),
+            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
+            ("median standard error", lambda row: row.median_stderr),
         ),
-        [
-            (
-                words(row.name),
-                unit_sign(row.unit),
-                row.points,
-                100 * row.masked,
-                row.mean,
-                row.median,
-                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}",
-                row.high,
-                row.bias,
-                100 * row.coverage.share,
-                row.median_stderr,
-            )
-            for row in found
-        ],
         caption="Texel by texel against the nearest true point; angles in degrees",
     )
     yield page.table(
@@ -315,14 +300,9 @@ def _reflection(
     figures = []
     for site, true_image, image in reflection.spheres(appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
-        figures.append(map_pictures.color_picture(f"{site}: truth", true_image / bright))
+        figures.append(map_images.color_image(f"{site}: truth", true_image / bright))
         if image is not None:
-            figures.append(map_pictures.color_picture(f"{site}: estimate", image / bright))
+            figures.append(map_images.color_image(f"{site}: estimate", image / bright))
     if figures:
         yield page.Heading("Reflection on spheres")
         yield page.Images(figures)
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -23,7 +23,7 @@ from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks
 from skinrig.traits import regions
 from skinrig.viewer.assets.reflectance import filled
-from skinrig.viewer.assets.traits import told_from_chance
+from skinrig.viewer.assets.traits import distinct_from_chance
 from skinrig.viewer.scene import SceneSource, Texture
 
 MAX_FACTOR_PX: Final = 128
@@ -97,7 +97,7 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     library, _ = regions.load(None)
     parts = regions.parts_of(library)
     space = parts.albedo["face"]
-    names = told_from_chance(space.traits.traits)
+    names = distinct_from_chance(space.traits.traits)
     r_d = face.r_d.values
     valid = face_textures.valid_of(face.r_d)
     chart = face.chart(parts.frame)

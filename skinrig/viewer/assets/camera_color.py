@@ -36,14 +36,14 @@ class CameraColor:
     ----------
     convert
         From (..., 3) to (..., 3).
-    told
+    provenance
         Where it comes from, for people.
     known
         False: nothing is known, and camera RGB is taken for linear sRGB.
     """
 
     convert: Callable[[Float64Array], Float64Array]
-    told: str
+    provenance: str
     known: bool = True
 
 

@@ -58,9 +58,9 @@ def assets(source: SceneSource) -> Assets:
     left_out = list(found.left_out)
     if albedo is not None:
         textures["albedo_map"], seen = albedo
-        facts["albedo_color"] = seen.told
+        facts["albedo_color"] = seen.provenance
         if not seen.known:
-            left_out.append(("colors of this face", seen.told))
+            left_out.append(("colors of this face", seen.provenance))
         left_out.append(
             (
                 "chromophores of this face",
@@ -111,13 +111,13 @@ def simulated(person: Subject, skin: FineSkin) -> FaceColor:
     return FaceColor(
         melanin=skin.melanin(),
         hemoglobin=skin.hemoglobin(),
-        states=stored_states(rig),
+        states=_stored_states(rig),
         global_states=rig.global_states,
         facts={"source": "simulated"},
     )
 
 
-def stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
+def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
     """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
     layers = {}
     for name in (NEUTRAL, *rig.states):

@@ -71,14 +71,14 @@ class PageLobes:
 def assemble(source: SceneSource, found: PageLobes) -> Assets:
     """Return the assets of some lobes, which may hold those of traits too."""
     compact = compact_brdf.chosen(found.lobes)
-    profile, widths, told = diffusion_of(source)
+    profile, widths, told = _diffusion_of(source)
     textures = {
         "lobe_atlas": Texture(
             # the packer turns pictures over; this one's rows stand as the shader counts them
             np.ascontiguousarray(compact_brdf.atlas(compact)[::-1]),
             "f16",
         ),
-        "lobe_shares": Texture(rounded(layers_of(found.shares)), "f16"),
+        "lobe_shares": Texture(rounded(_layers_of(found.shares)), "f16"),
     }
     if widths is not None:
         textures["translucency"] = Texture(widths[..., None], "u8")
@@ -116,7 +116,7 @@ def lobes_of(source: SceneSource) -> PageLobes:
     )
 
 
-def layers_of(shares: Float32Array) -> Float32Array:
+def _layers_of(shares: Float32Array) -> Float32Array:
     """Return shares (H, W, K) as layers of four, (L, H, W, 4); what fills them up is 0."""
     height, width, count = shares.shape
     groups = -(-count // LOBES_PER_LOOKUP)
@@ -162,7 +162,7 @@ def filled(values: Float32Array, valid: BoolArray, most: int) -> Float32Array:
     return np.asarray(texture_fill.push_pull(held, kept).values, np.float32)
 
 
-def diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | None, str]:
+def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | None, str]:
     """Return the profile at a face's mean, how much wider it is at each texel, and where from.
 
     Returns

@@ -95,7 +95,7 @@ class LobeTraits:
         return np.asarray(found / self.scale, np.float32)
 
 
-def told_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
+def distinct_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
     """Return the traits that are worth a slider, in the library's order.
 
     Those that a permutation of the labels brings about as easily are left out, and of two opposite
@@ -122,7 +122,7 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
     materials = brdf_tables.default()
     if found.materials != materials.names or (traits.names and traits.names != materials.names):
         return None
-    names = told_from_chance(traits.traits)
+    names = distinct_from_chance(traits.traits)
     rows = _some(found.shares)
     mix = np.asarray(found.mix, np.float64)
     most = -(-len(mix) // LOBES_PER_LOOKUP) * LOBES_PER_LOOKUP + MAX_ADDED_LOBES

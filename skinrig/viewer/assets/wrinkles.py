@@ -40,13 +40,13 @@ class WrinkleAssetError(ValueError):
 
 def assets(source: SceneSource) -> Assets:
     """Return the wrinkles of a scene, or why there are none."""
-    model, origin = model_of(source)
+    model, origin = _model_of(source)
     if model is None:
         return Assets(left_out=(("wrinkles", origin),))
     return from_model(model, source, origin=origin)
 
 
-def model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
+def _model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
     """Return the wrinkles of a scene and where they come from; None and the reason without."""
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and FILE in dynamic.files:

@@ -92,7 +92,7 @@ class ClosedMesh:
                 _paint(layer, chart)
         return dataclasses.replace(texture, values=values.reshape(texture.values.shape))
 
-    def told(self) -> tuple[tuple[str, str], ...]:
+    def summary(self) -> tuple[tuple[str, str], ...]:
         """Return what the page says of it."""
         rows = []
         if self.charts:

@@ -160,7 +160,7 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     """
     # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
     finest = float(np.percentile(scale, 99.0))
-    reach = math.ceil(4.0 * largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
+    reach = math.ceil(4.0 * _largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
     if reach > MAX_REACH_PX:
         raise MicrostructureAssetError(
             f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
@@ -225,7 +225,7 @@ def px_per_mm(mesh: ViewerMesh) -> Float64Array:
     return np.asarray(np.sqrt(np.abs(a * c - b * b)))
 
 
-def largest_sigma_um(table: KernelTable) -> float:
+def _largest_sigma_um(table: KernelTable) -> float:
     """Return the widest kernel of a table within its range, um."""
     ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
     return float(kernel_parameters(ends, table)[1].max())

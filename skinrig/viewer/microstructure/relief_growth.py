@@ -131,7 +131,7 @@ class GrownRelief:
         y, x = np.meshgrid(
             np.arange(top, top + shape[0]), np.arange(left, left + shape[1]), indexing="ij"
         )
-        corners, weights = corners_at(x, y, self.cell_px, level)
+        corners, weights = _corners_at(x, y, self.cell_px, level)
         total = np.zeros(shape)
         for (i, j), weight in zip(corners, weights, strict=True):
             move_x, move_y = self._moves(i, j)
@@ -140,7 +140,7 @@ class GrownRelief:
 
     def _moves(self, i: Int64Array, j: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Return by how many pixels of level 0 the patch's places are from the relief's."""
-        at_x, at_y = corner_px(i, j, self.cell_px)
+        at_x, at_y = _corner_px(i, j, self.cell_px)
         drawn = hashed(i, j, self.seed)
         # the hexagon's first pixel becomes one of the first pixels that keep its last inside
         free_x = STEP_PX * ((drawn & np.uint32(0xFFFF)) % np.uint32(self.choices)).astype(np.int64)
@@ -186,7 +186,7 @@ def hashed(i: Int64Array, j: Int64Array, seed: int) -> UInt32Array:
     return np.asarray(h, np.uint32)
 
 
-def corner_px(i: Int64Array, j: Int64Array, cell_px: int) -> tuple[Int64Array, Int64Array]:
+def _corner_px(i: Int64Array, j: Int64Array, cell_px: int) -> tuple[Int64Array, Int64Array]:
     """Return columns and rows of lattice corners, on whole steps of `STEP_PX`."""
     # half the cell a row to the side, and sqrt(3)/2 of it down; in integers: 14189 / 16384
     x = (2 * i + j) * cell_px // 2
@@ -194,7 +194,7 @@ def corner_px(i: Int64Array, j: Int64Array, cell_px: int) -> tuple[Int64Array, I
     return (x // STEP_PX) * STEP_PX, (y // STEP_PX) * STEP_PX
 
 
-def corners_at(
+def _corners_at(
     x: Int64Array, y: Int64Array, cell_px: int, level: int
 ) -> tuple[list[tuple[Int64Array, Int64Array]], list[Float64Array]]:
     """Return the three corners around pixels of a level, and their weights (squares sum to 1)."""

@@ -58,7 +58,7 @@ class Packed:
         ).encode("utf-8")
 
 
-def quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Array, Float32Array]:
+def _quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Array, Float32Array]:
     """Return the words of a texture, and the range of each layer and channel.
 
     Parameters
@@ -98,8 +98,8 @@ def dequantize(words: Words, low: Float32Array, high: Float32Array) -> Float32Ar
 def stored(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
     """Return the words that the page holds of a texture, and their range."""
     if texture.fine == 1:
-        return quantize(texture.values, texture.storage)
-    _, low, high = quantize(texture.values, "u8")
+        return _quantize(texture.values, texture.storage)
+    _, low, high = _quantize(texture.values, "u8")
     coarse, steps = octaves.split(_unrounded(texture.values, low, high), texture.fine)
     return octaves.joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
 

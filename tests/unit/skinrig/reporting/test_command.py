@@ -11,8 +11,7 @@ from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig.appearances.front_view import WIDTH_PX
 from skinrig.cli import main
-from skinrig.reporting import folders, verdict
-from skinrig.reporting import map_images as map_pictures
+from skinrig.reporting import folders, map_images, verdict
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 
@@ -91,7 +90,7 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
         (r"more than (\d+) % are masked", 100 * verdict.MAX_UNREMARKED_MASK),
         (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
-        (r"has (\d+) colors", map_pictures.SCALE_COLORS),
+        (r"has (\d+) colors", map_images.SCALE_COLORS),
         (r"faces from the front (\d+)", WIDTH_PX),
     ],
 )

@@ -17,8 +17,7 @@ from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import report
 from skinrig.drawing import figures, png, svg
-from skinrig.reporting import map_images as map_pictures
-from skinrig.reporting import page, verdict
+from skinrig.reporting import map_images, page, verdict
 
 
 class Outline(HTMLParser):
@@ -127,7 +126,7 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
     values = np.arange(100.0).reshape(10, 10)
     valid = np.ones((10, 10), bool)
     valid[:2] = False
-    shown = map_pictures.scalar_picture(
+    shown = map_images.scalar_image(
         "error", values, low=0.0, high=99.0, valid=valid, unit="um", of="height"
     )
     assert shown.alt == (
@@ -139,7 +138,7 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
 def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_value(rng):
     values = rng.random((40, 50))
     values[3, 4] = np.nan
-    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_pictures.SCALE_COLORS)
+    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_images.SCALE_COLORS)
     seen = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
     assert seen[3, 4].tolist() == [png.INVALID_GRAY] * 3
     fine = png.colorize(values, 0.0, 1.0).astype(int)

@@ -188,7 +188,7 @@ def test_traits_of_other_materials_are_left_out(face):
 
 def test_opposite_traits_have_one_slider_and_chance_has_none():
     traits = trait_storage.default().spaces["albedo"].traits
-    names = trait_assets.told_from_chance(traits)
+    names = trait_assets.distinct_from_chance(traits)
     assert "caucasian" not in names
     assert "freckles" not in names  # p = 1 in the packaged population
     assert "tan" in names

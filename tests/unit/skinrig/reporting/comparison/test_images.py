@@ -8,7 +8,7 @@ import pytest
 from model import store
 from skinrig import report
 from skinrig.drawing import png
-from skinrig.reporting.comparison import images as picture_comparison
+from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 
 
@@ -32,19 +32,19 @@ def test_brighter_light_is_told_by_its_factor_although_both_pictures_look_alike(
     """A picture may be shown at a brightness of its own: codes would say that nothing differs."""
     a = folder(tmp_path / "a", light, shown=light)
     b = folder(tmp_path / "b", 1.25 * light, shown=light)
-    (one,), refused = picture_comparison.compared(a, b)
+    (one,), refused = image_comparison.compared(a, b)
     assert (one.kind, refused) == ("linear", [])
     assert one.mean_ratio == pytest.approx(1.25, rel=1e-6)
     assert one.relative_rms == pytest.approx(0.25, rel=1e-6)
     (a / "radiance.exr").unlink()
-    (codes,), _ = picture_comparison.compared(a, b)
+    (codes,), _ = image_comparison.compared(a, b)
     assert (codes.kind, codes.equal) == ("8-bit codes", True)
 
 
 def test_a_spot_that_brightens_is_found_where_it_is_and_in_its_channel(light, tmp_path):
     other = light.copy()
     other[5:8, 20:24, 0] += 0.3
-    (one,), _ = picture_comparison.compared(
+    (one,), _ = image_comparison.compared(
         folder(tmp_path / "a", light), folder(tmp_path / "b", other)
     )
     spot = np.zeros(light.shape[:2], bool)
@@ -58,14 +58,14 @@ def test_colors_of_png_files_keep_their_order(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
     for one in (a, b):
         (one / "radiance.exr").unlink()
-    (found,), _ = picture_comparison.compared(a, b)
+    (found,), _ = image_comparison.compared(a, b)
     np.testing.assert_allclose(found.a, light, atol=0.51 / 255)
 
 
 def test_pictures_of_other_sizes_or_of_one_run_alone_are_named(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light[:12])
     (b / "shadow.png").write_bytes(png.encode(np.zeros((4, 4), np.uint8)))
-    found, refused = picture_comparison.compared(a, b)
+    found, refused = image_comparison.compared(a, b)
     assert found == []
     assert dict(refused) == {"radiance": "sizes 24 x 32 x 3 and 12 x 32 x 3", "shadow": "only in B"}
 
@@ -90,8 +90,8 @@ def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, t
     paths = [tmp_path / "x", tmp_path / "y"]
     both = run_comparison.sides(paths)
     assert both is not None
-    assert [name for name, _, _ in picture_comparison.pairs(*both)] == ["pictures-front"]
-    assert picture_comparison.alone(*both) == [("pictures-side", "A: x")]
+    assert [name for name, _, _ in image_comparison.pairs(*both)] == ["pictures-front"]
+    assert image_comparison.alone(*both) == [("pictures-side", "A: x")]
     html = report.make(paths).html
     assert "0 of 1 pictures of both differ" in html
     assert "all that the records say, is the same" in html
@@ -125,6 +125,6 @@ def test_a_damaged_picture_is_named_and_the_rest_is_compared(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
     for one in (a, b):
         (one / "broken.png").write_bytes(b"no picture")
-    found, refused = picture_comparison.compared(a, b)
+    found, refused = image_comparison.compared(a, b)
     assert [one.name for one in found] == ["radiance"]
     assert refused == [("broken", "cannot be read: is no picture")]

@@ -66,7 +66,7 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
     rgb = np.array([[0.5, 0.4, 0.3], [1.0, 1.0, 1.0]])
     np.testing.assert_allclose(found.convert(rgb), fit.to_linear_srgb(rgb * WHITE), rtol=1e-12)
     assert found.known
-    assert "1.5 dE2000" in found.told
+    assert "1.5 dE2000" in found.provenance
     assert np.abs(found.convert(rgb) - rgb).max() > 0.05
 
 
@@ -76,7 +76,7 @@ def test_a_calibration_of_another_session_beside_is_not_taken(tmp_path):
     assert not found.known
     rgb = np.array([0.5, 0.4, 0.3])
     np.testing.assert_array_equal(found.convert(rgb), rgb)
-    assert "as if it were linear sRGB" in found.told
+    assert "as if it were linear sRGB" in found.provenance
 
 
 def test_a_tabulated_sensor_sees_skin_as_srgb_does(tmp_path, monkeypatch):
@@ -91,7 +91,7 @@ def test_a_tabulated_sensor_sees_skin_as_srgb_does(tmp_path, monkeypatch):
     monkeypatch.setattr("capture.session.Session.open", lambda _: Named)
     found = camera_color.of(source)
     assert found.known
-    assert "no color calibration" in found.told
+    assert "no color calibration" in found.provenance
     table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)
     wanted = color_table.build(spectra.LINEAR_SRGB, "D65", size=9, anisotropy=ANISOTROPY_SKIN)
     assert np.abs(found.convert(table.rgb) - wanted.rgb).max() < 0.01

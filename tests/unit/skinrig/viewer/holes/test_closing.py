@@ -85,7 +85,7 @@ def test_patches_get_charts_of_their_own_that_lie_apart(scan):
         for other in closed.charts[k + 1 :]:
             apart = np.linalg.norm(chart.center - other.center)
             assert apart > chart.radius + other.radius + 0.01
-    (_, told), *rest = closed.told()
+    (_, told), *rest = closed.summary()
     assert told.startswith("2 holes")
     assert not rest
 
@@ -129,4 +129,4 @@ def test_a_texture_without_room_leaves_a_hole_open_and_says_so(scan):
     closed = patch_charts.closed(mesh)
     assert closed.charts == ()
     assert len(closed.left_open_mm) >= 2
-    assert closed.told()[0][0] == "holes that stay open"
+    assert closed.summary()[0][0] == "holes that stay open"
