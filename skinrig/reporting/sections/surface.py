@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.appearances.front_view import WIDTH_PX, FrontView
+from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX, FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
@@ -66,7 +66,7 @@ def section(
             continue
         values = skin_map.values[rows, columns]
         good = _valid(skin_map)[rows, columns]
-        width = WIDTH_PX if key in large else SMALL_PX
+        width = FRONT_VIEW_WIDTH_PX if key in large else SMALL_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
         known_truth = truth is not None and true_name in truth.maps

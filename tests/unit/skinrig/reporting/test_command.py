@@ -9,7 +9,7 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig.appearances.front_view import WIDTH_PX
+from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import folders, verdict
 from skinrig.reporting import map_images as map_pictures
@@ -92,7 +92,7 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
         (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MOST_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.SAME_PLACE_MM),
         (r"has (\d+) colors", map_pictures.LEVELS),
-        (r"faces from the front (\d+)", WIDTH_PX),
+        (r"faces from the front (\d+)", FRONT_VIEW_WIDTH_PX),
     ],
 )
 def test_the_page_on_reports_tells_the_numbers_of_the_program(words, value):
