@@ -171,7 +171,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         )
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):
-        from skinrig.rendering.photographs.comparison import FULL
+        from skinrig.rendering.photographs.comparison import FULL_MODEL
         from skinrig.rendering.photographs.evaluation import evaluate_folders
 
         compared = evaluate_folders(
@@ -188,7 +188,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
             "head": ["model", "median error, %", "all skin, %"],
             "rows": [
                 [name, 100 * row["median"], 100 * row["total_error"]]
-                for name, row in ((FULL, compared[FULL]), *compared["ablation"].items())
+                for name, row in ((FULL_MODEL, compared[FULL_MODEL]), *compared["ablation"].items())
             ],
         }
     )

@@ -19,7 +19,7 @@ from typing import Any
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
-from skinrig.rendering.photographs.comparison import FULL
+from skinrig.rendering.photographs.comparison import FULL_MODEL
 from skinrig.rendering.photographs.evaluation import evaluate_folders
 from skinrig.simulating.simulation import simulate_session
 
@@ -80,7 +80,7 @@ def main(arguments: list[str]) -> int:
 
 def show(subject: str, record: dict[str, Any]) -> None:
     """Print one subject's rows."""
-    full = record[FULL]
+    full = record[FULL_MODEL]
     print(
         f"{subject:8} ITA {record['typology_angle_deg']:6.1f} ({record['band']}): median "
         f"{100 * full['median']:.2f} % [{100 * full['interval'][0]:.2f}, "

@@ -299,7 +299,7 @@ def main() -> None:
                 part: {n: round(c, 4) for n, c in row.items()} for part, row in truth.items()
             },
         ),
-        {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
+        {regions.TEXTURE_SPACE_FILE: regions.texture_bytes(texture)},
     )
     content = library.to_bytes(precision="int8")
     back = from_bytes(content)

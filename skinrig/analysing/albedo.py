@@ -29,10 +29,10 @@ from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 
-BINS: Final = 128
-EVERYBODY: Final = "all"
-SHOWN: Final = ("red", "green", "blue")
-FILES: Final = ("figure-16.png", "histograms.csv", "components.csv", "analysis.json")
+HISTOGRAM_BINS: Final = 128
+ALL_GROUPS: Final = "all"
+CHANNEL_NAMES: Final = ("red", "green", "blue")
+OUTPUT_FILES: Final = ("figure-16.png", "histograms.csv", "components.csv", "analysis.json")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ def analyse_measured(
     Parameters
     ----------
     out
-        Folder to write `FILES` into.
+        Folder to write `OUTPUT_FILES` into.
     appearances
         APPEARANCE/ folders of dome sessions.
     labels
@@ -128,7 +128,7 @@ def analyse_measured(
     faces = traits.read_faces(appearances, landmarks)
     frame = face_textures.common_frame(faces, size)
     names = tuple(face.name for face in faces)
-    groups = {EVERYBODY: np.ones(len(names), np.bool_)}
+    groups = {ALL_GROUPS: np.ones(len(names), np.bool_)}
     if labels is not None:
         table = trait_labels.read(labels, names)
         groups |= complements(table.binary)
@@ -186,7 +186,7 @@ def analyse_simulated(
     binary = {
         name: flags for name, flags in labels_of(some, known).items() if 0 < flags.sum() < len(some)
     }
-    groups = {EVERYBODY: np.ones(len(some), np.bool_)} | binary
+    groups = {ALL_GROUPS: np.ones(len(some), np.bool_)} | binary
     regions = {
         name: common_regions.region(name, faces.frame) for name in ("face", "beard", "no-beard")
     }
@@ -222,7 +222,7 @@ def analyse(
     for region, inside in regions.items():
         masks = [inside & one.valid for one in samples]
         fewest = min(int(mask.sum()) for mask in masks)
-        if fewest < traits.LEAST_PIXELS:
+        if fewest < traits.MIN_REGION_PIXELS:
             left_out.append((region, f"a face shows {fewest} pixels of it"))
             continue
         reach = (
@@ -235,7 +235,7 @@ def analyse(
             ),
         )
         histograms[region] = texture_histograms.rgb_histograms(
-            images, groups, valid=masks, reach=reach, bins=BINS
+            images, groups, valid=masks, reach=reach, bins=HISTOGRAM_BINS
         )
         rows = np.array(
             [
@@ -258,13 +258,13 @@ def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
     part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
     part.mkdir(parents=True)
     try:
-        (part / FILES[0]).write_bytes(_figure(found))
-        (part / FILES[1]).write_text(_histogram_rows(found), encoding="utf-8")
-        (part / FILES[2]).write_text(_component_rows(found), encoding="utf-8")
+        (part / OUTPUT_FILES[0]).write_bytes(_figure(found))
+        (part / OUTPUT_FILES[1]).write_text(_histogram_rows(found), encoding="utf-8")
+        (part / OUTPUT_FILES[2]).write_text(_component_rows(found), encoding="utf-8")
         text = json.dumps({"schema": "skinrig.analyse-albedo/1", **found.document()}, indent=1)
-        (part / FILES[3]).write_text(text + "\n", encoding="utf-8")
+        (part / OUTPUT_FILES[3]).write_text(text + "\n", encoding="utf-8")
         out.mkdir(parents=True, exist_ok=True)
-        for name in FILES:
+        for name in OUTPUT_FILES:
             os.replace(part / name, out / name)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -279,7 +279,7 @@ def _histogram_rows(found: AlbedoAnalysis) -> str:
     )
     for region, one in found.histograms.items():
         for g, group in enumerate(one.names):
-            for c, channel in enumerate(SHOWN):
+            for c, channel in enumerate(CHANNEL_NAMES):
                 for b, share in enumerate(one.mean[g, c]):
                     error = one.stderr[g, c, b]
                     rows.writerow(

@@ -30,13 +30,13 @@ from skinrig.traits import labels as trait_labels
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
 BASIS_FILE: Final = "brdf_basis.npz"
-POINTS_A: Final = 5_000
-POINTS_B: Final = 2_000
-TRAINED: Final = 5_000
+N_POINTS_PER_DATASET: Final = 5_000
+N_POINTS_PER_FACE: Final = 2_000
+MAX_TRAINING_POINTS: Final = 5_000
 """Points, at most, that common mixtures are made of."""
-HELD_OUT: Final = 5_000
+MAX_HELD_OUT_POINTS: Final = 5_000
 """Points, at most, that they are tried on."""
-HELD_OUT_SHARE: Final = 0.3
+HELD_OUT_FRACTION: Final = 0.3
 """Part of the points, or of the people, that are kept for that."""
 
 
@@ -126,14 +126,14 @@ def analyse(
         )
     present = np.unique(data.label)
     if by_label and len(present) > 2:
-        kept = rng.permutation(present)[: max(1, round(HELD_OUT_SHARE * len(present)))]
+        kept = rng.permutation(present)[: max(1, round(HELD_OUT_FRACTION * len(present)))]
         out = np.isin(data.label, kept)
     else:
         by_label = False
         out = np.zeros(count, np.bool_)
-        out[rng.permutation(count)[: round(HELD_OUT_SHARE * count)]] = True
-    trained = rng.permutation(np.flatnonzero(~out))[:TRAINED]
-    tried = rng.permutation(np.flatnonzero(out))[:HELD_OUT]
+        out[rng.permutation(count)[: round(HELD_OUT_FRACTION * count)]] = True
+    trained = rng.permutation(np.flatnonzero(~out))[:MAX_TRAINING_POINTS]
+    tried = rng.permutation(np.flatnonzero(out))[:MAX_HELD_OUT_POINTS]
     curve = brdf_space.curve(
         data.weights[trained],
         basis,
@@ -157,8 +157,8 @@ def analyse(
 def analyse_simulated(
     out: Path,
     *,
-    points: int = POINTS_A,
-    points_each: int = POINTS_B,
+    points: int = N_POINTS_PER_DATASET,
+    points_each: int = N_POINTS_PER_FACE,
     method: brdf_space.Method = "shares",
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
@@ -201,7 +201,7 @@ def analyse_measured(
     *,
     labels: Path | None = None,
     basis: Path | None = None,
-    points_each: int = POINTS_B,
+    points_each: int = N_POINTS_PER_FACE,
     method: brdf_space.Method = "shares",
     seed: int = 0,
 ) -> tuple[Analysis, ...]:

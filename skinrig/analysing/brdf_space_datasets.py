@@ -24,19 +24,19 @@ from rigsim.population.conditions import CONDITIONS, conditioned_surface
 from rigsim.population.population import HAIR_LIMIT, Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
-LEAST_COS_LIGHT: Final = 0.12
-LEAST_COS_VIEW: Final = 0.25
-NOISE: Final = 0.02
+MIN_COS_LIGHT: Final = 0.12
+MIN_COS_VIEW: Final = 0.25
+RADIANCE_NOISE: Final = 0.02
 """Standard deviation of a sample's radiance, as a share of itself and of 2 % of white."""
-DARK_SHARE: Final = 0.02
-SAMPLES: Final = 160
+NOISE_FLOOR_OF_WHITE: Final = 0.02
+SAMPLES_PER_POINT: Final = 160
 """Pairs of light and view of a point, drawn among all that are above the horizon."""
-CHUNK: Final = 1000
+POINTS_PER_FIT: Final = 1000
 """Points that are worked on at a time."""
-REPEATED: Final = 100
+MAX_REPEATED_POINTS: Final = 100
 """Points of a label, at most, that are fitted twice to tell what noise alone leaves."""
-SIZE: Final = 256
-PERSON: Final = 4
+DATASET_TEXELS: Final = 256
+DATASET_A_MEMBER: Final = 4
 """Member of table 1 whose face dataset A is of."""
 
 
@@ -95,8 +95,8 @@ def capture(
     where: BoolArray,
     count: int,
     *,
-    samples: int = SAMPLES,
-    noise: float = NOISE,
+    samples: int = SAMPLES_PER_POINT,
+    noise: float = RADIANCE_NOISE,
     rng: np.random.Generator,
 ) -> Captured:
     """Return samples of random points of a face.
@@ -114,7 +114,7 @@ def capture(
     samples
         Pairs of light and view a point.
     noise
-        See `NOISE`.
+        See `RADIANCE_NOISE`.
     rng
         Of everything random.
 
@@ -137,7 +137,7 @@ def capture(
     normal = surface.normal.reshape(-1, 3)[drawn].astype(np.float64)
     place = position_mm.reshape(-1, 3)[drawn].astype(np.float64)
     above_l, above_v = _above(lights, place, normal), _above(views, place, normal)
-    pairs = (above_l >= LEAST_COS_LIGHT).sum(1) * (above_v >= LEAST_COS_VIEW).sum(1)
+    pairs = (above_l >= MIN_COS_LIGHT).sum(1) * (above_v >= MIN_COS_VIEW).sum(1)
     able = np.flatnonzero(pairs >= samples)
     if not len(able):
         raise DatasetError(
@@ -146,8 +146,8 @@ def capture(
         )
     chosen = able[:count] if len(able) >= count else rng.choice(able, count)
     normal, place = normal[chosen], place[chosen]
-    valid = (above_v[chosen][:, :, None] >= LEAST_COS_VIEW) & (
-        above_l[chosen][:, None, :] >= LEAST_COS_LIGHT
+    valid = (above_v[chosen][:, :, None] >= MIN_COS_VIEW) & (
+        above_l[chosen][:, None, :] >= MIN_COS_LIGHT
     )
     order = np.argsort(np.where(valid, rng.random(valid.shape), 2.0).reshape(count, -1), axis=1)
     view_index, light_index = np.divmod(order[:, :samples], len(lights))
@@ -161,7 +161,7 @@ def capture(
     )
     f = clean.astype(np.float64).reshape(count, samples, 3)
     mu = np.einsum("pmc,pc->pm", to_light, normal)[..., None]
-    sigma = noise * (f * mu + DARK_SHARE / np.pi) / mu
+    sigma = noise * (f * mu + NOISE_FLOOR_OF_WHITE / np.pi) / mu
     return Captured(
         f=f + sigma * rng.standard_normal(f.shape),
         variance=np.maximum(sigma, 1e-9) ** 2,
@@ -197,7 +197,11 @@ def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.Basis
 
 
 def one_person(
-    points: int, *, member: Member | None = None, noise: float = NOISE, rng: np.random.Generator
+    points: int,
+    *,
+    member: Member | None = None,
+    noise: float = RADIANCE_NOISE,
+    rng: np.random.Generator,
 ) -> Dataset:
     """Return points of one face as it usually is.
 
@@ -208,11 +212,11 @@ def one_person(
     member
         Whose; None: that of dataset A.
     noise
-        See `NOISE`.
+        See `RADIANCE_NOISE`.
     rng
         Of everything random.
     """
-    person = table_1()[PERSON] if member is None else member
+    person = table_1()[DATASET_A_MEMBER] if member is None else member
     return _gathered(
         "one person", ("normal",), [points], lambda _: _skin(person, {}), noise=noise, rng=rng
     )
@@ -223,7 +227,7 @@ def dataset_a(
     *,
     member: Member | None = None,
     conditions: Sequence[str] = CONDITIONS,
-    noise: float = NOISE,
+    noise: float = RADIANCE_NOISE,
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
 ) -> Dataset:
@@ -234,11 +238,11 @@ def dataset_a(
     points
         How many in all.
     member
-        Whose; None: `PERSON` of table 1.
+        Whose; None: `DATASET_A_MEMBER` of table 1.
     conditions
         Of `rigsim.population.conditions.CONDITIONS`, each of amount 1.
     noise
-        See `NOISE`.
+        See `RADIANCE_NOISE`.
     progress
         Called with each condition's name.
     rng
@@ -248,7 +252,7 @@ def dataset_a(
         raise DatasetError(
             f"points: got {points} for {len(conditions)} conditions, expected one each or more"
         )
-    person = table_1()[PERSON] if member is None else member
+    person = table_1()[DATASET_A_MEMBER] if member is None else member
     share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
     return _gathered(
         "dataset A",
@@ -265,7 +269,7 @@ def dataset_b(
     points: int,
     *,
     members: Sequence[Member] | None = None,
-    noise: float = NOISE,
+    noise: float = RADIANCE_NOISE,
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
 ) -> Dataset:
@@ -278,7 +282,7 @@ def dataset_b(
     members
         None: the 87 of `rigsim.population.population.table_1`.
     noise
-        See `NOISE`.
+        See `RADIANCE_NOISE`.
     progress
         Called with each member's name.
     rng
@@ -306,7 +310,7 @@ def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
     rig = load_rig("dome")
     camera, light = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
     worn = dict(member.applied) if conditions is None else conditions
-    face = member.face(SIZE)
+    face = member.face(DATASET_TEXELS)
     surface = conditioned_surface(face, camera, light, worn)
     return surface, face.atlas.position_mm, face.atlas.covered & (face.hair < HAIR_LIMIT)
 
@@ -329,15 +333,17 @@ def _gathered(
         if progress is not None:
             progress(f"{name}: {labels[k]}")
         surface, place, where = skin(k)
-        for start in range(0, count, CHUNK):
-            seen = capture(surface, place, where, min(CHUNK, count - start), noise=noise, rng=rng)
+        for start in range(0, count, POINTS_PER_FIT):
+            seen = capture(
+                surface, place, where, min(POINTS_PER_FIT, count - start), noise=noise, rng=rng
+            )
             fit = fitted(seen, basis)
             good = fit.valid & (fit.weights @ basis.strength() > 0.0)
             lost += int(np.count_nonzero(~good))
             weights.append(fit.weights[good])
             label.append(np.full(np.count_nonzero(good), k))
             if start == 0:
-                few = min(REPEATED, len(good))
+                few = min(MAX_REPEATED_POINTS, len(good))
                 other = fitted(seen.again(few, rng=rng), basis)
                 both = good[:few] & other.valid
                 twice[0].append(fit.weights[:few][both])

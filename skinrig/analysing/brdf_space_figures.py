@@ -13,14 +13,14 @@ from reconstruction import brdf_basis
 from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig.arrays import Float64Array
 
-LIGHTS: Final = (
+SPHERE_LIGHTS: Final = (
     ((-0.5, 0.5, 0.70710678), "light from the left"),
     ((0.85, 0.35, -0.39), "light from behind right"),
 )
 """The two directions that spheres are lit from."""
 SPHERE_PX: Final = 160
-GAMMA: Final = 2.2
-BRIGHTEST: Final = 99.0
+DISPLAY_GAMMA: Final = 2.2
+SPHERE_WHITE_PERCENTILE: Final = 99.0
 """Percentile of all spheres' lit pixels that is shown as white."""
 
 
@@ -82,25 +82,25 @@ def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
     """
     pictures = lit(means, basis)
     shown = np.concatenate([p[p > 0.0] for row in pictures.values() for p in row])
-    white = float(np.percentile(shown, BRIGHTEST)) if len(shown) else 1.0
+    white = float(np.percentile(shown, SPHERE_WHITE_PERCENTILE)) if len(shown) else 1.0
     count = max(len(means), 1)
-    figure, axes = _figure(1.25 * count + 0.3, 3.0, len(LIGHTS), count)
+    figure, axes = _figure(1.25 * count + 0.3, 3.0, len(SPHERE_LIGHTS), count)
     for place in axes.flat:
         place.axis("off")
     for column, (name, row) in enumerate(pictures.items()):
         for k, picture in enumerate(row):
-            level = np.clip(picture / white, 0.0, 1.0) ** (1.0 / GAMMA)
+            level = np.clip(picture / white, 0.0, 1.0) ** (1.0 / DISPLAY_GAMMA)
             axes[k, column].imshow(level, cmap="gray", vmin=0.0, vmax=1.0)
         axes[0, column].set_title(name, fontsize=8)
     return _png(figure)
 
 
 def lit(means: Mapping[str, Float64Array], basis: BrdfBasis) -> dict[str, tuple[Float64Array, ...]]:
-    """Return each label's sphere under each of `LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
+    """Return each label's sphere under each of `SPHERE_LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
     return {
         name: tuple(
             brdf_basis.lit_sphere(shares, basis, light_dir=way, size_px=SPHERE_PX)
-            for way, _ in LIGHTS
+            for way, _ in SPHERE_LIGHTS
         )
         for name, shares in means.items()
     }

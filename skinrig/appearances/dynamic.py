@@ -14,9 +14,9 @@ from typing import Any
 from model import store
 from model.skin import SkinAppearance, SkinMap
 
-KIND = "dynamic"
+DYNAMIC_KIND = "dynamic"
 FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
-PARTS = (FACIAL_COLOR, WRINKLES, MICROSTRUCTURE)
+DYNAMIC_PARTS = (FACIAL_COLOR, WRINKLES, MICROSTRUCTURE)
 FIT_COMMANDS: Mapping[str, str] = {
     FACIAL_COLOR: "skinrig fit facial-color",
     WRINKLES: "skinrig fit wrinkles",
@@ -76,7 +76,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     out
         The folder; made where there is none.
     name
-        Of `PARTS`.
+        Of `DYNAMIC_PARTS`.
     part
         What was fitted.
 
@@ -115,7 +115,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     appearance = SkinAppearance(
         maps={**maps, **part.maps},
         source="simulated" if "simulated" in sources else "measured",
-        parameters={"kind": KIND, "parts": parts},
+        parameters={"kind": DYNAMIC_KIND, "parts": parts},
         inputs={**inputs, **{f"{name}: {key}": value for key, value in part.inputs.items()}},
         versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
         left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
@@ -126,7 +126,9 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     return appearance
 
 
-def read(path: Path, *, parts: Sequence[str] = PARTS) -> tuple[SkinAppearance, dict[str, Any]]:
+def read(
+    path: Path, *, parts: Sequence[str] = DYNAMIC_PARTS
+) -> tuple[SkinAppearance, dict[str, Any]]:
     """Return a dynamic appearance and what it says of its parts.
 
     Parameters
@@ -142,7 +144,7 @@ def read(path: Path, *, parts: Sequence[str] = PARTS) -> tuple[SkinAppearance, d
         It holds none of them.
     """
     appearance = store.read(path)
-    found = parts_of(appearance) if appearance.parameters.get("kind") == KIND else {}
+    found = parts_of(appearance) if appearance.parameters.get("kind") == DYNAMIC_KIND else {}
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
@@ -156,7 +158,7 @@ def _previous(out: Path) -> SkinAppearance | None:
     if not (out / store.DOCUMENT).is_file():
         return None
     kind = store.read_document(out).parameters.get("kind")
-    if kind != KIND:
+    if kind != DYNAMIC_KIND:
         raise DynamicAppearanceError(
             f"{out}: holds maps of kind {kind!r}, expected a new folder or one that a fit wrote; "
             "nothing was touched: name another with --out"

@@ -26,9 +26,9 @@ from skinrig.arrays import BoolArray, Float64Array
 Point = tuple[float, float, float]
 Landmarks = dict[str, Point]
 
-TRUE_LANDMARKS: Final = "landmarks_mm"
+TRUE_LANDMARKS_KEY: Final = "landmarks_mm"
 """Parameter of a TRUTH/ folder: name to x, y, z, mm, rig frame."""
-MARKED_MM: Final = 1.0
+LANDMARK_STDERR_MM: Final = 1.0
 """Standard error of a landmark that a person places, along each axis."""
 
 
@@ -98,7 +98,9 @@ class Face:
             cylinder = common_parameterization.find_cylinder(self.position, self.surface)
             return Correspondence(cylinder)
         try:
-            return common_parameterization.correspond(self.landmarks, frame, stderr_mm=MARKED_MM)
+            return common_parameterization.correspond(
+                self.landmarks, frame, stderr_mm=LANDMARK_STDERR_MM
+            )
         except ParameterizationError as error:
             raise FaceError(f"{self.path}: {error}") from error
 
@@ -132,13 +134,15 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     truth = _truth(path, found)
     if truth is None:
         return Face(name, path, found, {}, "none")
-    told = store.read_document(truth).parameters.get(TRUE_LANDMARKS)
+    told = store.read_document(truth).parameters.get(TRUE_LANDMARKS_KEY)
     if not isinstance(told, dict):
         return Face(name, path, found, {}, "none")
     try:
         points = {str(n): _point([float(x) for x in place]) for n, place in told.items()}  # type: ignore[arg-type,union-attr]
     except (TypeError, ValueError) as error:
-        raise FaceError(f"{truth}: {TRUE_LANDMARKS}: {json.dumps(told)[:80]}: {error}") from error
+        raise FaceError(
+            f"{truth}: {TRUE_LANDMARKS_KEY}: {json.dumps(told)[:80]}: {error}"
+        ) from error
     return Face(name, path, found, points, "the simulation's own")
 
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
-WIDTH_PX = 220
+FRONT_VIEW_WIDTH_PX = 220
 """Pixels across."""
 
 
@@ -37,13 +37,13 @@ class FrontView:
     def of(position_mm: FloatArray, box: tuple[FloatArray, FloatArray]) -> FrontView:
         """Look along -z at points, shape (N, 3), inside a box given by its two corners."""
         low, high = box
-        pixel = max(float(high[0] - low[0]) / WIDTH_PX, 1e-9)
+        pixel = max(float(high[0] - low[0]) / FRONT_VIEW_WIDTH_PX, 1e-9)
         height = max(int(np.ceil(float(high[1] - low[1]) / pixel)), 1)
         columns = np.floor((position_mm[:, 0] - low[0]) / pixel).astype(np.intp)
         rows = np.floor((high[1] - position_mm[:, 1]) / pixel).astype(np.intp)
-        inside = (columns >= 0) & (columns < WIDTH_PX) & (rows >= 0) & (rows < height)
+        inside = (columns >= 0) & (columns < FRONT_VIEW_WIDTH_PX) & (rows >= 0) & (rows < height)
         return FrontView(
-            (height, WIDTH_PX),
+            (height, FRONT_VIEW_WIDTH_PX),
             np.where(inside, rows, -1),
             np.where(inside, columns, -1),
             np.argsort(position_mm[:, 2], kind="stable"),

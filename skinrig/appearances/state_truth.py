@@ -8,7 +8,7 @@ from typing import Final
 from model import store
 from skinrig.simulating.orders import truth_folder
 
-USUAL: Final = "neutral"
+DEFAULT_STATE: Final = "neutral"
 """The state that is meant where none is said."""
 
 
@@ -26,13 +26,13 @@ def truth_of_state(session: Path, state: str) -> Path | None:
     return None
 
 
-def truth_beside(session: Path, state: str = USUAL) -> Path | None:
+def truth_beside(session: Path, state: str = DEFAULT_STATE) -> Path | None:
     """Return the folder with what maps of a session's state are to be compared with, or None.
 
     Where no state is asked for, as of rigs before which faces hold still, it is the session's own.
     """
     found = truth_of_state(session, state)
-    if found is not None or state != USUAL:
+    if found is not None or state != DEFAULT_STATE:
         return found
     folder = truth_folder(session)
     return folder if (folder / store.DOCUMENT).is_file() else None

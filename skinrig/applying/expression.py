@@ -22,12 +22,12 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.dynamic import FACIAL_COLOR, PARTS, WRINKLES
+from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.errors import UsageError
 
-KIND = "expression"
-LEAST_SUM = 1e-6
-OBSERVER, LIGHT = "linear sRGB", "D65"
+EXPRESSION_KIND = "expression"
+MIN_WEIGHT_SUM = 1e-6
+COLOR_OBSERVER, COLOR_ILLUMINANT = "linear sRGB", "D65"
 """What colors are given for: screens and textures, not the camera that measured."""
 
 
@@ -146,7 +146,7 @@ def apply_expression(
     expression: Expression,
     *,
     out: Path,
-    parts: Sequence[str] = PARTS,
+    parts: Sequence[str] = DYNAMIC_PARTS,
     relief: Callable[[SkinAppearance, dict[str, Any], Applied], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Applied:
@@ -176,14 +176,14 @@ def apply_expression(
     ApplyError, FacialColorError, WrinkleError, DynamicAppearanceError, StoreError
         For weights that a part cannot take, or a folder that holds none of the parts.
     """
-    unknown = [name for name in parts if name not in PARTS]
+    unknown = [name for name in parts if name not in DYNAMIC_PARTS]
     if unknown:
-        raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(PARTS)}")
+        raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(DYNAMIC_PARTS)}")
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
     expression = normalized(expression)
     done = Applied()
-    for name in PARTS:
+    for name in DYNAMIC_PARTS:
         if name not in found or name not in parts:
             why = "not asked for" if name in found else "the folder does not hold it"
             done.left_out.append((name, why))
@@ -211,7 +211,7 @@ def apply_expression(
             maps=done.maps,
             source=_source(appearance, expression),
             parameters={
-                "kind": KIND,
+                "kind": EXPRESSION_KIND,
                 "weights": dict(expression.weights),
                 "clamp": expression.clamp,
                 "emotional": expression.emotional,
@@ -238,7 +238,7 @@ def _check_target(out: Path, path: Path) -> None:
         raise ApplyError(f"{out}: is the fitted folder itself; name another with --out")
     if (out / store.DOCUMENT).is_file():
         kind = store.read_document(out).parameters.get("kind")
-        if kind != KIND:
+        if kind != EXPRESSION_KIND:
             raise ApplyError(
                 f"{out}: holds maps of kind {kind!r}, expected a new folder or an older result; "
                 "nothing was touched: name another with --out"
@@ -250,7 +250,7 @@ def normalized(expression: Expression) -> Expression:
     if not expression.normalize:
         return expression
     total = sum(expression.weights.values())
-    if abs(total) < LEAST_SUM:
+    if abs(total) < MIN_WEIGHT_SUM:
         raise ApplyError(f"weights: their sum is {total:g}: it cannot be made 1")
     weights = {name: weight / total for name, weight in expression.weights.items()}
     return replace(expression, weights=weights, normalize=False)
@@ -310,7 +310,7 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         "1",
         None,
         seen,
-        f"diffuse reflectance as {OBSERVER} under {LIGHT}, white = 1",
+        f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1",
     )
 
 
@@ -337,8 +337,8 @@ def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinR
 
 
 def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
-    """Return diffuse reflectance of skin, (H, W, 3), as `OBSERVER` under `LIGHT`; 0 outside."""
-    table = color_table.build(OBSERVER, LIGHT, anisotropy=ANISOTROPY_SKIN)
+    """Return diffuse reflectance of skin in linear sRGB under D65, (H, W, 3); 0 outside."""
+    table = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
     color = np.zeros((*seen.shape, 3), np.float32)
     color[seen] = table.lookup(melanin[seen], hemoglobin[seen])
     return color

@@ -24,11 +24,11 @@ from skinrig.blend_shapes.meshes import BlendShapeMesh
 
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
-COUNTED_PX: Final = 1024
+COUNTING_SIDE_PX: Final = 1024
 """Shares of pixels are counted on a texture of so many a side."""
-LEAST_SIGMA_PX: Final = 0.3
+MIN_SIGMA_PX: Final = 0.3
 """The discrete Gaussian of a narrower kernel leaves 99 % and more to the pixel itself."""
-HASHED_ROWS: Final = 256
+ROWS_PER_DIGEST: Final = 256
 """Rows of a map that are read at a time to tell one map from another."""
 
 
@@ -65,7 +65,7 @@ class MicrostructureReport:
         Of the covered pixels: a kernel does something.
     unresolved_share : float
         Of the covered pixels: kernels are asked for that are all too narrow for the map's pixels
-        (`LEAST_SIGMA_PX`), so that next to nothing is done. Near 1 for maps of a whole face below
+        (`MIN_SIGMA_PX`), so that next to nothing is done. Near 1 for maps of a whole face below
         8K or so: microstructure needs pixels of 10 to 20 um.
     pixel_um : float
         Median over vertices of the length of skin that a pixel has along the axes.
@@ -244,14 +244,14 @@ def _shares(
     extrapolate: Literal["hold", "formula"],
 ) -> tuple[float, float, float]:
     """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
-    coarser = math.ceil(max(size) / COUNTED_PX)
+    coarser = math.ceil(max(size) / COUNTING_SIDE_PX)
     few = (math.ceil(size[0] / coarser), math.ceil(size[1] / coarser))
     shown = rasterize(found, mesh.faces, mesh.uv, few, pad_px=0)
     changed, narrow = np.zeros((2, *few), bool)
     for lines in regional_kernels(shown, regions, few, extrapolate=extrapolate):
         sigma_px = coarser * lines.sigma_px[shown.covered]
         asked = (lines.alpha[shown.covered] != 0.0) & (sigma_px > 0.0)
-        wide = sigma_px >= LEAST_SIGMA_PX
+        wide = sigma_px >= MIN_SIGMA_PX
         changed[shown.covered] |= asked & wide
         narrow[shown.covered] |= asked & ~wide
     covered = max(int(shown.covered.sum()), 1)
@@ -333,8 +333,8 @@ def _job(
     for each in (height, valid, *regions.weights):
         if each is not None:
             digest.update(f"{each.dtype} {tuple(each.shape)}".encode())
-            for top in range(0, each.shape[0], HASHED_ROWS):
-                digest.update(np.ascontiguousarray(each[top : top + HASHED_ROWS]).data)
+            for top in range(0, each.shape[0], ROWS_PER_DIGEST):
+                digest.update(np.ascontiguousarray(each[top : top + ROWS_PER_DIGEST]).data)
     digest.update(json.dumps([*(table.to_json() for table in regions.tables), *settings]).encode())
     return digest.hexdigest()
 

@@ -30,17 +30,17 @@ from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 
-REACH: Final = 1.1
+CHART_HALF_SIDE: Final = 1.1
 """Half the chart's side, in units of the projection: 1 is the rim that is seen from +z."""
-MESH_DIVISIONS: Final = 96
-DEFORMATIONS: Final[Mapping[str, tuple[float, float, float]]] = {
+SPHERE_DIVISIONS: Final = 96
+DEFORMATION_RATIOS: Final[Mapping[str, tuple[float, float, float]]] = {
     "neutral": (1.0, 1.0, 1.0),
     "shrunk": (0.8, 0.8, 0.8),
     "grown": (1.25, 1.25, 1.25),
     "squashed": (1.25, 0.8, 1.0),
 }
 """Ratios along x, y, z of what the figure shows; it gives no numbers, these are ours."""
-PLACES: Final[Mapping[str, tuple[float, float, float]]] = {
+ROUGHNESS_POINTS: Final[Mapping[str, tuple[float, float, float]]] = {
     "front": (0.0, 0.0, 1.0),
     "right": (math.sqrt(0.5), 0.0, math.sqrt(0.5)),
     "top": (0.0, math.sqrt(0.5), math.sqrt(0.5)),
@@ -74,7 +74,7 @@ class Sphere:
     def pixel_um(self) -> Float64Array:
         """Return the side of the chart's pixels on the neutral sphere, (N, N) um."""
         x, y = self._chart()
-        step = 2.0 * REACH / self.texels
+        step = 2.0 * CHART_HALF_SIDE / self.texels
         return np.asarray(2e3 * self.radius_mm * step / (1.0 + x * x + y * y))
 
     def noise_relief(self, noise: VolumeNoise) -> Float32Array:
@@ -90,7 +90,7 @@ class Sphere:
         )
 
     def _chart(self) -> tuple[Float64Array, Float64Array]:
-        at = REACH * ((np.arange(self.texels) + 0.5) * 2.0 / self.texels - 1.0)
+        at = CHART_HALF_SIDE * ((np.arange(self.texels) + 0.5) * 2.0 / self.texels - 1.0)
         x, y = np.meshgrid(at, -at)
         return x, y
 
@@ -101,12 +101,14 @@ class Sphere:
 
     def mesh(self) -> tuple[Float64Array, Int64Array, Float64Array]:
         """Return vertices (V, 3) mm, triangles (F, 3), texture coordinates (V, 2) of the chart."""
-        side = np.linspace(0.0, 1.0, MESH_DIVISIONS + 1)
+        side = np.linspace(0.0, 1.0, SPHERE_DIVISIONS + 1)
         u, v = (part.reshape(-1) for part in np.meshgrid(side, side))
-        vertices = self._points(REACH * (2.0 * u - 1.0), REACH * (2.0 * v - 1.0))
-        row = np.arange(MESH_DIVISIONS)
-        first = (row[:, None] * (MESH_DIVISIONS + 1) + row).reshape(-1)
-        a, b, c = first, first + 1, first + MESH_DIVISIONS + 1
+        vertices = self._points(
+            CHART_HALF_SIDE * (2.0 * u - 1.0), CHART_HALF_SIDE * (2.0 * v - 1.0)
+        )
+        row = np.arange(SPHERE_DIVISIONS)
+        first = (row[:, None] * (SPHERE_DIVISIONS + 1) + row).reshape(-1)
+        a, b, c = first, first + 1, first + SPHERE_DIVISIONS + 1
         faces = np.concatenate([np.stack([a, b, c + 1], 1), np.stack([a, c + 1, c], 1)])
         return vertices, faces, np.stack([u, v], axis=1)
 
@@ -140,15 +142,17 @@ class DeformedSphere:
         Parameters
         ----------
         place : str
-            One of :data:`PLACES`.
+            One of :data:`ROUGHNESS_POINTS`.
         within_rad : float
             Angle around it on the neutral sphere, rad, 0.02 to 0.5.
         """
-        if place not in PLACES:
-            raise SphereError(f"place: got {place!r}, expected one of {', '.join(PLACES)}")
+        if place not in ROUGHNESS_POINTS:
+            raise SphereError(
+                f"place: got {place!r}, expected one of {', '.join(ROUGHNESS_POINTS)}"
+            )
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
-        near = self.sphere.points_mm() @ np.asarray(PLACES[place]) > (
+        near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[place]) > (
             self.sphere.radius_mm * math.cos(within_rad)
         )
         variance_s, variance_t = np.var(self.slopes()[near], axis=0).tolist()
@@ -189,8 +193,8 @@ class DeformedSphere:
         inside = px * px + py * py < 0.999
         pz = np.sqrt(np.where(inside, 1.0 - px * px - py * py, 1.0))
         n = self.sphere.texels
-        columns = (px / (1.0 + pz) / REACH + 1.0) * 0.5 * n - 0.5
-        rows = (1.0 - py / (1.0 + pz) / REACH) * 0.5 * n - 0.5
+        columns = (px / (1.0 + pz) / CHART_HALF_SIDE + 1.0) * 0.5 * n - 0.5
+        rows = (1.0 - py / (1.0 + pz) / CHART_HALF_SIDE) * 0.5 * n - 0.5
         down, right = (np.asarray(part) for part in np.gradient(self.height_um))
         scale = 1.0 / self.sphere.pixel_um()
         slope_x, slope_y = (
@@ -236,7 +240,7 @@ def deform(
     height_um : array_like, shape (N, N)
         Neutral relief on its chart, um.
     ratios : sequence of 3 floats
-        Of lengths along x, y, z, > 0; :data:`DEFORMATIONS` has those of the figure.
+        Of lengths along x, y, z, > 0; :data:`DEFORMATION_RATIOS` has those of the figure.
     table : KernelTable
         Kernels by stretch; the paper's forehead by default, held at the ends of its range.
     dynamic : bool

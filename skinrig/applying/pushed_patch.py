@@ -29,12 +29,12 @@ from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_field
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
 
-DIVISIONS = (23, 23, 8)
+BLOCK_DIVISIONS = (23, 23, 8)
 """Boxes of six tetrahedra each: 25,392 in all, as many as the paper's mesh has, about."""
-MOST_ITERATIONS = 30
-SHORTEST_STEP = 1.0 / 64.0
+MAX_NEWTON_ITERATIONS = 30
+MIN_PUSH_STEP = 1.0 / 64.0
 """Of the push, below which a step that does not converge ends the search."""
-TOLERANCE = 1e-7
+RELATIVE_MOVE_TOL = 1e-7
 """Of the displacement's last correction, of the block's width."""
 
 
@@ -56,7 +56,7 @@ class SkinBlock:
     """Thickness, mm, > 0."""
     poisson: float = 0.49
     """Poisson's number, 0.01 to 0.5; 0.5 keeps every volume."""
-    divisions: tuple[int, int, int] = DIVISIONS
+    divisions: tuple[int, int, int] = BLOCK_DIVISIONS
     """Boxes along x, y and z, each of six tetrahedra."""
 
     def __post_init__(self) -> None:
@@ -241,7 +241,7 @@ def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPat
         iterations += count
         if found is None:
             step *= 0.5
-            if step < SHORTEST_STEP / steps:
+            if step < MIN_PUSH_STEP / steps:
                 raise PushDiverged(
                     f"push: found no equilibrium beyond {100 * reached:.0f} % of it, expected a "
                     "weaker push, a finer mesh or a wider contact"
@@ -299,7 +299,7 @@ class _Tissue:
         self.nodes = np.ascontiguousarray(self.mesh.p.T)
         self.corners = np.ascontiguousarray(self.mesh.t.T, np.int64)
         self.inverse_lambda = block.inverse_lambda
-        self.tolerance_mm = TOLERANCE * block.width_mm
+        self.tolerance_mm = RELATIVE_MOVE_TOL * block.width_mm
         bubble = fem.Basis(self.mesh, fem.ElementTetMini(), intorder=5)
         linear = bubble.with_element(fem.ElementTetP1())
         # (T, Q, 5, 3) gradients, (Q, 4) values, (T, Q) weights
@@ -328,7 +328,7 @@ class _Tissue:
         first = np.zeros(free.size)
         first[: -len(self.nodes)][known.reshape(-1)] = (given - begin.nodes_mm)[known]
         state = begin
-        for count in range(1, MOST_ITERATIONS + 1):
+        for count in range(1, MAX_NEWTON_ITERATIONS + 1):
             system = self._system(state)
             if system is None:
                 return None, count
@@ -356,7 +356,7 @@ class _Tissue:
                 return None, count
             if np.abs(moves).max() < self.tolerance_mm:
                 return state, count
-        return None, MOST_ITERATIONS
+        return None, MAX_NEWTON_ITERATIONS
 
     def _system(
         self, state: _State

@@ -24,7 +24,7 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
 
-REGION_PX: Final = 256
+REGION_ATLAS_PX: Final = 256
 """Texels a side of the maps that say whose relief is where, and how large pixels are."""
 SITE_REGIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "forehead": ("forehead", "brows", "temples"),
@@ -32,18 +32,18 @@ SITE_REGIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "chin": ("chin", "lips", "mouth corners", "neck"),
 }
 """Regions of a face that a site's relief stands for."""
-SMALLEST_PATCH_PX: Final = 64
-LONGEST_PER_MM: Final = 1.0
+MIN_PATCH_PX: Final = 64
+MIN_WAVES_PER_MM: Final = 1.0
 """The relief's longest waves: longer ones are the face's own shape (Nagano2015, section 4)."""
-SHORTEST_PER_MM: Final = 25.0
-NYQUIST_SHARE: Final = 0.8
-PIXEL_TOLERANCE: Final = 0.01
+MAX_WAVES_PER_MM: Final = 25.0
+NYQUIST_FRACTION: Final = 0.8
+PIXEL_SIZE_TOL: Final = 0.01
 """Sizes of pixels that count as one: calibrations of one rig differ by less."""
-PLACE_PX: Final = 1024
-BAND_ROWS: Final = 256
-SOURCES: Final = ("patches", "noise")
-EXTRAPOLATIONS: Final = ("hold", "formula")
-ASIDE_FROM_PX: Final = 8192
+POSITION_ATLAS_PX: Final = 1024
+ROWS_PER_NOISE_BAND: Final = 256
+RELIEF_SOURCES: Final = ("patches", "noise")
+EXTRAPOLATION_MODES: Final = ("hold", "formula")
+MAX_EXR_SIDE_PX: Final = 8192
 """Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
 
 Choice = TypeVar("Choice", bound=str)
@@ -121,23 +121,23 @@ class Relief:
     ) -> Relief:
         """Load the mesh and give it the shapes that states need.
 
-        Maps of more than `ASIDE_FROM_PX` go to a folder beside ``out``, as .npy files.
+        Maps of more than `MAX_EXR_SIDE_PX` go to a folder beside ``out``, as .npy files.
 
         Raises
         ------
         ApplyError, BlendShapeError
             For a size, a weight's name or a mesh that cannot be used.
         """
-        if not SMALLEST_PATCH_PX <= size_px <= 65_536:
-            raise ApplyError(f"size: got {size_px}, expected {SMALLEST_PATCH_PX} to 65536 px")
+        if not MIN_PATCH_PX <= size_px <= 65_536:
+            raise ApplyError(f"size: got {size_px}, expected {MIN_PATCH_PX} to 65536 px")
         mesh = blend_shapes.load(path)
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
         shaped, own = _with_states(mesh, list(used))
-        held = one_of("extrapolate", extrapolate, EXTRAPOLATIONS)
+        held = one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES)
         kept: Literal["hold", "formula"] = "hold" if held == "hold" else "formula"
         moved = {n: w for n, w in used.items() if n in shaped.shapes}
         aside = out.with_name(f"{out.name}-large")
-        made_of = one_of("synthesize", source, SOURCES)
+        made_of = one_of("synthesize", source, RELIEF_SOURCES)
         return Relief(
             shaped, moved, own, size_px, site, made_of, kept, seed, aside, _sha256(path), progress
         )
@@ -152,13 +152,13 @@ class Relief:
         rng = np.random.default_rng(self.seed)
         patches = {name: [_patch(name, appearance, sites[name])] for name in names}
         pixels_um = [float(sites[name]["pixel_um"]) for name in names]
-        if max(pixels_um) > (1.0 + PIXEL_TOLERANCE) * min(pixels_um):
+        if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --site"
             )
         regions = _regions(self.mesh, names)
-        large = self.size_px > ASIDE_FROM_PX
+        large = self.size_px > MAX_EXR_SIDE_PX
         neutral: Any = None
         if large:
             self.aside.mkdir(parents=True, exist_ok=True)
@@ -205,7 +205,7 @@ class Relief:
             done.left_out.append(
                 (MICROSTRUCTURE, f"EXR of {self.size_px} px: written to {self.aside.name} as .npy")
             )
-            step = -(-self.size_px // ASIDE_FROM_PX)
+            step = -(-self.size_px // MAX_EXR_SIDE_PX)
             note += f"; every {step}. pixel"
             shown = [np.array(each[::step, ::step]) for each in (neutral, moved.height)]
         else:
@@ -265,9 +265,9 @@ def _with_states(
 
 def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> Float32Array:
     relief = appearance.maps[str(entry["map"])]
-    if min(relief.values.shape) < SMALLEST_PATCH_PX:
+    if min(relief.values.shape) < MIN_PATCH_PX:
         raise ApplyError(
-            f"{site}: a patch of {relief.values.shape} px, expected {SMALLEST_PATCH_PX} px or more "
+            f"{site}: a patch of {relief.values.shape} px, expected {MIN_PATCH_PX} px or more "
             "a side"
         )
     return displacement_synthesis.leveled(
@@ -287,20 +287,22 @@ def _noise(
     """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
     from rigsim.geometry.atlas import spread, unwrap
 
-    finest = NYQUIST_SHARE * 0.5e3 * size_px / float(np.median(scale_um))
-    if finest <= LONGEST_PER_MM:
+    finest = NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
+    if finest <= MIN_WAVES_PER_MM:
         raise ApplyError(
             f"size: {size_px} px show no wave shorter than a millimetre, expected larger maps"
         )
-    band = (LONGEST_PER_MM, min(finest, SHORTEST_PER_MM))
+    band = (MIN_WAVES_PER_MM, min(finest, MAX_WAVES_PER_MM))
     noise = VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
     # places lie smoothly between the texels of a smaller atlas: microns off at most
-    atlas = unwrap(_face(mesh), PLACE_PX)
+    atlas = unwrap(_face(mesh), POSITION_ATLAS_PX)
     places = spread(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)
     target = np.empty((size_px, size_px), np.float32) if out is None else out
-    columns = (np.arange(size_px) + 0.5) * PLACE_PX / size_px - 0.5
-    for top in range(0, size_px, BAND_ROWS):
-        rows = (np.arange(top, min(top + BAND_ROWS, size_px)) + 0.5) * PLACE_PX / size_px - 0.5
+    columns = (np.arange(size_px) + 0.5) * POSITION_ATLAS_PX / size_px - 0.5
+    for top in range(0, size_px, ROWS_PER_NOISE_BAND):
+        rows = (
+            np.arange(top, min(top + ROWS_PER_NOISE_BAND, size_px)) + 0.5
+        ) * POSITION_ATLAS_PX / size_px - 0.5
         at = np.meshgrid(rows, columns, indexing="ij")
         points = np.stack(
             [
@@ -347,7 +349,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
 def _atlas(mesh: BlendShapeMesh) -> Any:
     from rigsim.geometry.atlas import unwrap
 
-    return unwrap(_face(mesh), REGION_PX)
+    return unwrap(_face(mesh), REGION_ATLAS_PX)
 
 
 def _face(mesh: BlendShapeMesh) -> Any:

@@ -29,7 +29,7 @@ from skinrig.arrays import Float64Array, Int64Array
 from skinrig.blend_shapes.errors import BlendShapeFileError
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-COMPONENTS: Final[dict[int, np.dtype[Any]]] = {
+COMPONENT_DTYPES: Final[dict[int, np.dtype[Any]]] = {
     5120: np.dtype("<i1"),
     5121: np.dtype("<u1"),
     5122: np.dtype("<i2"),
@@ -38,14 +38,14 @@ COMPONENTS: Final[dict[int, np.dtype[Any]]] = {
     5126: np.dtype("<f4"),
 }
 """Types of numbers in buffers, by the standard's codes."""
-WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-COMPRESSED: Final = (
+ACCESSOR_WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+COMPRESSION_EXTENSIONS: Final = (
     "KHR_draco_mesh_compression",
     "EXT_meshopt_compression",
     "KHR_meshopt_compression",
 )
-TRIANGLES: Final = 4
-DEEPEST: Final = 1000
+TRIANGLES_MODE: Final = 4
+MAX_NODE_DEPTH: Final = 1000
 """Nodes above a mesh beyond which a file is taken to go in circles."""
 
 
@@ -70,7 +70,7 @@ class _Gltf:
         if not str(version).startswith("2."):
             raise self.wrong(f"got glTF version {version}, expected 2")
         for name in document.get("extensionsRequired", []):
-            if name in COMPRESSED:
+            if name in COMPRESSION_EXTENSIONS:
                 raise self.wrong(f"geometry is compressed by {name}; export it without")
         self.document: dict[str, Any] = document
         self.buffers: dict[int, bytes] = {}
@@ -129,7 +129,7 @@ class _Gltf:
         self, view_number: int, offset: int, count: int, component: int, width: int
     ) -> NDArray[Any]:
         """Return (count, width) numbers of a view of a buffer."""
-        kind = COMPONENTS[component]
+        kind = COMPONENT_DTYPES[component]
         view = self.document["bufferViews"][view_number]
         stride = int(view.get("byteStride", 0)) or kind.itemsize * width
         start = int(view.get("byteOffset", 0)) + offset
@@ -145,14 +145,18 @@ class _Gltf:
         entry = self.document["accessors"][number]
         if entry["type"] != kind:
             raise self.wrong(f"accessor {number}: got {entry['type']}, expected {kind}")
-        component, count, width = int(entry["componentType"]), int(entry["count"]), WIDTHS[kind]
-        if component not in COMPONENTS:
+        component, count, width = (
+            int(entry["componentType"]),
+            int(entry["count"]),
+            ACCESSOR_WIDTHS[kind],
+        )
+        if component not in COMPONENT_DTYPES:
             raise self.wrong(f"accessor {number}: got component type {component}")
         if "bufferView" in entry:
             offset = int(entry.get("byteOffset", 0))
             values = self._rows(int(entry["bufferView"]), offset, count, component, width)
         else:
-            values = np.zeros((count, width), COMPONENTS[component])
+            values = np.zeros((count, width), COMPONENT_DTYPES[component])
         if "sparse" in entry:
             sparse = entry["sparse"]
             n, at, new = int(sparse["count"]), sparse["indices"], sparse["values"]
@@ -211,7 +215,7 @@ def _read(
     count = 0
     for index, primitive in enumerate(mesh["primitives"]):
         where = f"mesh {mesh.get('name', number)!r}, primitive {index}"
-        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+        if primitive.get("mode", TRIANGLES_MODE) != TRIANGLES_MODE:
             raise gltf.wrong(f"{where}: got mode {primitive['mode']}, expected triangles")
         attributes = primitive["attributes"]
         for name in ("POSITION", "TEXCOORD_0"):
@@ -278,7 +282,7 @@ def _transform(gltf: _Gltf, mesh: int) -> Float64Array:
         child: number for number, node in enumerate(nodes) for child in node.get("children", [])
     }
     matrix, here = _local(nodes[shown[0]]), shown[0]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_NODE_DEPTH):
         if here not in parent:
             return matrix
         here = parent[here]

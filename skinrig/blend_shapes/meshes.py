@@ -21,7 +21,7 @@ __all__ = ["BlendShapeError", "BlendShapeFileError", "BlendShapeMesh", "load"]
 EXTENT_RANGE_MM: Final = (1.0, 5000.0)
 """Longest side of a mesh that is believed to be in millimetres."""
 NPZ_KEYS: Final = ("vertices_mm", "uv", "faces", "shape_names", "shape_deltas_mm")
-METRE_MM: Final = 1000.0
+MM_PER_M: Final = 1000.0
 """glTF files are in metres."""
 
 
@@ -148,7 +148,7 @@ def load(
         scale = 1.0
     elif kind in (".gltf", ".glb"):
         vertices, uv, faces, deltas = blend_shape_gltf.read(source, part)
-        scale = METRE_MM
+        scale = MM_PER_M
     elif kind == ".npz":
         vertices, uv, faces, deltas = _read_npz(source)
         scale = 1.0

@@ -70,14 +70,14 @@ def analyse_brdf(
             appearances,
             labels=labels,
             basis=basis,
-            points_each=points or analysing_brdf.POINTS_B,
+            points_each=points or analysing_brdf.N_POINTS_PER_FACE,
             method=how,
             seed=seed,
         )
     elif labels is not None or basis is not None:
         raise UsageError("--labels, --basis: are of measured faces; name their folders")
     else:
-        some = points or analysing_brdf.POINTS_A
+        some = points or analysing_brdf.N_POINTS_PER_DATASET
         found = analysing_brdf.analyse_simulated(
             out,
             points=some,

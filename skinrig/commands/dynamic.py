@@ -202,13 +202,13 @@ def apply_expression(
 
     Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
     """
-    from skinrig.appearances.dynamic import PARTS
+    from skinrig.appearances.dynamic import DYNAMIC_PARTS
     from skinrig.applying import expression as applying
-    from skinrig.applying.relief import EXTRAPOLATIONS, SOURCES, Relief, one_of
+    from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES, Relief, one_of
 
     console = Console(json)
     given = applying.parse_weights(weights)
-    wanted = PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
+    wanted = DYNAMIC_PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
     expression = applying.Expression(
         given,
         normalize=normalize,
@@ -218,8 +218,8 @@ def apply_expression(
         onto=_other_face(onto, landmarks or []),
     )
     relief = None
-    one_of("--synthesize", synthesize, SOURCES)
-    one_of("--extrapolate", extrapolate, EXTRAPOLATIONS)
+    one_of("--synthesize", synthesize, RELIEF_SOURCES)
+    one_of("--extrapolate", extrapolate, EXTRAPOLATION_MODES)
     if mesh is not None:
         relief = Relief.of(
             mesh,

@@ -61,7 +61,7 @@ def edit(
     from skinrig.traits import regions
 
     console = Console(json)
-    order = editing.Order(
+    order = editing.EditRequest(
         traits=parse_amounts("--trait", trait),
         region=region,
         parts=None if parts is None else tuple(p.strip() for p in parts.split(",")),
@@ -78,7 +78,7 @@ def edit(
     )
     rows = [
         (part, key, value)
-        for part in editing.PARTS
+        for part in editing.EDITABLE_PARTS
         for key, value in done.record.get(part, {}).items()
         if isinstance(value, int | float)
     ]
@@ -234,7 +234,7 @@ def analyse_albedo(
         )
     for what, why in found.left_out:
         console.say(f"left out: {what}: {why}")
-    console.say(f"{out}: {', '.join(analysing_albedo.FILES)}")
+    console.say(f"{out}: {', '.join(analysing_albedo.OUTPUT_FILES)}")
     console.document("skinrig.analyse-albedo/1", {"out": out, **told})
 
 

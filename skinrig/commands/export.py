@@ -97,10 +97,16 @@ def export(
     from skinrig.exporting.sessions import light_lists, stokes
 
     console = Console(json)
-    known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME, stokes.NAME)
+    known = (
+        *appearances.APPEARANCE_FORMATS,
+        *brdfs.BRDF_SUFFIXES,
+        *sessions.SESSION_FORMATS,
+        light_lists.LIGHT_LIST_FORMAT,
+        stokes.STOKES_FORMAT,
+    )
     if to not in known:
         raise UnusableError(f"--to: got {to!r}, expected one of {', '.join(known)}")
-    of_maps = (*appearances.FORMATS, *brdfs.SUFFIX)
+    of_maps = (*appearances.APPEARANCE_FORMATS, *brdfs.BRDF_SUFFIXES)
     of_sessions = tuple(name for name in known if name not in of_maps)
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions),
@@ -111,10 +117,10 @@ def export(
                 f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
             )
     names = () if only is None else tuple(name.strip() for name in only.split(","))
-    if to in brdfs.SUFFIX:
+    if to in brdfs.BRDF_SUFFIXES:
         place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)
         done = appearances.export_brdfs(source, out, to=to, place=place, use=use)
-    elif to in appearances.FORMATS:
+    elif to in appearances.APPEARANCE_FORMATS:
         delivery = Delivery(
             unit=unit,
             normal_y=normal_y,
@@ -126,21 +132,21 @@ def export(
             landmarks=tuple(landmarks or ()),
         )
         done = appearances.export_appearance(source, out, to=to, delivery=delivery, use=use)
-    elif to == light_lists.NAME:
+    elif to == light_lists.LIGHT_LIST_FORMAT:
         done = light_lists.export_light_list(
-            source, out, use=sessions.named(use), camera=camera, calibration=calibration
+            source, out, use=sessions.require_use(use), camera=camera, calibration=calibration
         )
-    elif to == stokes.NAME:
+    elif to == stokes.STOKES_FORMAT:
         done = stokes.export_stokes(
             source,
             out,
-            use=sessions.named(use),
+            use=sessions.require_use(use),
             only=names,
             with_errors=with_errors,
             calibration=calibration,
         )
     else:
-        done = sessions.export_session(source, out, to=to, use=sessions.named(use))
+        done = sessions.export_session(source, out, to=to, use=sessions.require_use(use))
     after = NEXT.get(to, "hand the folder on; `ascmhl verify` tells whether it is still whole")
     for what, why in done.left_out:
         console.say(f"left out: {what}: {why}")

@@ -115,7 +115,7 @@ def render(
     from skinrig.errors import UnusableError, UsageError
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
-    from skinrig.rendering.request import Stage, lights_of, subpixels_of
+    from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
 
     console = Console(json)
     if subsurface not in get_args(Subsurface):
@@ -150,16 +150,16 @@ def render(
             seed=seed,
             progress=console.progress,
         )
-        evaluation.tell(console, found)
+        evaluation.print_comparison(console, found)
         if not found["passed"]:
             raise typer.Exit(errors.LIMIT_MISSED)
         return
     if shadow_boundary:
-        subject = figures.Subject.of(appearance[0], mesh=mesh)
+        subject = figures.RenderModel.of(appearance[0], mesh=mesh)
         done = figures.draw_shadow_boundary(subject, out, effort, size_px=size)
         _tell(console, done)
         return
-    stage = Stage.of(rig, calibration)
+    stage = RenderRig.of(rig, calibration)
     camera = stage.camera(view, size_px=size, target_mm=target, fov_deg=fov)
     lights = lights_of(
         stage,
@@ -170,7 +170,7 @@ def render(
         seed=seed,
     )
     subjects = [
-        figures.Subject.of(path, mesh=mesh, translucency=translucency) for path in appearance
+        figures.RenderModel.of(path, mesh=mesh, translucency=translucency) for path in appearance
     ]
     if against is not None:
         done = figures.draw_photograph(

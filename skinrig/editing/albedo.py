@@ -22,9 +22,9 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits import albedo_vectors
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 
-NOISE: Final = 0.05
+MATCHING_NOISE: Final = 0.05
 """Standard deviation of the noise added before matching, in each channel's own."""
-DARKEST: Final = 0.02
+MIN_ALBEDO_FACTOR: Final = 0.02
 """Least factor by which an edit darkens, and the inverse of the most by which it lightens."""
 
 
@@ -39,7 +39,7 @@ class AlbedoEdit:
     Attributes
     ----------
     factor
-        (H, W, 3), `DARKEST` to its inverse; 1 where nothing changes.
+        (H, W, 3), `MIN_ALBEDO_FACTOR` to its inverse; 1 where nothing changes.
     clipped
         Share of the change of statistics that was not possible.
     before, after
@@ -89,7 +89,7 @@ def edit_albedo(
     region: BoolArray,
     share: Float64Array,
     iterations: int = 5,
-    noise: float = NOISE,
+    noise: float = MATCHING_NOISE,
     rng: np.random.Generator,
 ) -> AlbedoEdit:
     """Find what some traits do to an albedo map.
@@ -114,7 +114,7 @@ def edit_albedo(
     iterations
         Of matching.
     noise
-        See `NOISE`.
+        See `MATCHING_NOISE`.
     rng
         Draws the noise.
     """
@@ -137,7 +137,7 @@ def edit_albedo(
     filled = filled * np.asarray(share, np.float32)[..., None]
     texels, _ = chart.read(filled)
     spread = texture_fill.push_pull(texels, chart.on_surface.astype(np.float32)).values  # gutters
-    most = -np.log(DARKEST)
+    most = -np.log(MIN_ALBEDO_FACTOR)
     told = albedo_vectors.telling(space.texture)
     return AlbedoEdit(
         np.exp(np.clip(spread, -most, most)).astype(np.float32),
@@ -153,7 +153,7 @@ def _log_ratio(
     """Return the logarithm of the factor from one encoded map to another."""
     if kind == "quantiles":
         return new - old
-    least = max(DARKEST * float(np.median(old[used])), albedo_vectors.LEAST)
+    least = max(MIN_ALBEDO_FACTOR * float(np.median(old[used])), albedo_vectors.MIN_REFLECTANCE)
     return np.asarray(np.log(np.maximum(new, least) / np.maximum(old, least)))
 
 

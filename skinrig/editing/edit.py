@@ -32,13 +32,13 @@ from skinrig.errors import UsageError
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 
-PARTS: Final = ("albedo", "surface")
-MOST_AMOUNT: Final = 10.0
+EDITABLE_PARTS: Final = ("albedo", "surface")
+MAX_TRAIT_AMOUNT: Final = 10.0
 """Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder) an
 amount: at 10 they reach the least or greatest factor of an edit, and more says nothing more."""
-UNREACHED: Final = 0.5
+MAX_DISTANCE_LEFT: Final = 0.5
 """Share of the distance to the wanted histograms that is left, from which on it is told."""
-STALE: Final = {"lobe_residual": "is of the lobes before the edit"}
+STALE_MAPS: Final = {"lobe_residual": "is of the lobes before the edit"}
 """Maps that an edit of the lobes leaves without meaning."""
 
 
@@ -47,7 +47,7 @@ class EditError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class EditRequest:
     """What to do to an appearance.
 
     Attributes
@@ -57,7 +57,7 @@ class Order:
     region
         One of `common_regions.REGIONS` that the library has: "face", "beard" or "no-beard".
     parts
-        Of `PARTS`; None: where the library tells a trait from chance.
+        Of `EDITABLE_PARTS`; None: where the library tells a trait from chance.
     mask
         Picture of the texture, see `edit_masks.read`.
     spots
@@ -87,15 +87,15 @@ class Order:
         if not self.traits and not self.spots:
             raise UsageError("edit: got neither traits nor spots, expected --trait or --spots")
         for name, amount in self.traits.items():
-            if not abs(amount) <= MOST_AMOUNT:
+            if not abs(amount) <= MAX_TRAIT_AMOUNT:
                 raise EditError(
-                    f"trait {name}: got {amount:g}, expected -{MOST_AMOUNT:g} to {MOST_AMOUNT:g}; "
-                    "faces with a trait and without it differ by 1, and beyond there are no faces "
-                    "that it was learned from"
+                    f"trait {name}: got {amount:g}, expected -{MAX_TRAIT_AMOUNT:g} to "
+                    f"{MAX_TRAIT_AMOUNT:g}; faces with a trait and without it differ by 1, and "
+                    "beyond there are no faces that it was learned from"
                 )
         for part in self.parts or ():
-            if part not in PARTS:
-                raise EditError(f"parts: got {part!r}, expected of {', '.join(PARTS)}")
+            if part not in EDITABLE_PARTS:
+                raise EditError(f"parts: got {part!r}, expected of {', '.join(EDITABLE_PARTS)}")
         if self.iterations < 1:
             raise EditError(
                 f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
@@ -140,7 +140,7 @@ class _Work:
 
 def edit(
     path: Path,
-    order: Order,
+    order: EditRequest,
     *,
     out: Path,
     library: TraitLibrary | None = None,
@@ -188,7 +188,7 @@ def edit(
 
 def edited(
     face: Face,
-    order: Order,
+    order: EditRequest,
     library: TraitLibrary | None = None,
     *,
     progress: Callable[[str], None] | None = None,
@@ -252,7 +252,7 @@ def edited(
     return Edited(appearance, changed, record, tuple(work.warnings))
 
 
-def _opened(order: Order, library: TraitLibrary | None) -> LibraryParts | None:
+def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | None:
     """Return the library's parts, after a check that it has what is asked for."""
     if not order.traits:
         return None
@@ -288,7 +288,7 @@ def _texture_shape(source: SkinAppearance, face: Face) -> tuple[int, int]:
 
 
 def _chosen(
-    asked: Mapping[str, float], parts: LibraryParts, order: Order, work: _Work
+    asked: Mapping[str, float], parts: LibraryParts, order: EditRequest, work: _Work
 ) -> dict[str, dict[str, float]]:
     """Return which traits to use in which part."""
     have: dict[str, Mapping[str, TraitVector]] = {
@@ -296,9 +296,9 @@ def _chosen(
         "surface": {} if parts.surface is None else parts.surface.traits,
     }
     missing = {"albedo": "r_d", "surface": "basis_weight_0"}
-    out: dict[str, dict[str, float]] = {part: {} for part in PARTS}
+    out: dict[str, dict[str, float]] = {part: {} for part in EDITABLE_PARTS}
     for name, amount in asked.items():
-        possible = [p for p in PARTS if name in have[p] and missing[p] in work.maps]
+        possible = [p for p in EDITABLE_PARTS if name in have[p] and missing[p] in work.maps]
         if order.parts is not None:
             use = [p for p in possible if p in order.parts]
         else:
@@ -312,8 +312,9 @@ def _chosen(
         if not use:
             raise EditError(
                 f"trait {name!r}: none of the parts asked for can be edited by it; the traits have "
-                f"it in {', '.join(p for p in PARTS if name in have[p]) or 'no part'}, the "
-                f"appearance has {', '.join(p for p in PARTS if missing[p] in work.maps)}"
+                f"it in {', '.join(p for p in EDITABLE_PARTS if name in have[p]) or 'no part'}, "
+                "the appearance has "
+                f"{', '.join(p for p in EDITABLE_PARTS if missing[p] in work.maps)}"
             )
         for p in use:
             out[p][name] = amount
@@ -325,7 +326,7 @@ def _edit_albedo(
     work: _Work,
     parts: LibraryParts,
     amounts: Mapping[str, float],
-    order: Order,
+    order: EditRequest,
     mask: Float32Array | None,
 ) -> None:
     space = parts.albedo[order.region]
@@ -352,7 +353,7 @@ def _edit_albedo(
     again, _ = back.apply(values, mask)
     work.maps["r_d"] = editing_spots.with_values(source, values)
     good = face_textures.valid_of(source) & (values != source.values).any(axis=-1)
-    if found.after > UNREACHED * found.before and any(abs(a) > 1 for a in amounts.values()):
+    if found.after > MAX_DISTANCE_LEFT * found.before and any(abs(a) > 1 for a in amounts.values()):
         work.warnings.append(
             f"albedo: matching came {100 * (1 - found.after / found.before):.0f} % of the way to "
             "the histograms asked for; smaller amounts can be reached"
@@ -374,7 +375,7 @@ def _edit_surface(
     work: _Work,
     parts: LibraryParts,
     amounts: Mapping[str, float],
-    order: Order,
+    order: EditRequest,
     mask: Float32Array | None,
 ) -> None:
     if parts.surface is None:
@@ -395,9 +396,9 @@ def _edit_surface(
     replaced = surface_mixtures.replaced(
         current, found.mixtures, surface_mixtures.written(found.mixtures, tables)
     )
-    work.maps = {n: m for n, m in replaced.maps.items() if n not in STALE}
+    work.maps = {n: m for n, m in replaced.maps.items() if n not in STALE_MAPS}
     work.files = dict(replaced.files)
-    work.left_out += [(n, f"{STALE[n]}") for n in STALE if n in replaced.maps]
+    work.left_out += [(n, f"{STALE_MAPS[n]}") for n in STALE_MAPS if n in replaced.maps]
     work.record["surface"] = {
         "traits": dict(amounts),
         "clipped_share": found.clipped,
@@ -412,7 +413,7 @@ def _edit_surface(
 def _edit_spots(
     work: _Work,
     spots: Sequence[SpotOrder],
-    order: Order,
+    order: EditRequest,
     mask: Float32Array | None,
     tell: Callable[[str], None],
 ) -> None:
@@ -441,7 +442,7 @@ def _edit_spots(
                 moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
             work.maps["r_d"] = dataclasses.replace(moved, valid=good)
         told.append({**dataclasses.asdict(spot), **one})
-        least = pigment_spots.KINDS[spot.kind].diameter_mm
+        least = pigment_spots.SPOT_KINDS[spot.kind].diameter_mm
         if face.texel_mm() > least:
             work.warnings.append(
                 f"{spot.kind}: are smaller ({least} mm) than a texel ({face.texel_mm():.2f} mm) "
@@ -451,7 +452,7 @@ def _edit_spots(
     work.record["spots_done"] = told
 
 
-def _say_unmarked(work: _Work, order: Order) -> None:
+def _say_unmarked(work: _Work, order: EditRequest) -> None:
     text = "the face has no landmarks: it was unrolled from its foremost point, regions are typical"
     if not work.face.landmarks and (order.region != "face" or order.spots):
         if text not in work.warnings:

@@ -22,12 +22,12 @@ from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
-CAMERA, ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
+DOME_CAMERA, DOME_ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
 """Of the dome's camera RGB."""
-MOST_MELANIN: Final = 0.45
+MAX_SPOT_MELANIN: Final = 0.45
 """Volume fraction, just inside the table."""
-MOST_SPOTS: Final = 50_000
-_PACKING: Final = 0.6
+MAX_SPOTS: Final = 50_000
+_MIN_SPACING_RATIO: Final = 0.6
 """Least distance of spots over that at which they would stand on a square grid."""
 
 
@@ -63,7 +63,7 @@ class SpotKind:
     range_mm: tuple[float, float]
 
 
-KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
+SPOT_KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
     {
         "freckles": SpotKind(2.2, 0.35, 0.02, 0.8, 2.0, (0.8, 6.0)),
         "moles": SpotKind(3.5, 0.3, 0.12, 0.35, 0.03, (1.5, 10.0)),
@@ -113,7 +113,7 @@ def draw(
     Parameters
     ----------
     kind
-        One of `KINDS`.
+        One of `SPOT_KINDS`.
     r_d
         (H, W, 3), whose median color in the mask says what the skin holds.
     position_mm
@@ -123,9 +123,9 @@ def draw(
     mask
         (H, W), 0 to 1: where, and how strongly.
     amount
-        Of pigment, at least 0: 1 as `KINDS` has it, 0 none.
+        Of pigment, at least 0: 1 as `SPOT_KINDS` has it, 0 none.
     density_per_cm2
-        At least 0; as `KINDS` has it by default.
+        At least 0; as `SPOT_KINDS` has it by default.
     rng
         Says where they are.
     table
@@ -134,7 +134,7 @@ def draw(
     Raises
     ------
     SpotError
-        For another kind, negative amounts, an empty mask, or more than `MOST_SPOTS` spots.
+        For another kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
     """
     what = _kind(kind)
     density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
@@ -150,8 +150,8 @@ def draw(
     )
     area = texel_area_mm2(place, np.asarray(surface, np.bool_))
     wanted = float((area * share).sum()) / 100.0 * density
-    if wanted > MOST_SPOTS:
-        raise SpotError(f"density of {kind}: asks for {wanted:.0f} spots, at most {MOST_SPOTS}")
+    if wanted > MAX_SPOTS:
+        raise SpotError(f"density of {kind}: asks for {wanted:.0f} spots, at most {MAX_SPOTS}")
     number = int(np.floor(wanted + rng.random())) if amount > 0 else 0
     centers = _scatter(place[share > 0], (area * share)[share > 0], number, density, rng)
     diameter = what.diameter_mm * np.exp(what.spread * rng.standard_normal(len(centers)))
@@ -184,13 +184,13 @@ def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Arra
 
 
 def _kind(kind: str) -> SpotKind:
-    if kind not in KINDS:
-        raise SpotError(f"spots: got {kind!r}, expected one of {', '.join(KINDS)}")
-    return KINDS[kind]
+    if kind not in SPOT_KINDS:
+        raise SpotError(f"spots: got {kind!r}, expected one of {', '.join(SPOT_KINDS)}")
+    return SPOT_KINDS[kind]
 
 
 def _table() -> ColorTable:
-    return color_table.build(CAMERA, ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
 def _transmitted(
@@ -206,7 +206,7 @@ def _transmitted(
     i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
     c_m = table.c_m_max * (max(int(i), 1) / (size - 1)) ** 3
     c_hd = table.c_hd_max * (int(j) / (size - 1)) ** 3
-    more = max(min(c_m + amount * added, MOST_MELANIN), c_m)
+    more = max(min(c_m + amount * added, MAX_SPOT_MELANIN), c_m)
     ratio = table.lookup(more, c_hd) / table.lookup(c_m, c_hd)
     return np.minimum(np.asarray(ratio, np.float64), 1.0)
 
@@ -224,9 +224,9 @@ def _scatter(
     """
     if number == 0:
         return np.empty((0, 3))
-    least = _PACKING * 10.0 / np.sqrt(density)
+    least = _MIN_SPACING_RATIO * 10.0 / np.sqrt(density)
     drawn = rng.choice(
-        len(points), size=min(12 * number + 64, 20 * MOST_SPOTS), p=weight / weight.sum()
+        len(points), size=min(12 * number + 64, 20 * MAX_SPOTS), p=weight / weight.sum()
     )
     cells: dict[tuple[int, int, int], list[Float64Array]] = {}
     kept: list[Float64Array] = []

@@ -18,11 +18,11 @@ from reconstruction.correspondence.common_parameterization import Chart
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array
 
-SIGMAS: Final = 5.0
+DEPTH_SIGMAS: Final = 5.0
 """Times the usual depth of the skin's grain from which on a spot is one."""
-LEAST_DEPTH: Final = 0.03
+MIN_SPOT_DEPTH: Final = 0.03
 """Natural logarithm of brightness; less is not seen."""
-LONGEST: Final = 3.0
+MAX_ELONGATION: Final = 3.0
 """Length over width of what is still a spot."""
 
 
@@ -103,7 +103,7 @@ def dark_spots(
     closed = ndimage.grey_closing(smooth, footprint=_disc(max(large, 1.5)))
     depth = np.where(good, closed - smooth, 0.0)
     grain = float(np.median(depth[good])) if good.any() else 0.0
-    least = max(SIGMAS * grain, LEAST_DEPTH)
+    least = max(DEPTH_SIGMAS * grain, MIN_SPOT_DEPTH)
     seeds = np.zeros(good.shape, np.bool_)
     found = 0
     # deep thresholds part spots that touch, shallow ones find the faint
@@ -115,7 +115,7 @@ def dark_spots(
                 continue
             rows, columns = np.nonzero(part)
             width = np.sqrt(len(rows) / np.pi)
-            slim = _longest(rows, columns) > LONGEST * width
+            slim = _longest(rows, columns) > MAX_ELONGATION * width
             if not slim and max(0.4 * small, 0.5) <= width <= 1.2 * large:
                 seeds[window] |= part
                 found += 1

@@ -31,7 +31,7 @@ class SpotOrder:
     Attributes
     ----------
     kind
-        One of `pigment_spots.KINDS`.
+        One of `pigment_spots.SPOT_KINDS`.
     amount
         Above 0 adds spots with so much pigment, below 0 removes that share of those there are.
     density_per_cm2
@@ -44,9 +44,9 @@ class SpotOrder:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and more than all spots removed."""
-        if self.kind not in pigment_spots.KINDS:
+        if self.kind not in pigment_spots.SPOT_KINDS:
             raise SpotOrderError(
-                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.KINDS)}"
+                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.SPOT_KINDS)}"
             )
         if not np.isfinite(self.amount) or self.amount < -1.0:
             raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
@@ -82,8 +82,8 @@ def added(
     return values, {
         "drawn": len(drawn.center_mm),
         "transmitted": drawn.transmitted.tolist(),
-        "camera": pigment_spots.CAMERA,
-        "illuminant": pigment_spots.ILLUMINANT,
+        "camera": pigment_spots.DOME_CAMERA,
+        "illuminant": pigment_spots.DOME_ILLUMINANT,
     }
 
 
@@ -96,11 +96,13 @@ def removed(
         face_textures.valid_of(source),
         chart,
         pixel_mm=frame.pixel_mm,
-        range_mm=pigment_spots.KINDS[spot.kind].range_mm,
+        range_mm=pigment_spots.SPOT_KINDS[spot.kind].range_mm,
     )
     part = (np.float32(-spot.amount) * share * found.share)[..., None]
     wanted = source.values * (1 - part) + found.fill * part
-    ratio = np.where(part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.LEAST))
+    ratio = np.where(
+        part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.MIN_REFLECTANCE)
+    )
     gain = _bled(ratio.astype(np.float32), chart.on_surface, share)
     values = np.where(part == 0.0, source.values * gain, wanted)
     values = np.where(gain == 1.0, source.values, values)

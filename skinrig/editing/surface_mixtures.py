@@ -16,7 +16,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT
 from skinrig.arrays import BoolArray, Float64Array
 
-UNUSUAL: Final = 6.0
+OUTLIER_STRENGTH_RATIO: Final = 6.0
 """Times the usual strength from which on a texel does not count: no sample held its lobes down."""
 
 
@@ -78,7 +78,9 @@ class SurfaceMixtures:
         some = total[total > 0]
         if not len(some):
             return np.zeros(len(self.mix))
-        return np.asarray(rows[total < UNUSUAL * float(np.median(some))].mean(axis=0))
+        return np.asarray(
+            rows[total < OUTLIER_STRENGTH_RATIO * float(np.median(some))].mean(axis=0)
+        )
 
     def mean(self, strength: Float64Array) -> Float64Array:
         """Return the mean mixture of materials, (M,)."""

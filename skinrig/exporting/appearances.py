@@ -17,7 +17,7 @@ from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
 
 Write = Callable[[SkinAppearance, Path, Delivery], list[tuple[str, str]]]
 
-FORMATS: Final[Mapping[str, str]] = {
+APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps",
     "mtlx": "materials.materialx",
     "gltf": "materials.gltf",
@@ -28,21 +28,21 @@ FORMATS: Final[Mapping[str, str]] = {
 """Format to the module of this package whose ``write`` makes it: each imports its own libraries."""
 
 
-SURFACES: Final = ("mtlx", "gltf", "usd")
+SURFACE_FORMATS: Final = ("mtlx", "gltf", "usd")
 """Formats of a surface in space, which a dome's maps hold and a photograph's do not."""
-_OF_A_SURFACE: Final = ("position", "normals", "normals_refined", "r_d")
+_DOME_MAPS: Final = ("position", "normals", "normals_refined", "r_d")
 """Maps of which a dome's reconstruction holds one at least."""
 
 
 def writer(to: str) -> Write:
-    """Return what writes a format of `FORMATS`.
+    """Return what writes a format of `APPEARANCE_FORMATS`.
 
     Examples
     --------
-    >>> [writer(to).__name__ for to in FORMATS] == ["write"] * len(FORMATS)
-    True
+    >>> {writer(to).__name__ for to in APPEARANCE_FORMATS}
+    {'write'}
     """
-    write: Write = import_module(f"skinrig.exporting.{FORMATS[to]}").write
+    write: Write = import_module(f"skinrig.exporting.{APPEARANCE_FORMATS[to]}").write
     return write
 
 
@@ -65,7 +65,7 @@ def export_appearance(
     out
         New folder.
     to
-        One of `FORMATS`.
+        One of `APPEARANCE_FORMATS`.
     delivery
         Scene unit, tiles, green of normals, errors, mesh; None: as `Delivery()`.
     use
@@ -89,12 +89,12 @@ def export_appearance(
     ValueError
         Of the format, for maps that it cannot be made of.
     """
-    if to not in FORMATS:
-        raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
+    if to not in APPEARANCE_FORMATS:
+        raise ExportError(f"to: got {to!r}, expected one of {', '.join(APPEARANCE_FORMATS)}")
     target = fresh(out)
     appearance = allowed(appearance_path, use, today=today)
-    if to in SURFACES and not any(name in appearance.maps for name in _OF_A_SURFACE):
-        others = ", ".join(name for name in FORMATS if name not in SURFACES)
+    if to in SURFACE_FORMATS and not any(name in appearance.maps for name in _DOME_MAPS):
+        others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
         raise ExportError(
             f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
             f"{appearance_path} holds {', '.join(appearance.maps) or 'none'}; expected {others}"
@@ -138,8 +138,8 @@ def export_brdfs(
     ExportError
         For an unknown format, or a folder that exists.
     """
-    if to not in brdfs.SUFFIX:
-        raise ExportError(f"to: got {to!r}, expected one of {', '.join(brdfs.SUFFIX)}")
+    if to not in brdfs.BRDF_SUFFIXES:
+        raise ExportError(f"to: got {to!r}, expected one of {', '.join(brdfs.BRDF_SUFFIXES)}")
     target = fresh(out)
     appearance = allowed(appearance_path, use, today=today)
     return sealed(target, lambda part: brdfs.write_brdfs(appearance, part, to=to, place=place), now)

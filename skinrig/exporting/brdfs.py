@@ -19,8 +19,8 @@ from skinrig.errors import UsageError
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
 
-DOCUMENT = "brdfs.json"
-_UP = np.array([0.0, 0.0, 1.0])
+DOCUMENT_FILE = "brdfs.json"
+_SURFACE_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
 class BrdfExportError(ValueError):
@@ -98,13 +98,13 @@ def write_brdfs(
     lobes = skin_reflectance.lobes_of(appearance)
     files: dict[str, object] = {}
     for k in range(lobes.size):
-        name = f"lobe_{k}{SUFFIX[to]}"
+        name = f"lobe_{k}{BRDF_SUFFIXES[to]}"
         told = f"lobe {k}, equal in all channels: highlights have the light's color"
         _write(to, folder / name, _lobe(lobes, k), told, lobes.light_radius_rad)
         files[name] = {"what": told, "light_from_inside": False}
     if place is not None:
         at, entry = _place(appearance, lobes, place)
-        name = f"place{SUFFIX[to]}"
+        name = f"place{BRDF_SUFFIXES[to]}"
         _write(to, folder / name, at, str(entry["what"]), lobes.light_radius_rad)
         files[name] = entry
     document = {
@@ -118,7 +118,7 @@ def write_brdfs(
         "files": files,
     }
     text = json.dumps(document, indent=1, allow_nan=False)
-    (folder / DOCUMENT).write_text(text + "\n", encoding="utf-8")
+    (folder / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
 
 
 def merl_table(brdf: Brdf) -> merl.MerlTable:
@@ -142,7 +142,7 @@ def merl_table(brdf: Brdf) -> merl.MerlTable:
 
 def _lobe(lobes: BrdfBasis, k: int) -> Brdf:
     one = lobes.mixed(np.eye(lobes.size)[k : k + 1])
-    return lambda light, view: one.evaluate(light, view, _UP)[:, 0]
+    return lambda light, view: one.evaluate(light, view, _SURFACE_NORMAL)[:, 0]
 
 
 def _place(
@@ -165,7 +165,7 @@ def _place(
     surface = lobes.mixed(model.weights[near].astype(np.float64).mean(axis=0)[None])
 
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
-        found = np.repeat(surface.evaluate(light, view, _UP), 3, axis=-1)
+        found = np.repeat(surface.evaluate(light, view, _SURFACE_NORMAL), 3, axis=-1)
         if place.diffuse:
             through = 1.0 - fresnel.reflectance(light[:, 2], model.eta)
             through = through * (1.0 - fresnel.reflectance(view[:, 2], model.eta))
@@ -205,9 +205,14 @@ def _write_rgl(path: Path, brdf: Brdf, description: str) -> None:
     rgl.write(path, rgl.of_brdf(brdf, description=description))
 
 
-_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {"merl": _write_merl, "rgl": _write_rgl}
-SUFFIX: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
+_BRDF_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {
+    "merl": _write_merl,
+    "rgl": _write_rgl,
+}
+BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
 
 
 def _write(to: str, path: Path, brdf: Brdf, told: str, light_radius_rad: float) -> None:
-    _WRITERS[to](path, brdf, f"{told}; measured with a light of radius {light_radius_rad:.6g} rad")
+    _BRDF_WRITERS[to](
+        path, brdf, f"{told}; measured with a light of radius {light_radius_rad:.6g} rad"
+    )

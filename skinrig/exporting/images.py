@@ -19,15 +19,14 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
 
-SRGB: Final = "linear sRGB"
-CAMERA: Final = "camera RGB, linear, white balanced"
-DATA: Final = "data"
-REC709: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+SRGB_SPACE: Final = "linear sRGB"
+CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
+DATA_SPACE: Final = "data"
+REC709_CHROMATICITIES: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of sRGB's primaries and D65, for headers."""
-CODES: Final = 65535
-EMPTY_SIDE: Final = 8
+EMPTY_TILE_PX: Final = 8
 """Texels a side of a tile where nothing was measured."""
-RANGES: Final[Mapping[str, tuple[float, float]]] = {
+PNG_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "melanin": (0.0, 0.5),
     "hemoglobin": (0.0, 0.25),
     "normals": (-1.0, 1.0),
@@ -50,7 +49,7 @@ class Image:
     unit
         "1" for numbers without dimension.
     space
-        `SRGB`, `CAMERA` or `DATA`.
+        `SRGB_SPACE`, `CAMERA_SPACE` or `DATA_SPACE`.
     what
         One line for people.
     low, high
@@ -64,7 +63,7 @@ class Image:
     name: str
     values: FloatArray
     unit: str
-    space: str = DATA
+    space: str = DATA_SPACE
     what: str = ""
     low: float | None = None
     high: float | None = None
@@ -78,7 +77,7 @@ class Image:
         known = rows[np.isfinite(rows).all(axis=-1)]
         usual = np.median(known, axis=0) if len(known) else np.zeros(layers.shape[2])
         value = usual if self.filler is None else np.array(self.filler)
-        values = np.empty((EMPTY_SIDE, EMPTY_SIDE, *self.values.shape[2:]), np.float32)
+        values = np.empty((EMPTY_TILE_PX, EMPTY_TILE_PX, *self.values.shape[2:]), np.float32)
         values[...] = value if self.values.ndim == 3 else value[0]
         return replace(
             self,
@@ -118,7 +117,7 @@ class ImageFolder:
                 self.root / names[-1],
                 one.values,
                 {"unit": one.unit, "colorSpace": one.space, "comments": one.what},
-                rec709=one.space == SRGB,
+                rec709=one.space == SRGB_SPACE,
             )
             self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
         return names[0]
@@ -126,7 +125,7 @@ class ImageFolder:
     def png(self, image: Image, folder: str = "png", *, depth: int = 16) -> str:
         """Write a PNG of 16 or 8 bits a tile; return the first's name below the root.
 
-        Colors in `SRGB` are coded by sRGB's curve, all else in proportion.
+        Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
         """
         low, high = coded_range(image)
         names = []
@@ -187,7 +186,7 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
     values = np.nan_to_num(np.asarray(image.values, np.float64))
     shown = values if image.valid is None else values[image.valid]
     low, high = coded_range(image)
-    if image.space == SRGB:
+    if image.space == SRGB_SPACE:
         position = srgb_curve(np.clip(values, 0.0, 1.0))
         encoding = f"sRGB curve (IEC 61966-2-1): value = inverse curve of code / {top}"
     else:
@@ -213,7 +212,7 @@ def coded_range(image: Image) -> tuple[float, float]:
     >>> coded_range(Image(name="a", values=np.array([[1.0, 3.0]]), unit="mm", low=0.0))
     (0.0, 3.0)
     """
-    if image.space == SRGB:
+    if image.space == SRGB_SPACE:
         return 0.0, 1.0
     values = np.nan_to_num(np.asarray(image.values, np.float64))
     shown = values if image.valid is None else values[image.valid]
@@ -239,7 +238,7 @@ def srgb_curve(linear: FloatArray) -> Float64Array:
 
 def png_range(name: str) -> tuple[float | None, float | None]:
     """Return the fixed range of a map's PNG, None and None where it follows the values."""
-    for start, (low, high) in RANGES.items():
+    for start, (low, high) in PNG_RANGES.items():
         if name.startswith(start):
             return low, high
     return None, None
@@ -281,7 +280,7 @@ def write_channels(
         **{name: text for name, text in attributes.items() if text},
     }
     if rec709:
-        header["chromaticities"] = REC709
+        header["chromaticities"] = REC709_CHROMATICITIES
     pixels = {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}
     with OpenEXR.File(header, pixels) as file:
         file.write(str(path))

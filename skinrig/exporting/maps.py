@@ -9,19 +9,26 @@ from typing import Any, Final
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.exporting.images import CAMERA, DATA, SRGB, Image, ImageFolder, png_range
+from skinrig.exporting.images import (
+    CAMERA_SPACE,
+    DATA_SPACE,
+    SRGB_SPACE,
+    Image,
+    ImageFolder,
+    png_range,
+)
 from skinrig.exporting.materials import materialx
 from skinrig.exporting.options import NORMAL_Y, Delivery
-from skinrig.exporting.provenance import ORIENTATION, provenance
+from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
 from skinrig.rendering.geometry import MESH_FILES
 
-DOCUMENT: Final = "maps.json"
+DOCUMENT_FILE: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
-PACKED: Final = "chromophores"
+CHROMOPHORE_PACK: Final = "chromophores"
 """Melanin in R, hemoglobin in G, as texture suppliers deliver them."""
-LINEAR_SRGB: Final = ("picture", "specular_picture", "color")
-CAMERA_RGB: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
+SRGB_MAPS: Final = ("picture", "specular_picture", "color")
+CAMERA_RGB_MAPS: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
 
 
 def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -61,14 +68,14 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         image = _image(name, appearance.maps[name], delivery, on_mesh=on_mesh)
         exr = out.exr(image)
         out.png(image)
-        colored = "color3" if image.space == SRGB else "vector3"
+        colored = "color3" if image.space == SRGB_SPACE else "vector3"
         shown[name] = (exr, colored if image.values.ndim == 3 else "float")
         if delivery.with_errors:
             _errors(name, appearance.maps[name], out)
     if {"melanin", "hemoglobin"} <= set(names):
         packed = _packed(appearance)
         if packed is None:
-            left_out.append((PACKED, "melanin and hemoglobin are of different sizes"))
+            left_out.append((CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes"))
         else:
             out.exr(packed)
             _packed_png(packed, out)
@@ -82,7 +89,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     for name, data in sorted(appearance.files.items()):
         (folder / "files").mkdir(exist_ok=True)
         (folder / "files" / name).write_bytes(data)
-    write_json(folder / DOCUMENT, _document(appearance, delivery, out.records, left_out))
+    write_json(folder / DOCUMENT_FILE, _document(appearance, delivery, out.records, left_out))
     return left_out
 
 
@@ -94,7 +101,7 @@ def _document(
 ) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
-        "orientation": ORIENTATION,
+        "orientation": IMAGE_ORIENTATION,
         "normal_y": "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)",
         "udim": "none" if delivery.udim == "none" else "tile 1001",
         "rig_frame": "mm, +x right, +y up, +z towards the main camera",
@@ -116,11 +123,11 @@ def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Ima
             what = f"{what}; picture's frame: x right, y {'up' if y > 0 else 'down'}".strip("; ")
         else:
             what = f"{what}; rig frame, green is not flipped".strip("; ")
-    space = DATA
-    if values.ndim == 3 and name.startswith(LINEAR_SRGB):
-        space = SRGB
-    elif values.ndim == 3 and name.startswith(CAMERA_RGB):
-        space = CAMERA
+    space = DATA_SPACE
+    if values.ndim == 3 and name.startswith(SRGB_MAPS):
+        space = SRGB_SPACE
+    elif values.ndim == 3 and name.startswith(CAMERA_RGB_MAPS):
+        space = CAMERA_SPACE
         low, high = (0.0, 1.0) if low is None else (low, high)
     return Image(
         name=name,
@@ -170,7 +177,9 @@ def _packed(appearance: SkinAppearance) -> Image | None:
         valid &= True if one.valid is None else one.valid
     layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
     what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
-    return Image(name=PACKED, values=np.stack(layers, axis=-1), unit="1", what=what, valid=valid)
+    return Image(
+        name=CHROMOPHORE_PACK, values=np.stack(layers, axis=-1), unit="1", what=what, valid=valid
+    )
 
 
 def _packed_png(packed: Image, out: ImageFolder) -> None:

@@ -12,16 +12,17 @@ from skinrig.errors import UnusableError, UsageError
 
 UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
+M_PER_MM: Final = UNITS_M["mm"]
 NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
 """Sign of a normal map's green: +Y up (OpenGL, glTF, Blender, Maya) or down (DirectX, Unreal)."""
 FIRST_TILE: Final = 1001
 """UDIM tile of texture coordinates 0 to 1, which maps are of."""
-TILES: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
+TILE_SEPARATORS: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
 """What stands between a texture's name and the number of its tile."""
-UDIM: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "underscore": "_<UDIM>"}
+UDIM_TOKENS: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "underscore": "_<UDIM>"}
 """The same in a material file."""
 
-_WORD = re.compile(r"[a-z][a-z0-9_]{0,63}")
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +36,7 @@ class Delivery:
     normal_y
         Of `NORMAL_Y`.
     udim
-        Of `TILES`. Maps are those of tile 1001; a mesh may reach over more.
+        Of `TILE_SEPARATORS`. Maps are those of tile 1001; a mesh may reach over more.
     with_errors
         Whether standard errors and masks are written beside the values.
     only
@@ -63,12 +64,12 @@ class Delivery:
         for option, value, known in (
             ("--unit", self.unit, UNITS_M),
             ("--normal-y", self.normal_y, NORMAL_Y),
-            ("--udim", self.udim, TILES),
+            ("--udim", self.udim, TILE_SEPARATORS),
         ):
             if value is not None and value not in known:
                 raise UnusableError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
         for name in self.only:
-            if not _WORD.fullmatch(name):
+            if not _NAME_PATTERN.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names joined by commas")
 
     def unit_or(self, default: str) -> str:
@@ -84,8 +85,8 @@ class Delivery:
         'normal_1001.png'
         """
         number = "" if self.udim == "none" else str(tile)
-        return f"{name}{TILES[self.udim]}{number}.{suffix}"
+        return f"{name}{TILE_SEPARATORS[self.udim]}{number}.{suffix}"
 
     def referred(self, name: str, suffix: str) -> str:
         """Return a texture's name as a material file refers to all its tiles."""
-        return f"{name}{UDIM[self.udim]}.{suffix}"
+        return f"{name}{UDIM_TOKENS[self.udim]}.{suffix}"

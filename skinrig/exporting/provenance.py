@@ -7,7 +7,7 @@ from typing import Any, Final
 from model.skin import SkinAppearance
 from skinrig import consent
 
-ORIENTATION: Final = (
+IMAGE_ORIENTATION: Final = (
     "row 0 of every image is its top; of a texture that is v = 1, with (0, 0) bottom left"
 )
 

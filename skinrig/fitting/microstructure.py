@@ -21,7 +21,7 @@ from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import MICROSTRUCTURE, Part
 
-SITE = re.compile(r"[a-z][a-z0-9_]{0,31}")
+SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 
 class MicrostructureFitError(ValueError):
@@ -144,13 +144,13 @@ def fit_microstructure(
 
 def _site_of(given: Path) -> tuple[str, Path]:
     site, equals, path = str(given).partition("=")
-    if equals and SITE.fullmatch(site):
+    if equals and SITE_PATTERN.fullmatch(site):
         folder = Path(path)
     else:
         folder = given
         site = re.sub(r"^appearance-?(gradient-?)?", "", given.name) or "skin"
     site = site.replace("-", "_").lower()
-    if not SITE.fullmatch(site):
+    if not SITE_PATTERN.fullmatch(site):
         raise MicrostructureFitError(
             f"{given}: got site {site!r}, expected a-z, 0-9 and _; name it as SITE={folder}"
         )

@@ -26,11 +26,11 @@ FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
 }
 """Places of the simulator's mean head, mm to the right and up of the tip of the nose as seen from
 the front; chin is below it. Left and right as seen in the picture."""
-GRID: Final = 256
+GRID_SIDE: Final = 256
 """Places a side that translucency is interpolated at before it is laid on the texture."""
-NEAR_MM: Final = 15.0
+MAX_SITE_DISTANCE_MM: Final = 15.0
 """Farther than this from every measured texel a place is not on the scan."""
-ROUND_MM: Final = (40.0, 200.0)
+HEAD_RADIUS_RANGE_MM: Final = (40.0, 200.0)
 """Radii of what counts as a head; other shapes are measured along x and y."""
 
 
@@ -131,7 +131,7 @@ def place(
             wanted = at_mm[min(int(row), height - 1), min(int(column), width - 1)]
         elif name in FROM_NOSE_MM:
             wanted, off_mm = _mean_place(name, at_mm[known])
-            if off_mm > NEAR_MM:
+            if off_mm > MAX_SITE_DISTANCE_MM:
                 left_out.append((name, f"the scan ends {off_mm:.0f} mm before it"))
                 continue
             guessed.append(name)
@@ -140,7 +140,7 @@ def place(
             continue
         away = np.where(known, np.linalg.norm(at_mm - wanted, axis=-1), np.inf)
         texel = np.unravel_index(np.argmin(away), away.shape)
-        if away[texel] > NEAR_MM:
+        if away[texel] > MAX_SITE_DISTANCE_MM:
             left_out.append((name, f"the scan ends {away[texel]:.0f} mm before it"))
             continue
         found = at_mm[texel]
@@ -240,7 +240,7 @@ class _Chart:
                 columns, (girth[:, [0, 2]] ** 2).sum(axis=1), rcond=None
             )
             square = c + a**2 + b**2
-            if rank == 3 and ROUND_MM[0] ** 2 < square < ROUND_MM[1] ** 2:
+            if rank == 3 and HEAD_RADIUS_RANGE_MM[0] ** 2 < square < HEAD_RADIUS_RANGE_MM[1] ** 2:
                 axis, radius = (float(a), float(b)), math.sqrt(square)
         free = _Chart(axis, radius, np.zeros(2), np.ones(2))
         over = free.coordinates(points_mm)
@@ -259,9 +259,12 @@ class _Chart:
         """Return values and standard errors, (H, W, 6), at the places of texels, linear."""
         both = np.concatenate([found.values, found.stderr], axis=-1)
         share = self.coordinates(points_mm) / self.size_mm
-        x = np.clip(share[..., 0] * GRID - 0.5, 0.0, GRID - 1.0)
-        y = np.clip((1.0 - share[..., 1]) * GRID - 0.5, 0.0, GRID - 1.0)
-        i, j = np.minimum(y.astype(np.intp), GRID - 2), np.minimum(x.astype(np.intp), GRID - 2)
+        x = np.clip(share[..., 0] * GRID_SIDE - 0.5, 0.0, GRID_SIDE - 1.0)
+        y = np.clip((1.0 - share[..., 1]) * GRID_SIDE - 0.5, 0.0, GRID_SIDE - 1.0)
+        i, j = (
+            np.minimum(y.astype(np.intp), GRID_SIDE - 2),
+            np.minimum(x.astype(np.intp), GRID_SIDE - 2),
+        )
         p, q = (y - i)[..., None], (x - j)[..., None]
         upper = both[i, j] * (1.0 - q) + both[i, j + 1] * q
         lower = both[i + 1, j] * (1.0 - q) + both[i + 1, j + 1] * q
@@ -276,7 +279,7 @@ def _interpolated(chart: _Chart, sites: Sequence[Site]) -> TranslucencyMap:
         np.clip(at, 0.0, 1.0),
         np.where(good, sigma_tr, 1.0),
         np.array([site.stderr_per_mm for site in sites]),
-        (GRID, GRID),
+        (GRID_SIDE, GRID_SIDE),
         valid=good,
         names=[site.name for site in sites],
         texture_mm=(float(chart.size_mm[0]), float(chart.size_mm[1])),

@@ -19,7 +19,7 @@ from skinrig.errors import UsageError
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import PlacedTranslucency
 
-KEY = "reflectance_model"
+REFLECTANCE_KEY = "reflectance_model"
 """Of `parameters`: how the translucency of a model came about."""
 
 
@@ -109,7 +109,7 @@ def fit_reflectance(
             "assumed": assumed,
             consent.CONSENT_KEY: agreed,
             "appearances": [path.name for path in (dome, probe) if path is not None],
-            KEY: _record(placed),
+            REFLECTANCE_KEY: _record(placed),
         },
         inputs={**surface.inputs, **inputs},
         versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},

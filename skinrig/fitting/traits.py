@@ -30,9 +30,9 @@ from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 from skinrig.traits.labels import Labels
 
-RANK: Final = 8
+MAX_SURFACE_RANK: Final = 8
 """Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
-LEAST_PIXELS: Final = 200
+MIN_REGION_PIXELS: Final = 200
 """Valid pixels of the common map below which a region says nothing."""
 
 
@@ -125,7 +125,7 @@ def fit_traits(
     texture = spaces.pop("texture")
     surface = _surface(faces, table, basis, contrast, seed, left_out)
     if surface is not None:
-        spaces[regions.SURFACE] = surface
+        spaces[regions.SURFACE_SPACE] = surface
     library = TraitLibrary(
         spaces,
         "measured" if all(f.appearance.source == "measured" for f in faces) else "simulated",
@@ -144,7 +144,7 @@ def fit_traits(
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),
-        {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
+        {regions.TEXTURE_SPACE_FILE: regions.texture_bytes(texture)},
     )
     _write(out, library)
     rows, warnings = summary(library)
@@ -183,7 +183,7 @@ def albedo_spaces(
     for region in ("face", "beard", "no-beard"):
         inside = common_regions.region(region, frame)
         fewest = min(int((inside & one.valid).sum()) for one in samples)
-        if fewest < LEAST_PIXELS:
+        if fewest < MIN_REGION_PIXELS:
             left_out.append((f"albedo of {region}", f"a face shows {fewest} pixels of it"))
             continue
         rows = [
@@ -283,7 +283,7 @@ def _surface(
     strength = tables.strength()
     means = np.array([one.mean(strength) for one in found])
     products = tables.kinship() * np.outer(strength, strength)
-    rank = min(RANK, len(means) - 1)
+    rank = min(MAX_SURFACE_RANK, len(means) - 1)
     # the paper's: traits in the space of few non-negative lobes of the population
     mix = brdf_basis.reduce(means, rank, basis=tables, seed=seed)[1]
     return TraitSpace.fit(

@@ -24,10 +24,10 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import WRINKLES, Part
 from skinrig.arrays import BoolArray, Float32Array
 
-STATE = re.compile(r"[a-z][a-z0-9_]{0,31}")
-NORMALS = ("normals_refined", "normals")
+STATE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
+NORMAL_MAPS = ("normals_refined", "normals")
 """Maps that are taken, the better first."""
-ZONES = 8
+N_ZONES = 8
 """As many as Jimenez2011 stores in two RGBA masks."""
 
 
@@ -103,7 +103,7 @@ def fit_wrinkles(
         small = min(mask_size, side)
         found_zones = fit_zones(
             amplitudes(neutral, measured, size=(small, small)),
-            zones=ZONES,
+            zones=N_ZONES,
             rng=np.random.default_rng(seed),
         )
         stack = found_zones.masks
@@ -150,7 +150,7 @@ def fit_wrinkles(
 
 def _state_of(given: Path) -> tuple[str, Path]:
     state, equals, path = str(given).partition("=")
-    if equals and STATE.fullmatch(state):
+    if equals and STATE_PATTERN.fullmatch(state):
         return state, Path(path)
     told = store.read_document(given).parameters.get("state")
     if not isinstance(told, str) or not told:
@@ -201,7 +201,7 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
         shape = tangent.values.shape[:2]
         valid = np.ones(shape, bool) if tangent.valid is None else tangent.valid
         return _as_maps(tangent.values, tangent.stderr, valid)
-    name = next((name for name in NORMALS if name in maps), None)
+    name = next((name for name in NORMAL_MAPS if name in maps), None)
     if name is None or "position" not in maps:
         raise WrinkleInputError(
             f"{folder}: holds no normals with positions, expected a dome session reconstructed "

@@ -12,9 +12,9 @@ from model.skin_reflectance import SkinReflectance
 from reconstruction import brdf_basis
 from skinrig.arrays import Float64Array
 
-POINTS: Final = 5_000
+FACTORIZED_TEXELS: Final = 5_000
 """Texels, drawn at random, that the mixtures are found on."""
-SWEEPS: Final = 60
+DESCENT_SWEEPS: Final = 60
 """Passes over the shares of all texels; each sets one share to its best while others stand."""
 
 
@@ -52,7 +52,7 @@ def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> S
         return model
     shares = model.weights.reshape(-1, model.lobes.size).astype(np.float64)
     known = np.flatnonzero(model.valid.reshape(-1) & (shares.sum(axis=-1) > 0.0))
-    drawn = np.sort(rng.permutation(known)[:POINTS])
+    drawn = np.sort(rng.permutation(known)[:FACTORIZED_TEXELS])
     seed = int(rng.integers(2**31))
     _, mix, _ = brdf_basis.reduce(shares[drawn], rank, basis=model.lobes, seed=seed)
     fewer = nearest_shares(shares, mix, model.lobes)
@@ -83,7 +83,7 @@ def nearest_shares(shares: Float64Array, mix: Float64Array, lobes: BrdfBasis) ->
     wanted = shares @ gram @ mix.T
     size = np.maximum(np.diag(square), 1e-300)
     found = np.zeros_like(wanted)
-    for _ in range(SWEEPS):
+    for _ in range(DESCENT_SWEEPS):
         for k in range(len(mix)):
             rest = wanted[:, k] - found @ square[:, k] + found[:, k] * size[k]
             found[:, k] = np.maximum(rest / size[k], 0.0)

@@ -15,7 +15,7 @@ from skinrig.arrays import Float32Array, Float64Array
 Camera = CameraPose
 """Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s centre is (0, 0)."""
 
-MOST_PX: Final = 16_384
+MAX_SIDE_PX: Final = 16_384
 """Longest side of a rendering."""
 
 
@@ -67,8 +67,10 @@ def looking_at(
     if not 0.0 < fov_deg < 170.0:
         raise CameraError(f"fov: got {fov_deg} degrees, expected above 0 and below 170")
     columns, rows = size_px
-    if not (2 <= columns <= MOST_PX and 2 <= rows <= MOST_PX):
-        raise CameraError(f"size: got {columns} x {rows}, expected 2 to {MOST_PX} pixels a side")
+    if not (2 <= columns <= MAX_SIDE_PX and 2 <= rows <= MAX_SIDE_PX):
+        raise CameraError(
+            f"size: got {columns} x {rows}, expected 2 to {MAX_SIDE_PX} pixels a side"
+        )
     back = place - target
     right = np.cross(upward, back)
     if not np.linalg.norm(back) > 0.0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
@@ -107,8 +109,10 @@ def binned(camera: Camera, factor: float) -> Camera:
     matrix[:2] /= factor
     matrix[:2, 2] += 0.5 / factor - 0.5  # a pixel's centre is at a whole number
     columns, rows = (int(side / factor + 1e-6) for side in camera.image_size)
-    if not (1 <= columns <= MOST_PX and 1 <= rows <= MOST_PX):
-        raise CameraError(f"size: got {columns} x {rows}, expected 1 to {MOST_PX} pixels a side")
+    if not (1 <= columns <= MAX_SIDE_PX and 1 <= rows <= MAX_SIDE_PX):
+        raise CameraError(
+            f"size: got {columns} x {rows}, expected 1 to {MAX_SIDE_PX} pixels a side"
+        )
     return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
 
 

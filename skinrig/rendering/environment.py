@@ -19,9 +19,9 @@ from model import store
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light, LightError
 
-WIDEST_RAD: Final = 0.35
+MAX_LIGHT_RADIUS_RAD: Final = 0.35
 """Largest angular radius of a light that stands for a part of the map."""
-MOST_LIGHTS: Final = 65_536
+MAX_LIGHTS: Final = 65_536
 
 
 def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
@@ -69,7 +69,8 @@ def environment_lights(
     Returns
     -------
     tuple of Light
-        Their angular radius is that of the solid angle that each stands for, at most `WIDEST_RAD`.
+        Their angular radius is that of the solid angle that each stands for, at most
+        `MAX_LIGHT_RADIUS_RAD`.
 
     Raises
     ------
@@ -88,8 +89,8 @@ def environment_lights(
         raise LightError(f"environment: got shape {image.shape}, expected (H, W, 3) of 2 or more")
     if not (np.isfinite(image).all() and image.min() >= 0.0):
         raise LightError("environment: got negative or non-finite values, expected radiances")
-    if not 1 <= count <= MOST_LIGHTS:
-        raise LightError(f"environment lights: got {count}, expected 1 to {MOST_LIGHTS}")
+    if not 1 <= count <= MAX_LIGHTS:
+        raise LightError(f"environment lights: got {count}, expected 1 to {MAX_LIGHTS}")
     towards, solid = directions(*image.shape[:2])
     power = image.mean(axis=-1) * solid
     if not power.sum() > 0.0:
@@ -104,7 +105,7 @@ def environment_lights(
     chance = power.reshape(-1)[pixel] / running[-1]
     share = solid.reshape(-1)[pixel] / (chance * count)  # solid angle that each light stands for
     color = image.reshape(-1, 3)[pixel] * (share / math.pi)[:, None]
-    radius = np.minimum(np.sqrt(share / math.pi), WIDEST_RAD)
+    radius = np.minimum(np.sqrt(share / math.pi), MAX_LIGHT_RADIUS_RAD)
     return tuple(
         Light(
             name="environment",

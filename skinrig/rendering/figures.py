@@ -25,9 +25,9 @@ from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
-from skinrig.rendering.shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
+from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
 
-UNIT = (
+RADIANCE_UNIT = (
     "radiance over that of a perfect white Lambertian patch that faces a light of intensity 1; "
     "camera RGB, white balanced"
 )
@@ -48,7 +48,7 @@ class Effort:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Subject:
+class RenderModel:
     """A fitted model on a mesh."""
 
     path: Path
@@ -63,14 +63,16 @@ class Subject:
         return self.laid.model
 
     @staticmethod
-    def of(path: Path, *, mesh: Path | None = None, translucency: str | None = None) -> Subject:
+    def of(path: Path, *, mesh: Path | None = None, translucency: str | None = None) -> RenderModel:
         """Read an appearance and lay its maps on its own mesh, or on another of the same layout."""
         appearance, model = read_model(path, translucency=translucency)
         if mesh is None:
-            return Subject(path, appearance, FittedSurface.of(model, own_mesh(appearance)), "own")
+            return RenderModel(
+                path, appearance, FittedSurface.of(model, own_mesh(appearance)), "own"
+            )
         other = read_mesh(mesh)
         laid = FittedSurface.of(model, other, rest=own_mesh(appearance))
-        return Subject(path, appearance, laid, str(mesh))
+        return RenderModel(path, appearance, laid, str(mesh))
 
     def record(self) -> dict[str, Any]:
         """Return what a rendering's record says of the model."""
@@ -88,7 +90,7 @@ class Subject:
 
 
 def draw(
-    subject: Subject,
+    subject: RenderModel,
     camera: Camera,
     lights: Sequence[Light],
     out: Path,
@@ -138,7 +140,7 @@ def draw(
 
 
 def draw_photograph(
-    subject: Subject,
+    subject: RenderModel,
     session: Path,
     view: str,
     light: str,
@@ -235,7 +237,7 @@ def component_panels(
 
 
 def draw_bases(
-    subjects: Sequence[Subject],
+    subjects: Sequence[RenderModel],
     ranks: Sequence[int],
     camera: Camera,
     lights: Sequence[Light],
@@ -310,7 +312,7 @@ def draw_bases(
 
 
 def draw_shadow_boundary(
-    subject: Subject, out: Path, effort: Effort, *, size_px: int
+    subject: RenderModel, out: Path, effort: Effort, *, size_px: int
 ) -> dict[str, Any]:
     """Render a shadow's edge by the paper's two extremes of sigma_tr, on face and flat patch.
 
@@ -326,7 +328,7 @@ def draw_shadow_boundary(
         Columns of each picture.
     """
     folder.check(out)
-    media = {"most_translucent": MOST_TRANSLUCENT, "least_translucent": LEAST_TRANSLUCENT}
+    media = {"most_translucent": MIN_SIGMA_TR_PER_MM, "least_translucent": MAX_SIGMA_TR_PER_MM}
     rows, widths = [], []
     images: dict[str, Float32Array] = {}
     start = time.perf_counter()
@@ -349,7 +351,7 @@ def draw_shadow_boundary(
         rows.append(row)
     title = (
         "Shadow boundary by sigma_tr of red, green, blue in 1/mm; the least sigma_tr is the most "
-        f"translucent skin; {shadow.WIDTH_MM:g} mm across"
+        f"translucent skin; {shadow.BOUNDARY_WIDTH_MM:g} mm across"
     )
     return folder.write(
         out,
@@ -358,7 +360,7 @@ def draw_shadow_boundary(
         document={
             **subject.record(),
             "kind": "shadow boundary",
-            "unit": UNIT,
+            "unit": RADIANCE_UNIT,
             "boundaries": widths,
             "seconds": time.perf_counter() - start,
             "samples": effort.subpixels**2,
@@ -400,8 +402,8 @@ def _rendered(
 
 
 def _of_rank(
-    subjects: Sequence[Subject], rank: int, effort: Effort
-) -> tuple[Subject, FittedSurface]:
+    subjects: Sequence[RenderModel], rank: int, effort: Effort
+) -> tuple[RenderModel, FittedSurface]:
     enough = [s for s in subjects if s.model.lobes.size >= rank]
     if not enough:
         reduced(subjects[0].model, rank, rng=np.random.default_rng(effort.seed))
@@ -421,7 +423,7 @@ def _difference(one: Float32Array, other: Float32Array, lit: BoolArray) -> float
 
 
 def _record(
-    subjects: Sequence[Subject],
+    subjects: Sequence[RenderModel],
     camera: Camera,
     lights: Sequence[Light],
     effort: Effort,
@@ -436,7 +438,7 @@ def _record(
         "appearances": [subject.path for subject in subjects],
         "assumed": list(told),
         consent.CONSENT_KEY: consent.merge_consent(*(subject.appearance for subject in subjects)),
-        "unit": UNIT,
+        "unit": RADIANCE_UNIT,
         "view": {
             "name": camera.serial,
             "place_mm": camera.center_mm,

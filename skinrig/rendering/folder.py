@@ -15,7 +15,7 @@ from model import store
 from skinrig.arrays import Float32Array
 from skinrig.console import plain
 
-DOCUMENT: Final = "render.json"
+DOCUMENT_FILE: Final = "render.json"
 SCHEMA: Final = "skinrig.render/1"
 
 
@@ -31,7 +31,9 @@ def check(out: Path) -> None:
     RenderingFolderError
         ``out`` exists and is neither empty nor an older rendering.
     """
-    if out.is_file() or (out.is_dir() and not (out / DOCUMENT).is_file() and any(out.iterdir())):
+    if out.is_file() or (
+        out.is_dir() and not (out / DOCUMENT_FILE).is_file() and any(out.iterdir())
+    ):
         raise RenderingFolderError(
             f"{out}: exists and is no rendering; nothing was written: name another folder"
         )
@@ -80,7 +82,7 @@ def write(
         files = sorted(path.name for path in fresh.iterdir())
         record = plain({"schema": SCHEMA, **document, "out": out, "files": files})
         text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
-        (fresh / DOCUMENT).write_text(text + "\n", encoding="utf-8")
+        (fresh / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
         if out.exists():
             out.rename(old)
         try:

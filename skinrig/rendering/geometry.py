@@ -21,18 +21,18 @@ from skinrig.rendering.lookup_kernels import look_up
 
 MESH_FILES: Final = ("mesh.obj", "mesh.ply")
 """Names under which an appearance holds the mesh that its maps lie on."""
-SAME_MM: Final = 1.0
+MAX_SAME_MESH_MM: Final = 1.0
 """Median distance from the maps' places up to which a mesh is the one they were made on."""
-FOREIGN_MM: Final = 40.0
+MAX_LAYOUT_DISTANCE_MM: Final = 40.0
 """Median distance from which on texture coordinates cannot be of the same layout."""
-LEAST_SHARE: Final = 0.2
+MIN_COVERED_FRACTION: Final = 0.2
 """Least share of a mesh's texels that the maps must hold values for."""
-SPREAD: Final = 4
-AROUND: Final = 8
+FRAME_DILATION_STEPS: Final = 4
+N_NEAREST_TEXELS: Final = 8
 """Nearest texels that stand in where a point has none of its own."""
-SPARSE: Final = 8_000
+N_SPARSE_TEXELS: Final = 8_000
 """Texels, drawn at random, that stand in farther away: their mean is smooth."""
-LEAST_BLEND: Final = 0.01
+MIN_BLEND_WEIGHT: Final = 0.01
 """Least share of the four texels around a point that must be of its place."""
 
 
@@ -112,22 +112,22 @@ class FittedSurface:
         atlas = unwrap(mesh, width)
         both = atlas.covered & model.valid
         share = float(np.sum(both)) / max(float(np.sum(atlas.covered)), 1.0)
-        if share < LEAST_SHARE:
+        if share < MIN_COVERED_FRACTION:
             raise GeometryError(
                 f"mesh: the maps hold values for {100 * share:.0f} % of it, expected at least "
-                f"{100 * LEAST_SHARE:.0f} %; its texture coordinates are not those of the maps: "
-                "export it with the layout of the appearance's own mesh"
+                f"{100 * MIN_COVERED_FRACTION:.0f} %; its texture coordinates are not those of "
+                "the maps: export it with the layout of the appearance's own mesh"
             )
         apart = np.linalg.norm(atlas.position_mm[both] - model.position_mm[both], axis=-1)
         median = float(np.median(apart))
-        if median > FOREIGN_MM:
+        if median > MAX_LAYOUT_DISTANCE_MM:
             raise GeometryError(
                 f"mesh: its points lie {median:.0f} mm (median) from where the maps have them, "
-                f"expected less than {FOREIGN_MM:.0f} mm; its texture coordinates are not those of "
-                "the maps, or it stands elsewhere"
+                f"expected less than {MAX_LAYOUT_DISTANCE_MM:.0f} mm; its texture coordinates are "
+                "not those of the maps, or it stands elsewhere"
             )
         moved = rest is not None and not _same(mesh, rest)
-        if rest is None and median > SAME_MM:
+        if rest is None and median > MAX_SAME_MESH_MM:
             raise GeometryError(
                 f"mesh: lies {median:.1f} mm (median) from the maps' own places; normals in the "
                 "rig's frame fit only the mesh that they were measured on: give that one, too"
@@ -193,7 +193,7 @@ class FittedSurface:
             share,
         )
         lobes = self.model.weights.shape[-1]
-        measured = share > LEAST_BLEND
+        measured = share > MIN_BLEND_WEIGHT
         lost = np.flatnonzero(~measured)
         if len(lost):
             rows[lost], near = self._around(point[lost])
@@ -207,7 +207,7 @@ class FittedSurface:
         """Return means of known texels around points, and where one is within its own width."""
         if not self._trees:
             every = np.flatnonzero(self._known)
-            some = np.sort(np.random.default_rng(0).permutation(every)[:SPARSE])
+            some = np.sort(np.random.default_rng(0).permutation(every)[:N_SPARSE_TEXELS])
             place = self.atlas.position_mm.reshape(-1, 3).astype(np.float64)
             self._trees.extend((cKDTree(place[t]), t) for t in (every, some))
         means, near = self._mean(*self._trees[0], point)
@@ -220,7 +220,7 @@ class FittedSurface:
         self, tree: cKDTree, texels: NDArray[np.intp], point: Float32Array
     ) -> tuple[Float32Array, BoolArray]:
         """Return means of the nearest texels by inverse squares, and where one is near."""
-        count = min(AROUND, len(texels))
+        count = min(N_NEAREST_TEXELS, len(texels))
         distance, index = tree.query(point.astype(np.float64), k=range(1, count + 1))
         found = texels[index]
         weight = 1.0 / np.maximum(distance, 1e-3) ** 2
@@ -344,7 +344,7 @@ def unit(vectors: ArrayLike) -> Float32Array:
 def _frames(atlas: Atlas) -> Float64Array:
     """Return the tangents along u and v and the normal, as rows, shape (N, N, 3, 3)."""
     layers = np.concatenate([atlas.dp_du_mm, atlas.dp_dv_mm, atlas.normal], axis=-1)
-    wide = spread(layers, atlas.covered, steps=SPREAD)
+    wide = spread(layers, atlas.covered, steps=FRAME_DILATION_STEPS)
     return wide.reshape(atlas.size, atlas.size, 3, 3).astype(np.float64)
 
 

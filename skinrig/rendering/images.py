@@ -13,18 +13,18 @@ from numpy.typing import ArrayLike
 from skinrig.arrays import UInt8Array
 from skinrig.drawing import png
 
-BRIGHT: Final = 0.75
+BRIGHT_SKIN_LEVEL: Final = 0.75
 """Linear value at which the brightest skin is shown."""
-PERCENTILE: Final = 99.0
+BRIGHT_SKIN_PERCENTILE: Final = 99.0
 """Share of skin, %, that stays below it: highlights are few."""
-KNEE: Final = 0.8
+TONE_KNEE: Final = 0.8
 """Linear value up to which tones are shown as they are; above they are pressed below 1."""
 MARGIN_PX: Final = 8
 LABEL_PX: Final = 26
 
 
 def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
-    """Return the factor that shows skin well: its brightest percent at `BRIGHT`; 1 for darkness.
+    """Return the factor that puts the brightest skin at `BRIGHT_SKIN_LEVEL`; 1 if it is dark.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
     3.0
     """
     light = np.asarray(radiance, np.float64).max(axis=-1)[np.asarray(coverage) > 0.5]
-    top = float(np.percentile(light, PERCENTILE)) if light.size else 0.0
-    return BRIGHT / top if top > 0.0 else 1.0
+    top = float(np.percentile(light, BRIGHT_SKIN_PERCENTILE)) if light.size else 0.0
+    return BRIGHT_SKIN_LEVEL / top if top > 0.0 else 1.0
 
 
 def tone(radiance: ArrayLike, exposure: float) -> UInt8Array:
-    """Return a picture for a screen: linear up to `KNEE`, highlights pressed together above.
+    """Return a picture for a screen: linear up to `TONE_KNEE`, highlights pressed together above.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ def tone(radiance: ArrayLike, exposure: float) -> UInt8Array:
         By the sRGB curve; channels are shown as if they were linear sRGB.
     """
     value = np.asarray(radiance, np.float64) * exposure
-    room = 1.0 - KNEE
-    above = KNEE + room * -np.expm1(-np.maximum(value - KNEE, 0.0) / room)
-    return png.srgb8(np.where(value > KNEE, above, value))
+    room = 1.0 - TONE_KNEE
+    above = TONE_KNEE + room * -np.expm1(-np.maximum(value - TONE_KNEE, 0.0) / room)
+    return png.srgb8(np.where(value > TONE_KNEE, above, value))
 
 
 @dataclass(frozen=True, slots=True)

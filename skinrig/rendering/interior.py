@@ -18,9 +18,9 @@ from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.lights import Light
 
-POINTS: Final = 2
+POINTS_PER_SIDE: Final = 2
 """Points along each side of a piece that light is looked for at."""
-MANY_LIGHTS: Final = 8
+MIN_LIGHTS_FOR_ONE_POINT: Final = 8
 """With so many lights one point is enough: their shadows' steps lie in different places."""
 
 
@@ -95,7 +95,7 @@ class Interior:
         faces = shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
         # several points of each piece, or shadows would end in steps
-        points = POINTS if len(lamps) < MANY_LIGHTS else 1
+        points = POINTS_PER_SIDE if len(lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
         offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
         for u in offsets:
             for v in offsets:

@@ -18,13 +18,13 @@ from skinrig.arrays import Float64Array
 
 Vector = tuple[float, float, float]
 
-FAR_MM: Final = 1e5
+FAR_LIGHT_MM: Final = 1e5
 """Where the disc of a light stands that is far away: shadow rays end there."""
-BROAD_RAD: Final = 0.04
+MAX_UNDIVIDED_RAD: Final = 0.04
 """Seen larger than this (half its width) a light is shaded in parts: lobes change across it."""
-PARTS: Final = 16
+LIGHT_PARTS: Final = 16
 """Into how many parts a broad light is divided."""
-GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))
+GOLDEN_ANGLE_RAD: Final = math.pi * (3.0 - math.sqrt(5.0))
 
 
 class LightError(ValueError):
@@ -161,17 +161,17 @@ class Light:
     def disc(self) -> tuple[Float64Array, float]:
         """Return the centre of the disc, mm, shape (3,), and its radius, mm: shadow rays end there.
 
-        A light that is far away stands at `FAR_MM`.
+        A light that is far away stands at `FAR_LIGHT_MM`.
         """
         if self.direction is not None:
-            return np.asarray(self.direction) * FAR_MM, FAR_MM * math.tan(self.radius)
+            return np.asarray(self.direction) * FAR_LIGHT_MM, FAR_LIGHT_MM * math.tan(self.radius)
         return np.asarray(self.position_mm, np.float64), self.radius
 
-    def parts(self, count: int = PARTS) -> tuple[Light, ...]:
+    def parts(self, count: int = LIGHT_PARTS) -> tuple[Light, ...]:
         """Return a broad light as smaller ones that together give the same; others as they are."""
         center, radius = self.disc()
         away = float(np.linalg.norm(center))
-        if not self.divisible or count < 2 or away == 0.0 or radius <= BROAD_RAD * away:
+        if not self.divisible or count < 2 or away == 0.0 or radius <= MAX_UNDIVIDED_RAD * away:
             return (self,)
         helper = np.eye(3)[int(np.argmin(np.abs(center)))]
         side = np.cross(helper, center)
@@ -180,7 +180,8 @@ class Light:
         k = np.arange(count)
         reach = radius * np.sqrt((k + 0.5) / count)
         places = center + reach[:, None] * (
-            np.cos(k * GOLDEN)[:, None] * side + np.sin(k * GOLDEN)[:, None] * other
+            np.cos(k * GOLDEN_ANGLE_RAD)[:, None] * side
+            + np.sin(k * GOLDEN_ANGLE_RAD)[:, None] * other
         )
         # a white that faces the middle sees the others aslant, and at a place farther away
         cosine = away / np.linalg.norm(places, axis=-1)

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numba import njit, prange
 
-NEAR_TEXELS: Final = 2.0
+MAX_TEXEL_DISTANCE: Final = 2.0
 """A texel counts for a point up to so many of its own widths away on the surface."""
-CHUNK: Final = 1 << 12
+POINTS_PER_THREAD_BLOCK: Final = 1 << 12
 
 
 @njit(parallel=True, cache=True)
@@ -39,8 +39,10 @@ def look_up(values, known, place, width, uv, point, out, share):  # type: ignore
         Sum of the weights of those that count, 0 to 1.
     """
     rows, columns, channels = values.shape
-    for chunk in prange((uv.shape[0] + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, uv.shape[0])):
+    for chunk in prange((uv.shape[0] + POINTS_PER_THREAD_BLOCK - 1) // POINTS_PER_THREAD_BLOCK):
+        for i in range(
+            chunk * POINTS_PER_THREAD_BLOCK, min((chunk + 1) * POINTS_PER_THREAD_BLOCK, uv.shape[0])
+        ):
             x = min(max(uv[i, 0] * columns - 0.5, 0.0), columns - 1.0)
             y = min(max((1.0 - uv[i, 1]) * rows - 0.5, 0.0), rows - 1.0)
             column, row = min(int(x), columns - 2), min(int(y), rows - 2)
@@ -56,7 +58,7 @@ def look_up(values, known, place, width, uv, point, out, share):  # type: ignore
                 away = 0.0
                 for k in range(3):
                     away += (place[r, c, k] - point[i, k]) ** 2
-                if weight <= 0.0 or away > (NEAR_TEXELS * width[r, c]) ** 2:
+                if weight <= 0.0 or away > (MAX_TEXEL_DISTANCE * width[r, c]) ** 2:
                     continue
                 total += weight
                 for k in range(channels):

@@ -39,12 +39,12 @@ Subsurface = Literal["local", "dipole", "none"]
 
 BAND_RAYS: Final = 1 << 18
 """Camera rays worked on at a time; bounds memory."""
-SUBPIXELS: Final = 2
+SUBPIXELS_PER_SIDE: Final = 2
 SHADOW_SAMPLES: Final = 4
 """Rays to different points of a light's disc, from each ray of a pixel."""
-LIT: Final = 0.999
+MIN_LIT_FRACTION: Final = 0.999
 """Share of a light that counts as all of it."""
-FACING: Final = 0.5
+MIN_OUTSIDE_FRACTION: Final = 0.5
 """Least share of what a camera sees of the mesh that must be its outside."""
 
 
@@ -99,7 +99,7 @@ def render(
     lights: Light | Sequence[Light],
     *,
     subsurface: Subsurface = "local",
-    subpixels: int = SUBPIXELS,
+    subpixels: int = SUBPIXELS_PER_SIDE,
     shadow_samples: int = SHADOW_SAMPLES,
     rest: Mesh | None = None,
     blockers: Mesh | None = None,
@@ -256,7 +256,7 @@ class _Sighting:
                 f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
                 "turn it towards the face, which stands at the rig's origin and looks along +z"
             )
-        if self.out < FACING * (self.out + self.inside):
+        if self.out < MIN_OUTSIDE_FRACTION * (self.out + self.inside):
             raise RenderingError(
                 f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
                 "the inside of the mesh; move it to the front, z > 0"
@@ -357,7 +357,7 @@ def _shade(
             laid.model.eta,
         )
         entered += through
-        lit |= seen >= LIT
+        lit |= seen >= MIN_LIT_FRACTION
         shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
         lobe = lobe_brdf(
             laid.model.lobes,

@@ -22,14 +22,14 @@ from skinrig.rendering.camera import Camera
 from skinrig.rendering.environment import environment_lights, read_environment
 from skinrig.rendering.lights import Light, LightError, Vector
 
-PLACE: Final = "at:"
-RADIUS_MM: Final = 10.0
-"""Radius of a light's disc, mm at `DISTANCE_MM`, where none is asked for: the dome's LEDs."""
-DISTANCE_MM: Final = 700.0
+POSITION_PREFIX: Final = "at:"
+LED_RADIUS_MM: Final = 10.0
+"""Radius of a light's disc, mm at `LED_DISTANCE_MM`, where none is asked for: the dome's LEDs."""
+LED_DISTANCE_MM: Final = 700.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Stage:
+class RenderRig:
     """A rig, drawn or calibrated, whose views and lights can be named."""
 
     rig: Rig
@@ -38,7 +38,7 @@ class Stage:
     """What was taken for granted for want of a calibration; grows."""
 
     @staticmethod
-    def of(rig: str, calibration: Path | None) -> Stage:
+    def of(rig: str, calibration: Path | None) -> RenderRig:
         """Load a rig by name or TOML file.
 
         Raises
@@ -48,7 +48,7 @@ class Stage:
         """
         if calibration is not None and not calibration.is_dir():
             raise UnusableError(f"--calibration: {calibration} is no folder")
-        return Stage(load_rig(rig), calibration, [])
+        return RenderRig(load_rig(rig), calibration, [])
 
     def camera(
         self, text: str, *, size_px: int, target_mm: str = "0,0,0", fov_deg: float = 25.0
@@ -101,7 +101,7 @@ class Stage:
         text
             What is asked for.
         radius_mm
-            Of its disc, mm; of a light that is far away at `DISTANCE_MM`. None: the rig's own.
+            Of its disc, mm; of a light that is far away at `LED_DISTANCE_MM`. None: the rig's own.
 
         Raises
         ------
@@ -112,14 +112,14 @@ class Stage:
         """
         what, _, factor = text.partition("*")
         strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
-        radius = RADIUS_MM if radius_mm is None else radius_mm
-        if what.startswith(PLACE):
-            place = numbers(what.removeprefix(PLACE), 3)
+        radius = LED_RADIUS_MM if radius_mm is None else radius_mm
+        if what.startswith(POSITION_PREFIX):
+            place = numbers(what.removeprefix(POSITION_PREFIX), 3)
             if place is not None:
                 return Light(name=text, position_mm=place, intensity=strength, radius=radius)
         direction = numbers(what, 3)
         if direction is not None:
-            far = radius / DISTANCE_MM
+            far = radius / LED_DISTANCE_MM
             return Light(name=text, direction=direction, intensity=strength, radius=far)
         try:
             drawn = self.rig.light(what)
@@ -150,7 +150,7 @@ class Stage:
 
 
 def lights_of(
-    stage: Stage,
+    stage: RenderRig,
     lights: Sequence[str],
     *,
     radius_mm: float | None,

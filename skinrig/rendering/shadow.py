@@ -28,25 +28,25 @@ from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light, Vector
 from skinrig.rendering.render import Rendering, RenderingError, render
 
-MOST_TRANSLUCENT: Final = (0.3558, 0.7932, 1.5173)
-LEAST_TRANSLUCENT: Final = (0.9171, 1.5682, 1.6569)
+MIN_SIGMA_TR_PER_MM: Final = (0.3558, 0.7932, 1.5173)
+MAX_SIGMA_TR_PER_MM: Final = (0.9171, 1.5682, 1.6569)
 """sigma_tr of red, green and blue, 1/mm: least and greatest of the paper's dataset B."""
-WIDTH_MM: Final = 24.0
+BOUNDARY_WIDTH_MM: Final = 24.0
 """What the picture spans on the skin."""
-AWAY_MM: Final = 250.0
-CARD_MM: Final = 30.0
+CAMERA_DISTANCE_MM: Final = 250.0
+CARD_HEIGHT_MM: Final = 30.0
 """How far off the skin the card's edge is."""
-SLANT_RAD: Final = 0.6
+LIGHT_SLANT_RAD: Final = 0.6
 """Angle of the light to the skin's normal."""
-LIGHT_RAD: Final = 0.002
+SHADOW_LIGHT_RADIUS_RAD: Final = 0.002
 """Angular radius of the light: a half shadow of 0.1 mm."""
-NEAR_MM: Final = 25.0
+MAX_ENTRY_DISTANCE_MM: Final = 25.0
 """Light that enters farther away does not reach the picture's middle."""
 FACE_TEXELS: Final = 2048
 """Pieces that a face is divided into along a side of its texture: 0.15 mm."""
 PATCH_MM: Final = 60.0
 PATCH_TEXELS: Final = 256
-SITE: Final = (0.12, 0.72)
+FOREHEAD_SITE: Final = (0.12, 0.72)
 """Where on the face: parts of the mesh's width from its middle, and of its height; the forehead."""
 
 
@@ -75,8 +75,8 @@ class Boundary:
         caster = Caster(laid.mesh)
         low, high = laid.mesh.vertices_mm.min(axis=0), laid.mesh.vertices_mm.max(axis=0)
         span = high - low
-        x = 0.5 * (low[0] + high[0]) + SITE[0] * span[0]
-        y = low[1] + SITE[1] * span[1]
+        x = 0.5 * (low[0] + high[0]) + FOREHEAD_SITE[0] * span[0]
+        y = low[1] + FOREHEAD_SITE[1] * span[1]
         origin = np.array([[x, y, high[2] + 10.0]])
         prim, share = caster.first_hit(origin, [[0.0, 0.0, -1.0]])
         if prim[0] < 0:
@@ -146,21 +146,21 @@ def _boundary(
     up /= np.linalg.norm(up)
     right = np.cross(up, normal)
     camera = rendering_camera.looking_at(
-        target + AWAY_MM * normal,
+        target + CAMERA_DISTANCE_MM * normal,
         target_mm=target,
         up=up,
         size_px=(size_px, size_px // 2),
-        fov_deg=math.degrees(2.0 * math.atan(0.5 * WIDTH_MM / AWAY_MM)),
+        fov_deg=math.degrees(2.0 * math.atan(0.5 * BOUNDARY_WIDTH_MM / CAMERA_DISTANCE_MM)),
         name=name,
     )
-    towards = math.cos(SLANT_RAD) * normal - math.sin(SLANT_RAD) * right
-    edge = target + CARD_MM * towards
+    towards = math.cos(LIGHT_SLANT_RAD) * normal - math.sin(LIGHT_SLANT_RAD) * right
+    edge = target + CARD_HEIGHT_MM * towards
     away = np.cross(up, towards)  # across the light, to the right
     corners = [edge + h * up + w * away for h, w in ((-80, 0), (-80, 90), (80, 90), (80, 0))]
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
     x, y, z = towards.tolist()
-    light = Light(name="card", direction=(x, y, z), radius=LIGHT_RAD)
-    below = Interior.of(laid, finer=finer, near=(target, NEAR_MM))
+    light = Light(name="card", direction=(x, y, z), radius=SHADOW_LIGHT_RADIUS_RAD)
+    below = Interior.of(laid, finer=finer, near=(target, MAX_ENTRY_DISTANCE_MM))
     return Boundary(name, laid, camera, light, card, caster, below)
 
 
@@ -171,7 +171,7 @@ def profile(seen: Rendering) -> tuple[Float64Array, Float64Array]:
     """
     height, width = seen.coverage.shape
     rows = seen.diffuse[height // 4 : height - height // 4].astype(np.float64)
-    place = (np.arange(width) - 0.5 * (width - 1)) * WIDTH_MM / width
+    place = (np.arange(width) - 0.5 * (width - 1)) * BOUNDARY_WIDTH_MM / width
     return place, rows.mean(axis=0)
 
 

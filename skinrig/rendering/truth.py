@@ -21,19 +21,19 @@ from rigsim.subject import Subject
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light
 
-ROUGHNESS: Final = np.linspace(0.12, 0.6, 9)
+TRUE_ROUGHNESS_NODES: Final = np.linspace(0.12, 0.6, 9)
 """Nodes of the roughness."""
-LEAST_COSINE: Final = 0.02
+MIN_TABLE_COSINE: Final = 0.02
 """Tables hold what the surface does at 89 degrees for directions closer to the horizon, too."""
-FUZZ: Final = 1e-3
+HAIR_OPTICAL_DEPTH: Final = 1e-3
 """Optical depth of the table of vellus hair."""
 
 
 @lru_cache(maxsize=1)
 def true_lobes() -> BrdfBasis:
-    """Return tables of facets at `ROUGHNESS`, each without and with oil, and of vellus hair."""
+    """Return tables of facets at each roughness, without and with oil, and of vellus hair."""
     materials = {}
-    for roughness in ROUGHNESS:
+    for roughness in TRUE_ROUGHNESS_NODES:
         for oil in (0.0, 1.0):
             materials[f"facets {roughness:.2f} oil {oil:g}"] = partial(_lobe, roughness, oil, 0.0)
     return brdf_tables.tabulate({**materials, "hair": _hair})
@@ -59,12 +59,14 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     if not isinstance(scene.subject, Subject):
         raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
     surface, atlas = scene.surface(scene.rig.view(view)), scene.subject.atlas
-    at = (surface.roughness - ROUGHNESS[0]) / (ROUGHNESS[1] - ROUGHNESS[0])
-    hat = np.maximum(1.0 - np.abs(at[..., None] - np.arange(len(ROUGHNESS))), 0.0)
+    at = (surface.roughness - TRUE_ROUGHNESS_NODES[0]) / (
+        TRUE_ROUGHNESS_NODES[1] - TRUE_ROUGHNESS_NODES[0]
+    )
+    hat = np.maximum(1.0 - np.abs(at[..., None] - np.arange(len(TRUE_ROUGHNESS_NODES))), 0.0)
     oil, bare = surface.oil[..., None], surface.bare[..., None]
     shares = np.stack([hat * (1.0 - oil), hat * oil], axis=-1).reshape(*at.shape, -1)
     layers = [surface.r_d, surface.normal, atlas.position_mm]
-    layers += [bare * shares, bare * surface.fuzz[..., None] / FUZZ]
+    layers += [bare * shares, bare * surface.fuzz[..., None] / HAIR_OPTICAL_DEPTH]
     covered = atlas.covered
     values = np.concatenate(layers, axis=-1).astype(np.float32)
     size = at.shape[0] // binning
@@ -113,14 +115,14 @@ def _lobe(
 
 def _raised(directions: Float64Array) -> Float32Array:
     """Return directions above the horizon, where hair would glow without end."""
-    up = np.maximum(directions[:, 2:], LEAST_COSINE)
+    up = np.maximum(directions[:, 2:], MIN_TABLE_COSINE)
     across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)
     scale = np.sqrt(1.0 - up**2) / np.maximum(across, 1e-9)
     flat = np.where(
-        across > np.sqrt(1.0 - LEAST_COSINE**2), directions[:, :2] * scale, directions[:, :2]
+        across > np.sqrt(1.0 - MIN_TABLE_COSINE**2), directions[:, :2] * scale, directions[:, :2]
     )
     return np.ascontiguousarray(np.concatenate([flat, up], axis=-1), np.float32)
 
 
 def _hair(light: Float64Array, view: Float64Array) -> Float64Array:
-    return _lobe(0.3, 0.0, FUZZ, light, view) - _lobe(0.3, 0.0, 0.0, light, view)
+    return _lobe(0.3, 0.0, HAIR_OPTICAL_DEPTH, light, view) - _lobe(0.3, 0.0, 0.0, light, view)

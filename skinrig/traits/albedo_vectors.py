@@ -24,10 +24,10 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 VectorKind = Literal["quantiles", "histograms"]
 
-KINDS: Final = ("quantiles", "histograms")
-NEGLIGIBLE: Final = 1e-3
+VECTOR_KINDS: Final = ("quantiles", "histograms")
+MIN_RELATIVE_SCALE: Final = 1e-3
 """Spread of a response, over that of the first channel of the image, that tells nothing."""
-LEAST: Final = 1e-3
+MIN_REFLECTANCE: Final = 1e-3
 """Reflectance below which a logarithm is taken of this; no skin is as dark."""
 
 
@@ -55,8 +55,10 @@ class AlbedoTraits:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and vectors of another length."""
-        if self.kind not in KINDS:
-            raise AlbedoVectorError(f"vectors: got {self.kind!r}, expected {' or '.join(KINDS)}")
+        if self.kind not in VECTOR_KINDS:
+            raise AlbedoVectorError(
+                f"vectors: got {self.kind!r}, expected {' or '.join(VECTOR_KINDS)}"
+            )
         if len(self.traits.center) != self.texture.size:
             raise AlbedoVectorError(
                 f"vectors: got {len(self.traits.center)} numbers, expected {self.texture.size}"
@@ -96,7 +98,7 @@ class AlbedoTraits:
             np.zeros(self.texture.size),
         )
         before = self.texture.histograms(given)
-        scale = spread(self.texture)[..., None]
+        scale = response_scale(self.texture)[..., None]
         by = change.reshape(before.shape) * scale
         wide = histogram_transport.widened(before, self.texture.edges, by)
         after = histogram_transport.moved(before, self.texture.edges, by, onto=wide)
@@ -114,27 +116,27 @@ def encoded(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     if kind == "histograms":
         return given
     if kind != "quantiles":
-        raise AlbedoVectorError(f"vectors: got {kind!r}, expected {' or '.join(KINDS)}")
-    return np.asarray(np.log(np.maximum(given, LEAST)))
+        raise AlbedoVectorError(f"vectors: got {kind!r}, expected {' or '.join(VECTOR_KINDS)}")
+    return np.asarray(np.log(np.maximum(given, MIN_REFLECTANCE)))
 
 
-def spread(texture: TextureSpace) -> Float64Array:
+def response_scale(texture: TextureSpace) -> Float64Array:
     """Return the scale of each response in a population, (C, responses): middle half its edges.
 
     Edges lie half evenly and half by how often values occur, so that the middle half of them spans
     what is common. Responses of next to no spread (rounding errors, levels larger than the
-    face) get `NEGLIGIBLE` of the first, so that they count for nothing.
+    face) get `MIN_RELATIVE_SCALE` of the first, so that they count for nothing.
     """
     e = texture.edges
     bins = e.shape[-1] - 1
     middle = e[..., bins - bins // 4] - e[..., bins // 4]
-    return np.maximum(middle, NEGLIGIBLE * float(middle[0, 0]))
+    return np.maximum(middle, MIN_RELATIVE_SCALE * float(middle[0, 0]))
 
 
 def telling(texture: TextureSpace) -> BoolArray:
     """Return the responses of more than negligible spread, (C, responses)."""
-    scale = spread(texture)
-    return np.asarray(scale > 1.001 * NEGLIGIBLE * scale[0, 0], np.bool_)
+    scale = response_scale(texture)
+    return np.asarray(scale > 1.001 * MIN_RELATIVE_SCALE * scale[0, 0], np.bool_)
 
 
 def vector(
@@ -147,7 +149,7 @@ def vector(
     if kind == "histograms":
         return found
     q = histogram_transport.quantiles(texture.histograms(found), texture.edges)
-    return (q / spread(texture)[..., None]).reshape(-1)
+    return (q / response_scale(texture)[..., None]).reshape(-1)
 
 
 def fit(

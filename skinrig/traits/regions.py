@@ -18,12 +18,12 @@ from model.traits import storage as trait_storage
 from model.traits.storage import TraitLibrary
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from skinrig.traits.albedo_vectors import KINDS, AlbedoTraits, VectorKind
+from skinrig.traits.albedo_vectors import VECTOR_KINDS, AlbedoTraits, VectorKind
 
-SURFACE: Final = "surface"
-ALBEDO: Final = "albedo"
-TEXTURE_SPACE: Final = "texture_space.npz"
-SIDE_MM, SIZE = 240.0, 256
+SURFACE_SPACE: Final = "surface"
+ALBEDO_SPACE: Final = "albedo"
+TEXTURE_SPACE_FILE: Final = "texture_space.npz"
+DEFAULT_SIDE_MM, DEFAULT_SIZE_PX = 240.0, 256
 """Of the common map of a library that does not tell its own."""
 
 
@@ -39,7 +39,7 @@ def space_name(region: str) -> str:
     >>> space_name("face"), space_name("no-beard")
     ('albedo', 'albedo_no_beard')
     """
-    return ALBEDO if region == "face" else f"{ALBEDO}_{region.replace('-', '_')}"
+    return ALBEDO_SPACE if region == "face" else f"{ALBEDO_SPACE}_{region.replace('-', '_')}"
 
 
 def library_parameters(frame: CommonFrame, kind: VectorKind, **more: Any) -> dict[str, Any]:
@@ -96,12 +96,14 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
     """
     told = library.parameters
     kind = told.get("vectors", "histograms")
-    if kind not in KINDS:
-        raise TraitLibraryError(f"vectors: got {kind!r}, expected {' or '.join(KINDS)}")
+    if kind not in VECTOR_KINDS:
+        raise TraitLibraryError(f"vectors: got {kind!r}, expected {' or '.join(VECTOR_KINDS)}")
     frame = (
         CommonFrame.from_document(told["frame"])
         if isinstance(told.get("frame"), dict)
-        else common_regions.standard_frame(side_mm=SIDE_MM, center_mm=(0.0, 0.0), size=SIZE)
+        else common_regions.standard_frame(
+            side_mm=DEFAULT_SIDE_MM, center_mm=(0.0, 0.0), size=DEFAULT_SIZE_PX
+        )
     )
     albedo = {}
     for region in common_regions.REGIONS:
@@ -109,15 +111,15 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
             albedo[region] = AlbedoTraits(
                 kind, _texture(library), library.spaces[space_name(region)]
             )
-    return LibraryParts(library.spaces.get(SURFACE), albedo, frame)
+    return LibraryParts(library.spaces.get(SURFACE_SPACE), albedo, frame)
 
 
 def _texture(library: TraitLibrary) -> TextureSpace:
-    content = library.files.get(TEXTURE_SPACE)
+    content = library.files.get(TEXTURE_SPACE_FILE)
     if content is None:
         raise TraitLibraryError(
-            f"files: got {json.dumps(sorted(library.files))}, expected {TEXTURE_SPACE}: traits of "
-            "the albedo mean nothing without the texture space they are of"
+            f"files: got {json.dumps(sorted(library.files))}, expected {TEXTURE_SPACE_FILE}: "
+            "traits of the albedo mean nothing without the texture space they are of"
         )
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
@@ -125,7 +127,7 @@ def _texture(library: TraitLibrary) -> TextureSpace:
             levels, orientations, images = (int(n) for n in stored["counts"])
         return TextureSpace(mean, axes, edges, levels, orientations, images)
     except (OSError, KeyError, ValueError, EOFError, TextureError) as error:
-        raise TraitLibraryError(f"{TEXTURE_SPACE}: cannot be read: {error}") from error
+        raise TraitLibraryError(f"{TEXTURE_SPACE_FILE}: cannot be read: {error}") from error
 
 
 def load(path: Path | None) -> tuple[TraitLibrary, str]:

@@ -32,13 +32,13 @@ from skinrig.traits.albedo_vectors import AlbedoSample
 
 Labels = dict[str, BoolArray]
 
-CAMERA: Final = "Nikon 5100 (NPL)"
-LIGHT: Final = "D55"
-SIZE: Final = 64
+TRUTH_CAMERA: Final = "Nikon 5100 (NPL)"
+TRUTH_ILLUMINANT: Final = "D55"
+TRUTH_TEXELS: Final = 64
 """Texels a side of the textures that points of the surface are drawn from."""
 ETA: Final = 1.4
-LEAST_COSINE: Final = 0.12
-BARE: Final = 0.98
+MIN_SAMPLED_COSINE: Final = 0.12
+MIN_BARE_FRACTION: Final = 0.98
 ALBEDO_NOISE: Final = 0.01
 """Relative noise of R_d at a pixel of the common map."""
 
@@ -80,10 +80,10 @@ def labels_of(members: Sequence[Member], names: Sequence[str]) -> Labels:
 
 def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> Float32Array:
     """Return what `count` random places of a face's bare skin reflect by, (count, 7 or 11)."""
-    surface = person.surface(SIZE, CAMERA, LIGHT)
+    surface = person.surface(TRUTH_TEXELS, TRUTH_CAMERA, TRUTH_ILLUMINANT)
     packed = surface.packed()
     length = np.linalg.norm(surface.normal, axis=-1)
-    bare = np.flatnonzero(((surface.bare > BARE) & (length > 0.5)).reshape(-1))
+    bare = np.flatnonzero(((surface.bare > MIN_BARE_FRACTION) & (length > 0.5)).reshape(-1))
     return packed.reshape(-1, packed.shape[-1])[rng.choice(bare, count)]
 
 
@@ -131,7 +131,7 @@ def mean_mixture(
 
 def directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float64Array:
     """Draw unit vectors (..., 3) evenly over the cap above the horizon about +z."""
-    z = rng.uniform(LEAST_COSINE, 1.0, shape)
+    z = rng.uniform(MIN_SAMPLED_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)
     ring = np.sqrt(1.0 - z * z)
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
@@ -271,7 +271,7 @@ class CommonFaces:
 
     def albedo(self, person: Member, *, noise: float, rng: np.random.Generator) -> AlbedoSample:
         """Return a face's R_d in the common map, with relative noise at each pixel."""
-        r_d, skin = person.r_d(self.size, CAMERA, LIGHT)
+        r_d, skin = person.r_d(self.size, TRUTH_CAMERA, TRUTH_ILLUMINANT)
         image, valid = self.charts[person.head].gather(r_d, skin)
         image = image * (1.0 + noise * rng.standard_normal(image.shape).astype(np.float32))
         return AlbedoSample(np.maximum(image, 1e-4).astype(np.float32), valid)

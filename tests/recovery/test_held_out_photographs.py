@@ -21,7 +21,7 @@ from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
 from skinrig.rendering.photographs import evaluation
-from skinrig.rendering.photographs.errors import LIMIT
+from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR
 from skinrig.rendering.photographs.held_out import Photographs, PhotographsError
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.simulation import simulate_session
@@ -107,11 +107,11 @@ def test_photographs_that_no_fit_has_seen_are_predicted(fitted):
     whole = assemble(appearance)
     found, pictures = judge(whole, ablation=True)
     assert found.full.pixels > 400
-    assert found.full.median < LIMIT
+    assert found.full.median < MAX_MEDIAN_ERROR
     assert found.full.noise < found.full.median
     assert found.passed
     assert found.ablation["without the surface"].median > found.full.median
-    assert found.ablation["without light from inside"].median > LIMIT
+    assert found.ablation["without light from inside"].median > MAX_MEDIAN_ERROR
     assert pictures
     # it can fail: with one normal for all, and without lobes, it does
     mean = whole.normals[whole.valid].mean(axis=0)

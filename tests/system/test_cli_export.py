@@ -141,10 +141,10 @@ def test_the_help_names_every_format():
     text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
     text = re.sub(r"-\s+", "-", text)  # lines end at hyphens, too
     for name in (
-        *appearances.FORMATS,
-        *brdfs.SUFFIX,
-        *sessions.FORMATS,
-        light_lists.NAME,
-        stokes.NAME,
+        *appearances.APPEARANCE_FORMATS,
+        *brdfs.BRDF_SUFFIXES,
+        *sessions.SESSION_FORMATS,
+        light_lists.LIGHT_LIST_FORMAT,
+        stokes.STOKES_FORMAT,
     ):
         assert name in text

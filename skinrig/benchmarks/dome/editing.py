@@ -46,11 +46,13 @@ def editing(*, toy: bool) -> StageBenchmark:
     points, returns, kept = [], [], {}
     bands: dict[str, BandError] = {}
     settings: list[tuple[VectorKind, int, float]] = [
-        ("quantiles", 5, editing_albedo.NOISE),
+        ("quantiles", 5, editing_albedo.MATCHING_NOISE),
         ("quantiles", 5, 0.0),
-        ("histograms", 5, editing_albedo.NOISE),
+        ("histograms", 5, editing_albedo.MATCHING_NOISE),
     ]
-    settings += [("quantiles", n, editing_albedo.NOISE) for n in ((1,) if toy else (1, 2, 10))]
+    settings += [
+        ("quantiles", n, editing_albedo.MATCHING_NOISE) for n in ((1,) if toy else (1, 2, 10))
+    ]
     spaces: dict[str, AlbedoTraits] = {}
     for kind, iterations, noise in settings:
         if kind not in spaces:
@@ -89,7 +91,9 @@ def editing(*, toy: bool) -> StageBenchmark:
             ]
         )
     )
-    same = _edit(spaces["quantiles"], 5, editing_albedo.NOISE, before[0].r_d, before[0].valid, 0.0)
+    same = _edit(
+        spaces["quantiles"], 5, editing_albedo.MATCHING_NOISE, before[0].r_d, before[0].valid, 0.0
+    )
     zero = float(np.abs(same / before[0].r_d - 1)[before[0].valid].max())
     return StageBenchmark(
         "editing",

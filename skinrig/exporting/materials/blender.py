@@ -17,12 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-FILE: Final = "skin_in_blender.py"
+from skinrig.exporting.options import M_PER_MM
+
+SCRIPT_FILE: Final = "skin_in_blender.py"
 RADIUS_FACTOR: Final = 4.0 * math.pi
 """Blender's radius over the mean free path, for the method Random Walk."""
-MM_M: Final = 0.001
 
-_TEXT: Final = '''"""Import {file} into Blender 4 or later, with what its importer leaves out.
+_SCRIPT: Final = '''"""Import {file} into Blender 4 or later, with what its importer leaves out.
 
 Run `blender --python {script}`, or open this text in the Scripting workspace and press Run.
 """
@@ -121,11 +122,11 @@ class Import:
         """Return the script that Blender runs."""
         operator = "import_scene.gltf" if self.file.endswith(".glb") else "wm.usd_import"
         channels = None if self.channels is None else tuple(round(c, 9) for c in self.channels)
-        return _TEXT.format(
+        return _SCRIPT.format(
             file=self.file,
-            script=FILE,
+            script=SCRIPT_FILE,
             operator=operator,
             channels=channels,
-            radius=f"{RADIUS_FACTOR * self.radius_mm * MM_M:.9g}",
+            radius=f"{RADIUS_FACTOR * self.radius_mm * M_PER_MM:.9g}",
             textures={socket: (name, factor) for socket, name, factor in self.textures},
         )

@@ -26,14 +26,13 @@ from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import Image, ImageFolder, coded
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import COLOR_NOTE, NOTES, Material
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.materials.material import COLOR_NOTE, MAP_NOTES, Material
+from skinrig.exporting.options import M_PER_MM, Delivery
 from skinrig.exporting.provenance import provenance
 from skinrig.exporting.sealing import write_json
 
-FILE, DOCUMENT = "skin.glb", "glb.json"
+GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
-MM_M: Final = 0.001
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 FLOAT, UNSIGNED_INT = 5126, 5125
 VERTICES, INDICES = 34962, 34963
@@ -124,24 +123,24 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             f"--mesh: reaches over tiles {', '.join(map(str, material.tiles))}, but glTF knows one "
             "alone; take mtlx or usd, or a mesh of tile 1001"
         )
-    (folder / FILE).write_bytes(content(material))
-    script = blender.Import.of_channels(FILE, material.usual_radius_mm()).script()
-    (folder / blender.FILE).write_text(script, encoding="utf-8")
+    (folder / GLB_FILE).write_bytes(content(material))
+    script = blender.Import.of_channels(GLB_FILE, material.usual_radius_mm()).script()
+    (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
     if delivery.with_errors:
         for image in material.error_images():
             out.exr(image)
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             **provenance(appearance),
             "schema": SCHEMA,
             "scene_unit": "m",
             "frame": "+x right, +y up, +z towards the main camera (the front of glTF)",
-            "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}; 8 bits, sRGB curve",
+            "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}; 8 bits, sRGB curve",
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports hold 16",
-            "subsurface": {**material.sigma_tr(), "mapping": NOTES["subsurface_radius"]},
+            "subsurface": {**material.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]},
             "specular_ior": material.eta,
             "morph_targets": list(material.shapes),
             "figures": material.figures(),
@@ -153,7 +152,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         *material.left_out_of_mesh(delivery),
         (
             "subsurface light",
-            f"glTF has no place for it: see extras; {blender.FILE} sets it in Blender",
+            f"glTF has no place for it: see extras; {blender.SCRIPT_FILE} sets it in Blender",
         ),
     ]
     if not material.shapes:
@@ -171,14 +170,14 @@ def content(material: Material) -> bytes:
     """
     mesh, buffer = material.mesh, _Buffer()
     attributes = {
-        "POSITION": buffer.vectors(mesh.vertices_mm * MM_M, bounds=True),
+        "POSITION": buffer.vectors(mesh.vertices_mm * M_PER_MM, bounds=True),
         "NORMAL": buffer.vectors(mesh.normals),
         # v grows downwards here: the third axis keeps its meaning, along falling v
         "TANGENT": buffer.vectors(mesh.tangents),
         "TEXCOORD_0": buffer.vectors(np.column_stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]])),
     }
     targets = [
-        {"POSITION": buffer.vectors(moved * MM_M, bounds=True)}
+        {"POSITION": buffer.vectors(moved * M_PER_MM, bounds=True)}
         for moved in material.shapes.values()
     ]
     primitive: dict[str, Any] = {

@@ -12,7 +12,7 @@ from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError
-from skinrig.exporting.images import CAMERA, SRGB, Image
+from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
@@ -23,7 +23,7 @@ COLOR_NOTE: Final = (
     "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
     "nothing else; no color calibration is in it"
 )
-NOTES: Final[dict[str, str]] = {
+MAP_NOTES: Final[dict[str, str]] = {
     "base_color": "R_d (1 - F_diffuse): what light from inside adds below a dielectric whose "
     "reflection formats take off by themselves; equal to the measured model for even light",
     "specular_roughness": "square root of GGX's alpha, the lobe nearest to the measured mixture",
@@ -240,7 +240,7 @@ class Material:
                 filler=(0.0, 0.0, 1.0),
             )
         simple: dict[str, tuple[Float32Array, str, str, float, float]] = {
-            "base_color": (self.base_color, "1", SRGB, 0.0, 1.0),
+            "base_color": (self.base_color, "1", SRGB_SPACE, 0.0, 1.0),
             "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),
             "specular_weight": (self.specular_weight, "1", "data", 0.0, 1.0),
             "specular_misfit": (self.surface.misfit, "1", "data", 0.0, 1.0),
@@ -251,7 +251,7 @@ class Material:
         if name not in simple:
             raise ExportError(f"texture: got {name!r}, expected one of {', '.join(simple)}")
         values, unit, space, low, high = simple[name]
-        what = NOTES.get(name, "1 where all was measured")
+        what = MAP_NOTES.get(name, "1 where all was measured")
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"
         return Image(
@@ -280,7 +280,7 @@ class Material:
                         name=f"{name}_stderr",
                         values=np.nan_to_num(values),
                         unit=unit,
-                        space=CAMERA if name == "base_color" else "data",
+                        space=CAMERA_SPACE if name == "base_color" else "data",
                         what=what,
                         valid=self.valid,
                     )

@@ -12,18 +12,24 @@ import numpy as np
 from model.skin import SkinAppearance
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.materials import obj
-from skinrig.exporting.materials.material import COLOR_NOTE, NOTES, Material
-from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, TILES, UNITS_M, Delivery
-from skinrig.exporting.provenance import ORIENTATION, provenance
+from skinrig.exporting.materials.material import COLOR_NOTE, MAP_NOTES, Material
+from skinrig.exporting.options import (
+    FIRST_TILE,
+    M_PER_MM,
+    NORMAL_Y,
+    TILE_SEPARATORS,
+    UNITS_M,
+    Delivery,
+)
+from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
 from skinrig.exporting.sealing import write_json
 
-VERSION: Final = "1.39"
-FILE, DOCUMENT = "skin.mtlx", "material.json"
+MATERIALX_VERSION: Final = "1.39"
+MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
 SCHEMA: Final = "skinrig.export.material/1"
-TEXTURES: Final = "textures"
-LINEAR: Final = "lin_rec709"
+TEXTURE_FOLDER: Final = "textures"
+LINEAR_SRGB_NAME: Final = "lin_rec709"
 """MaterialX's name of linear sRGB; data get no color space."""
-MM_M: Final = 0.001
 
 
 def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -55,12 +61,14 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     scale = write_textures(material, out)
     if delivery.with_errors:
         for image in material.error_images():
-            out.exr(image, TEXTURES)
-    (folder / FILE).write_text(openpbr_document(material, scale, delivery), encoding="utf-8")
-    per_mm = MM_M / UNITS_M[unit]
+            out.exr(image, TEXTURE_FOLDER)
+    (folder / MATERIALX_FILE).write_text(
+        openpbr_document(material, scale, delivery), encoding="utf-8"
+    )
+    per_mm = M_PER_MM / UNITS_M[unit]
     (folder / "skin.obj").write_text(obj.text(material.mesh, per_mm, unit), encoding="utf-8")
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             **facts(material, appearance, schema=SCHEMA, unit=unit, per_mm=per_mm, scale=scale),
             "files": dict(sorted(out.records.items())),
@@ -72,9 +80,9 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
 def write_textures(material: Material, out: ImageFolder) -> float:
     """Write the textures that `openpbr_document` names; return the largest radius, mm."""
     for name in ("base_color", "specular_roughness", "specular_weight", "translucency"):
-        out.exr(material.image(name, out.delivery), TEXTURES)
-    out.png(material.image("base_color", out.delivery), TEXTURES)
-    out.png(material.image("normal", out.delivery), TEXTURES)
+        out.exr(material.image(name, out.delivery), TEXTURE_FOLDER)
+    out.png(material.image("base_color", out.delivery), TEXTURE_FOLDER)
+    out.png(material.image("normal", out.delivery), TEXTURE_FOLDER)
     radius = material.radius_mm
     shown = radius[material.covered] if material.covered.any() else radius
     scale = float(shown.max())
@@ -83,10 +91,10 @@ def write_textures(material: Material, out: ImageFolder) -> float:
             name="subsurface_radius_scale",
             values=np.clip(radius / scale, 0.0, 1.0),
             unit="1",
-            what=f"{NOTES['subsurface_radius']}; over {scale:.9g} mm, the largest",
+            what=f"{MAP_NOTES['subsurface_radius']}; over {scale:.9g} mm, the largest",
             valid=material.valid,
         ),
-        TEXTURES,
+        TEXTURE_FOLDER,
     )
     return scale
 
@@ -118,14 +126,14 @@ def facts(
         "schema": schema,
         "scene_unit": unit,
         "mm_per_scene_unit": 1.0 / per_mm,
-        "orientation": ORIENTATION,
+        "orientation": IMAGE_ORIENTATION,
         "udim": {"tiles": list(material.tiles), "measured": [material.tiles[0]]},
         "frame": "+x right, +y up, +z towards the main camera",
-        "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}",
+        "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}",
         "subsurface": {
             **material.sigma_tr(),
             "radius_in_scene_units": scale * per_mm,
-            "mapping": NOTES["subsurface_radius"],
+            "mapping": MAP_NOTES["subsurface_radius"],
         },
         "specular_ior": material.eta,
         "figures": material.figures(),
@@ -134,7 +142,7 @@ def facts(
 
 
 def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -> str:
-    """Return a material whose textures lie in `TEXTURES`.
+    """Return a material whose textures lie in `TEXTURE_FOLDER`.
 
     Parameters
     ----------
@@ -146,7 +154,7 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
         Scene unit, names of tiles, green of the normal map.
     """
     unit = delivery.unit_or("m")
-    per_mm = MM_M / UNITS_M[unit]
+    per_mm = M_PER_MM / UNITS_M[unit]
     root = _root(
         f"Skin for OpenPBR. Scene unit: {unit}. Source: {material.source}. "
         f"Normals: {'+Y' if NORMAL_Y[delivery.normal_y] > 0 else '-Y'}."
@@ -159,11 +167,11 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
             graph,
             name,
             kind,
-            f"{TEXTURES}/{delivery.referred(name, 'exr')}",
-            LINEAR if name == "base_color" else None,
+            f"{TEXTURE_FOLDER}/{delivery.referred(name, 'exr')}",
+            LINEAR_SRGB_NAME if name == "base_color" else None,
         )
         ElementTree.SubElement(graph, "output", name=f"{name}_out", type=kind, nodename=name)
-    _normal_nodes(graph, f"{TEXTURES}/{delivery.referred('normal', 'png')}", delivery)
+    _normal_nodes(graph, f"{TEXTURE_FOLDER}/{delivery.referred('normal', 'png')}", delivery)
     shader = ElementTree.SubElement(
         root, "open_pbr_surface", name="SR_skin", type="surfaceshader", version="1.1.1"
     )
@@ -210,7 +218,13 @@ def images_document(
     root = _root("Maps of skin with their color spaces; see maps.json for units and ranges.")
     graph = ElementTree.SubElement(root, "nodegraph", name="NG_maps")
     for name, (file, kind) in files.items():
-        _image(graph, name, kind, _all_tiles(file, delivery), LINEAR if kind == "color3" else None)
+        _image(
+            graph,
+            name,
+            kind,
+            _all_tiles(file, delivery),
+            LINEAR_SRGB_NAME if kind == "color3" else None,
+        )
         ElementTree.SubElement(graph, "output", name=f"{name}_out", type=kind, nodename=name)
     if tangent_normal is not None:
         _normal_nodes(graph, _all_tiles(tangent_normal, delivery), delivery)
@@ -220,12 +234,12 @@ def images_document(
 def _all_tiles(file: str, delivery: Delivery) -> str:
     """Return a file's name with the token of all tiles in place of the tile's number."""
     stem, dot, suffix = file.rpartition(".")
-    tile = "" if delivery.udim == "none" else f"{TILES[delivery.udim]}{FIRST_TILE}"
+    tile = "" if delivery.udim == "none" else f"{TILE_SEPARATORS[delivery.udim]}{FIRST_TILE}"
     return delivery.referred(stem.removesuffix(tile), suffix) if dot and tile else file
 
 
 def _root(doc: str) -> ElementTree.Element:
-    return ElementTree.Element("materialx", version=VERSION, doc=doc)
+    return ElementTree.Element("materialx", version=MATERIALX_VERSION, doc=doc)
 
 
 def _image(

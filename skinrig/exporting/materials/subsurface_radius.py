@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from skinrig.arrays import Float64Array
 
-LEAST_COLOR, MOST_COLOR = 0.001, 0.999
+MIN_COLOR, MAX_COLOR = 0.001, 0.999
 """Colors are held in this range: at 1 no light is absorbed, and no radius has a sigma_tr."""
 
 
@@ -46,7 +46,7 @@ def deficit_root(color: ArrayLike) -> Float64Array:
     >>> deficit_root([0.001, 0.5, 0.999]).round(3).tolist()
     [0.997, 0.297, 0.0]
     """
-    a = np.clip(np.asarray(color, np.float64), LEAST_COLOR, MOST_COLOR)
+    a = np.clip(np.asarray(color, np.float64), MIN_COLOR, MAX_COLOR)
     root = 4.09712 + 4.20863 * a - np.sqrt(9.59217 + 41.6808 * a + 17.7126 * a * a)
     return np.asarray(np.clip(root, 1e-4, 1.0 - 1e-3))
 

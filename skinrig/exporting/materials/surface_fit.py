@@ -20,15 +20,15 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
-ROUGHNESS: Final = np.linspace(0.15, 1.0, 69)
+ROUGHNESS_NODES: Final = np.linspace(0.15, 1.0, 69)
 """Of materials: the square root of the slope width alpha."""
-CHUNK: Final = 1 << 15
+TEXELS_PER_FIT: Final = 1 << 15
 """Texels at a time: 69 sums of each are held."""
-LEAST_COSINE: Final = 0.2
-MOST_THETA_D: Final = np.deg2rad(60.0)
+MIN_FIT_COSINE: Final = 0.2
+MAX_THETA_D: Final = np.deg2rad(60.0)
 """Grazing light is left out: there one lobe of a smooth dielectric's index cannot follow a mixture,
 and would pay for it head-on, where skin is looked at."""
-FLOOR: Final = 0.03
+LOBE_FLOOR_FRACTION: Final = 0.03
 """Of the greatest mean lobe, added to it: the far tail of a sharp lobe decides nothing."""
 STRIDE_D, STRIDE_PHI, STRIDE_H = 2, 3, 2
 """Nodes of the grid are passed over: the lobes are smooth, and sums are of 3 000 directions."""
@@ -74,8 +74,8 @@ def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
     products = _products(lobes, eta)
     flat = share.reshape(-1, share.shape[-1])
     found = np.empty((3, len(flat)), np.float32)
-    for start in range(0, len(flat), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(flat), TEXELS_PER_FIT):
+        part = slice(start, start + TEXELS_PER_FIT)
         found[:, part] = _fit(flat[part].astype(np.float64), *products)
     roughness, weight, misfit = found.reshape(3, *share.shape[:-1])
     return SurfaceFit(roughness, weight, misfit)
@@ -89,7 +89,7 @@ def _fit(
     along = share @ cross  # (N, R)
     explained = np.maximum(along, 0.0) ** 2 / own
     best = np.argmax(explained, axis=-1)
-    inner = np.clip(best, 1, len(ROUGHNESS) - 2)
+    inner = np.clip(best, 1, len(ROUGHNESS_NODES) - 2)
 
     def at(offset: int) -> Float64Array:
         return np.take_along_axis(explained, (inner + offset)[..., None], axis=-1)[..., 0]
@@ -99,9 +99,9 @@ def _fit(
     curved = bend < -1e-12 * np.maximum(here, 1e-30)
     shift = np.where(curved, 0.5 * (below - above) / np.where(curved, bend, -1.0), 0.0)
     place = np.where(best == inner, inner + np.clip(shift, -0.5, 0.5), best)
-    nodes = np.arange(len(ROUGHNESS))
-    roughness = np.interp(place, nodes, ROUGHNESS)
-    low = np.clip(np.floor(place).astype(np.intp), 0, len(ROUGHNESS) - 2)
+    nodes = np.arange(len(ROUGHNESS_NODES))
+    roughness = np.interp(place, nodes, ROUGHNESS_NODES)
+    low = np.clip(np.floor(place).astype(np.intp), 0, len(ROUGHNESS_NODES) - 2)
     part = place - low
 
     def between(table: Float64Array) -> Float64Array:
@@ -128,8 +128,8 @@ def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array,
     table = lobes.table[::STRIDE_D, ::STRIDE_PHI, ::STRIDE_H, : lobes.size]
     values = table.reshape(-1, lobes.size)[keep].astype(np.float64)
     mean = values.mean(axis=1)
-    weight = _solid()[keep] / (mean + FLOOR * mean.max(initial=1e-12))
-    model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS], axis=1)
+    weight = _solid()[keep] / (mean + LOBE_FLOOR_FRACTION * mean.max(initial=1e-12))
+    model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
     scaled = values * weight[:, None]
     return values.T @ scaled, scaled.T @ model, np.sum(weight[:, None] * model**2, axis=0)
 
@@ -147,7 +147,7 @@ def _directions() -> tuple[Float64Array, Float64Array, Float64Array, Float64Arra
     """Return cosines of light, view, half vector and difference angle, and which nodes count."""
     theta_d, phi_d, theta_h = _grid()
     light, view = merl.to_directions(theta_h, theta_d, phi_d)
-    keep = (light[:, 2] > LEAST_COSINE) & (view[:, 2] > LEAST_COSINE) & (theta_d <= MOST_THETA_D)
+    keep = (light[:, 2] > MIN_FIT_COSINE) & (view[:, 2] > MIN_FIT_COSINE) & (theta_d <= MAX_THETA_D)
     return light[keep, 2], view[keep, 2], np.cos(theta_h[keep]), np.cos(theta_d[keep]), keep
 
 

@@ -21,10 +21,10 @@ from rigsim.geometry.mesh import Mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from skinrig.exporting.materials.udim import TiledMesh
 
-LEAST = 1e-12
-LEAST_VOLUME = 1e-6
+MIN_VECTOR_LENGTH = 1e-12
+MIN_FRAME_VOLUME = 1e-6
 """Of a frame: below it the texture is folded, and no normal is told."""
-LEAST_Z = 1e-3
+MIN_TANGENT_Z = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,8 +189,8 @@ def to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Fl
     found[:, 1] = np.sum(np.cross(normal, tangent) * world, axis=-1)
     found[:, 2] = np.sum(np.cross(tangent, bitangent) * world, axis=-1)
     found = _unit(found * np.sign(volume)[:, None])
-    found[:, 2] = np.maximum(found[:, 2], LEAST_Z)
-    found[np.abs(volume) < LEAST_VOLUME] = (0.0, 0.0, 1.0)
+    found[:, 2] = np.maximum(found[:, 2], MIN_TANGENT_Z)
+    found[np.abs(volume) < MIN_FRAME_VOLUME] = (0.0, 0.0, 1.0)
     out[good] = _unit(found)
     return out
 
@@ -220,7 +220,7 @@ def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     if not valid.any():
         return np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), given.shape).copy()
     spread = push_pull(given, valid.astype(np.float32)).values.astype(np.float64)
-    spread[..., 2] = np.maximum(spread[..., 2], LEAST_Z)
+    spread[..., 2] = np.maximum(spread[..., 2], MIN_TANGENT_Z)
     return np.where(valid[..., None], given, _unit(spread)).astype(np.float32)
 
 
@@ -253,4 +253,6 @@ def _any_across(normals: Float64Array) -> Float64Array:
 
 def _unit(vectors: Float64Array) -> Float64Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > LEAST, vectors / np.maximum(length, LEAST), 0.0)
+    return np.where(
+        length > MIN_VECTOR_LENGTH, vectors / np.maximum(length, MIN_VECTOR_LENGTH), 0.0
+    )

@@ -19,9 +19,9 @@ from skinrig.arrays import Float32Array, FloatArray, Int32Array
 from skinrig.exporting.options import FIRST_TILE
 from skinrig.exporting.sealing import ExportError
 
-ROW: Final = 10
+TILES_PER_ROW: Final = 10
 """Tiles side by side before the next row begins."""
-ROUNDING: Final = 1e-5
+UV_ROUNDING: Final = 1e-5
 """Of coordinates on a tile's border."""
 
 
@@ -104,7 +104,9 @@ def tiles_of(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     """
     corners = np.asarray(uv, np.float64)[faces]
     cell = np.floor(corners.mean(axis=1))
-    inside = (corners >= cell[:, None] - ROUNDING) & (corners <= cell[:, None] + 1.0 + ROUNDING)
+    inside = (corners >= cell[:, None] - UV_ROUNDING) & (
+        corners <= cell[:, None] + 1.0 + UV_ROUNDING
+    )
     across = np.flatnonzero(~inside.all(axis=(1, 2)))
     if len(across):
         low, high = corners[across[0]].min(axis=0), corners[across[0]].max(axis=0)
@@ -113,12 +115,12 @@ def tiles_of(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
             f"{high.round(3).tolist()} of the texture, expected each face on one UDIM tile; cut "
             "its texture along the tiles' borders"
         )
-    if len(cell) and (cell.min() < 0.0 or cell[:, 0].max() >= ROW):
+    if len(cell) and (cell.min() < 0.0 or cell[:, 0].max() >= TILES_PER_ROW):
         raise ExportError(
             f"--mesh: texture coordinates {corners.min():.3g} to {corners.max():.3g}, expected u "
-            f"from 0 to {ROW} and v from 0, as UDIM tiles are numbered"
+            f"from 0 to {TILES_PER_ROW} and v from 0, as UDIM tiles are numbered"
         )
-    return np.asarray(FIRST_TILE + cell[:, 0] + ROW * cell[:, 1], np.intp)
+    return np.asarray(FIRST_TILE + cell[:, 0] + TILES_PER_ROW * cell[:, 1], np.intp)
 
 
 def read(path: Path) -> TiledMesh:
@@ -132,7 +134,7 @@ def read(path: Path) -> TiledMesh:
         See `tiles_of`.
     """
     vertices, faces, uv, shapes = _contents(path)
-    if uv.min() >= -ROUNDING and uv.max() <= 1.0 + ROUNDING:
+    if uv.min() >= -UV_ROUNDING and uv.max() <= 1.0 + UV_ROUNDING:
         inside = np.clip(uv, 0.0, 1.0)
         return TiledMesh.of(build_mesh(vertices, faces, inside, shapes=shapes))
     # of a scaled copy of the texture: all else is checked as of any mesh

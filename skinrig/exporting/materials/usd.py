@@ -22,12 +22,12 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
+from skinrig.exporting.options import M_PER_MM, NORMAL_Y, UNITS_M, Delivery
 from skinrig.exporting.sealing import write_json
 
-FILE, DOCUMENT = "skin.usdc", "usd.json"
+USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
-ROOT: Final = "/Skin"
+ROOT_PRIM: Final = "/Skin"
 
 
 def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -61,20 +61,20 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
     unit = delivery.unit_or("m")
-    per_mm = materialx.MM_M / UNITS_M[unit]
+    per_mm = M_PER_MM / UNITS_M[unit]
     tiles = material.left_out_of_mesh(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
-    out.png(material.image("specular_roughness", delivery), materialx.TEXTURES)
+    out.png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
     if delivery.with_errors:
         for image in material.error_images():
-            out.exr(image, materialx.TEXTURES)
-    stage = Usd.Stage.CreateNew(str(folder / FILE))
+            out.exr(image, materialx.TEXTURE_FOLDER)
+    stage = Usd.Stage.CreateNew(str(folder / USD_FILE))
     names = _geometry(stage, material, per_mm, UNITS_M[unit])
     _materials(stage, material, scale * per_mm, delivery)
     stage.GetRootLayer().Save()
     del stage
-    (folder / materialx.FILE).write_text(
+    (folder / materialx.MATERIALX_FILE).write_text(
         materialx.openpbr_document(material, scale, delivery), encoding="utf-8"
     )
     textures = (
@@ -82,10 +82,10 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         # Blender's level of 0.5 is the reflection of a dielectric
         ("Specular IOR Level", _place(delivery, "specular_weight", "exr"), 0.5),
     )
-    script = blender.Import(FILE, scale, None, textures).script()
-    (folder / blender.FILE).write_text(script, encoding="utf-8")
+    script = blender.Import(USD_FILE, scale, None, textures).script()
+    (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             **materialx.facts(
                 material, appearance, schema=SCHEMA, unit=unit, per_mm=per_mm, scale=scale
@@ -98,7 +98,8 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         *tiles,
         (
             "subsurface light and specular weight of UsdPreviewSurface",
-            f"it has no place for them: the mtlx network holds both; {blender.FILE} sets them",
+            "it has no place for them: the mtlx network holds both; "
+            f"{blender.SCRIPT_FILE} sets them",
         ),
     ]
     if not material.shapes:
@@ -115,9 +116,9 @@ def _geometry(stage: Any, material: Material, per_mm: float, unit_m: float) -> d
 
     UsdGeom.SetStageMetersPerUnit(stage, unit_m)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    root = UsdSkel.Root.Define(stage, ROOT)
+    root = UsdSkel.Root.Define(stage, ROOT_PRIM)
     stage.SetDefaultPrim(root.GetPrim())
-    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/Face")
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT_PRIM}/Face")
     framed = material.mesh
     points = framed.vertices_mm * per_mm
     mesh.CreatePointsAttr(array3(points))
@@ -138,12 +139,12 @@ def _geometry(stage: Any, material: Material, per_mm: float, unit_m: float) -> d
     names = {name: Tf.MakeValidIdentifier(name) for name in material.shapes}
     if not names:
         return names
-    skeleton = UsdSkel.Skeleton.Define(stage, f"{ROOT}/Skeleton")
+    skeleton = UsdSkel.Skeleton.Define(stage, f"{ROOT_PRIM}/Skeleton")
     skeleton.CreateJointsAttr(["root"])
     one = Vt.Matrix4dArray([Gf.Matrix4d(1.0)])
     skeleton.CreateBindTransformsAttr(one)
     skeleton.CreateRestTransformsAttr(one)
-    rest = UsdSkel.Animation.Define(stage, f"{ROOT}/Skeleton/Neutral")
+    rest = UsdSkel.Animation.Define(stage, f"{ROOT_PRIM}/Skeleton/Neutral")
     rest.CreateJointsAttr(["root"])
     rest.SetTransforms([Gf.Matrix4d(1.0)])
     rest.CreateBlendShapesAttr(list(names.values()))
@@ -156,7 +157,7 @@ def _geometry(stage: Any, material: Material, per_mm: float, unit_m: float) -> d
     skinned.CreateJointWeightsPrimvar(True, 1).Set([1.0])
     targets = []
     for name, moved in material.shapes.items():
-        shape = UsdSkel.BlendShape.Define(stage, f"{ROOT}/Face/{names[name]}")
+        shape = UsdSkel.BlendShape.Define(stage, f"{ROOT_PRIM}/Face/{names[name]}")
         shape.CreateOffsetsAttr(array3(moved * per_mm))
         targets.append(shape.GetPath())
     skinned.CreateBlendShapesAttr(list(names.values()))
@@ -167,13 +168,13 @@ def _geometry(stage: Any, material: Material, per_mm: float, unit_m: float) -> d
 def _materials(stage: Any, material: Material, radius: float, delivery: Delivery) -> None:
     from pxr import Sdf, UsdShade, Vt
 
-    place = f"{ROOT}/Materials/Skin"
+    place = f"{ROOT_PRIM}/Materials/Skin"
     made = UsdShade.Material.Define(stage, place)
     told = material.sigma_tr()
     for key in ("sigma_tr_per_mm", "translucency_mm"):
         made.GetPrim().SetCustomDataByKey(key, Vt.DoubleArray(told[key]))
-    made.GetPrim().SetCustomDataByKey("materialx", Sdf.AssetPath(f"./{materialx.FILE}"))
-    mesh = stage.GetPrimAtPath(f"{ROOT}/Face")
+    made.GetPrim().SetCustomDataByKey("materialx", Sdf.AssetPath(f"./{materialx.MATERIALX_FILE}"))
+    mesh = stage.GetPrimAtPath(f"{ROOT_PRIM}/Face")
     UsdShade.MaterialBindingAPI.Apply(mesh).Bind(made)
     preview = _preview(stage, place, material, delivery)
     made.CreateSurfaceOutput().ConnectToSource(preview.ConnectableAPI(), "surface")
@@ -182,7 +183,7 @@ def _materials(stage: Any, material: Material, radius: float, delivery: Delivery
 
 
 def _place(delivery: Delivery, name: str, suffix: str) -> str:
-    return f"{materialx.TEXTURES}/{delivery.referred(name, suffix)}"
+    return f"{materialx.TEXTURE_FOLDER}/{delivery.referred(name, suffix)}"
 
 
 def _texture(delivery: Delivery, name: str, suffix: str) -> Any:
@@ -237,7 +238,7 @@ def _openpbr(stage: Any, place: str, material: Material, radius: float, delivery
         file = node.CreateInput("file", types.Asset)
         file.Set(_texture(delivery, name, suffix))
         if name == "base_color":
-            file.GetAttr().SetColorSpace(materialx.LINEAR)
+            file.GetAttr().SetColorSpace(materialx.LINEAR_SRGB_NAME)
         node.CreateOutput("out", kind)
         return node.ConnectableAPI()
 

@@ -13,14 +13,14 @@ from model.skin import SkinAppearance
 from model.texture_resampling import resampled
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder
+from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
 
-COLOR_SIZE, MOST = 512, 3
+COLOR_SIZE, MAX_STATES = 512, 3
 NEUTRAL: Final = "neutral"
 LANDMARK_STDERR_PX: Final = 1.0
-LEAST_SHARE: Final = 0.5
+MIN_KNOWN_FRACTION: Final = 0.5
 """Share of a pixel that must be known for it to count."""
 
 
@@ -84,7 +84,7 @@ def write(
         name="base_color",
         values=_filled(colors.base, colors.valid),
         unit="1",
-        space=SRGB,
+        space=SRGB_SPACE,
         what=f"neutral base color on {colors.layout}; {colors.space}; holes filled",
         valid=colors.valid,
     )
@@ -155,7 +155,7 @@ def _colors(
         deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
         layout = f"the flash camera's picture, {width} x {height}, stretched to a square"
-        return Colors(base, deltas, valid, layout, SRGB)
+        return Colors(base, deltas, valid, layout, SRGB_SPACE)
     return _on_texture(delivery, shown, seen, states)
 
 
@@ -191,7 +191,7 @@ def _on_texture(
         deltas[state][~told] = 0.0
         valid &= told
     layout = f"the texture of {delivery.onto.name}, by landmarks"
-    return Colors(base, deltas, valid, layout, CAMERA)
+    return Colors(base, deltas, valid, layout, CAMERA_SPACE)
 
 
 def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
@@ -240,7 +240,7 @@ def _looked_up(
         map_coordinates(np.where(seen, values[..., c], 0.0), at, order=1, cval=0.0)
         for c in range(values.shape[-1])
     ]
-    told = share >= LEAST_SHARE
+    told = share >= MIN_KNOWN_FRACTION
     return np.stack(layers, axis=-1) / np.where(told, share, 1.0)[..., None], told
 
 
@@ -248,9 +248,9 @@ def chosen(have: list[str], delivery: Delivery, what: str, left_out: Any) -> lis
     """Return up to three states, those asked for first of all."""
     asked = [name for name in delivery.only if name in have]
     names = asked if delivery.only else have
-    for name in names[MOST:]:
-        left_out.append((f"{what} of {name}", f"a face has {MOST}; choose with --only"))
-    return names[:MOST]
+    for name in names[MAX_STATES:]:
+        left_out.append((f"{what} of {name}", f"a face has {MAX_STATES}; choose with --only"))
+    return names[:MAX_STATES]
 
 
 def sized(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Array, BoolArray]:
@@ -258,5 +258,5 @@ def sized(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Arr
     layers = np.moveaxis(np.where(valid[..., None], values, 0.0), -1, 0)
     share = resampled(valid.astype(np.float64), (size, size))
     found = np.moveaxis(resampled(layers, (size, size)), 0, -1)
-    good = share >= LEAST_SHARE
+    good = share >= MIN_KNOWN_FRACTION
     return np.where(good[..., None], found / np.where(good, share, 1.0)[..., None], 0.0), good

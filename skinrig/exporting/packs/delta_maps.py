@@ -29,10 +29,10 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.packs import color_deltas, detail_maps
-from skinrig.exporting.provenance import ORIENTATION, provenance
+from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
 
-DOCUMENT: Final = "delta_maps.json"
+DOCUMENT_FILE: Final = "delta_maps.json"
 SCHEMA: Final = "skinrig.export.delta-maps/1"
 NORMAL_SIZE: Final = 1024
 COLOR_CODING: Final = "linear: shown = base + weight * delta; PNG: delta = 2 code / 65535 - 1"
@@ -117,11 +117,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         )
     green = "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)"
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             **provenance(appearance),
             "schema": SCHEMA,
-            "orientation": ORIENTATION,
+            "orientation": IMAGE_ORIENTATION,
             "normal_y": green,
             "color_coding": COLOR_CODING,
             "normal_coding": NORMAL_CODING,

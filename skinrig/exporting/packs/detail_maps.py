@@ -22,15 +22,15 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.packs import color_deltas
-from skinrig.exporting.packs.seamless import FADE, periodic, periodic_normals
+from skinrig.exporting.packs.seamless import FADE_DIVISOR, periodic, periodic_normals
 
-DIRECTIONS: Final = 16
-REACH_PX: Final = 16
+HORIZON_DIRECTIONS: Final = 16
+HORIZON_REACH_PX: Final = 16
 """How far relief shades, texels of the measured map."""
 SCATTER_SIZE: Final = 512
-SCATTER_MM: Final = 16.0
+MAX_SCATTER_MM: Final = 16.0
 """Translucency of the PNG code 65535."""
-UM_MM: Final = 0.001
+MM_PER_UM: Final = 0.001
 
 
 def cavity(
@@ -73,15 +73,15 @@ def cavity(
         high=1.0,
         valid=known,
         what="share of light from all around that relief leaves at a place: 1 on ridges and flat "
-        f"skin; horizons of {REACH_PX} measured texels in {DIRECTIONS} directions; 1 where nothing "
-        "was measured",
+        f"skin; horizons of {HORIZON_REACH_PX} measured texels in {HORIZON_DIRECTIONS} "
+        "directions; 1 where nothing was measured",
     )
     out.exr(image)
     out.png(image)
     return {
         "cavity": {
             "of": "heights integrated from the neutral wrinkle normals",
-            "reach_texels": REACH_PX,
+            "reach_texels": HORIZON_REACH_PX,
             "measured_size": list(slopes.shape[:2]),
             "least": float(values[known].min()),
             "median": float(np.median(values[known])),
@@ -118,16 +118,16 @@ def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
     z, number = np.asarray(height, np.float64), np.asarray(part)
     rows, columns = np.mgrid[0 : z.shape[0], 0 : z.shape[1]].astype(np.float64)
     total = np.zeros(z.shape)
-    for k in range(DIRECTIONS):
-        angle = 2.0 * np.pi * (k + 0.5) / DIRECTIONS
+    for k in range(HORIZON_DIRECTIONS):
+        angle = 2.0 * np.pi * (k + 0.5) / HORIZON_DIRECTIONS
         slope = np.zeros(z.shape)
-        for step in range(1, REACH_PX + 1):
+        for step in range(1, HORIZON_REACH_PX + 1):
             at = np.stack([rows + step * np.sin(angle), columns + step * np.cos(angle)])
             there = map_coordinates(z, at, order=1, mode="nearest")
             same = _among(number, at)
             slope = np.where(same, np.maximum(slope, (there - z) / step), slope)
         total += slope**2 / (1.0 + slope**2)
-    return np.asarray(1.0 - total / DIRECTIONS)
+    return np.asarray(1.0 - total / HORIZON_DIRECTIONS)
 
 
 def _among(number: NDArray[Any], at: Float64Array) -> BoolArray:
@@ -184,7 +184,7 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
         values=np.where(valid[..., None], shown, usual),
         unit="mm",
         low=0.0,
-        high=SCATTER_MM,
+        high=MAX_SCATTER_MM,
         valid=valid,
         what="1/sigma_tr in red, green and blue; the median where it is not known",
     )
@@ -262,7 +262,7 @@ def micro_normals(
             "slope_rms": float(np.sqrt(np.mean(np.sum(slope**2, axis=-1)))),
             "height_rms_um": float(tile.std()),
             "measured_mm": _size_mm(height, pixel_um),
-            "faded_share": 1.0 - (1.0 - 1.0 / FADE) ** 2,  # so that it repeats
+            "faded_share": 1.0 - (1.0 - 1.0 / FADE_DIVISOR) ** 2,  # so that it repeats
             "valid_share": float(valid.mean()),
         }
     return ({"micro": told} if told else {}), left_out
@@ -271,4 +271,4 @@ def micro_normals(
 def _size_mm(height: Float64Array, pixel_um: float) -> list[float]:
     """Return width and height of a map on the skin, mm."""
     rows, columns = height.shape
-    return [UM_MM * pixel_um * columns, UM_MM * pixel_um * rows]
+    return [MM_PER_UM * pixel_um * columns, MM_PER_UM * pixel_um * rows]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from skinrig.arrays import Float64Array
 
-FADE: Final = 8
+FADE_DIVISOR: Final = 8
 """One part of so many of a tile is faded into what lies beyond its other end."""
 
 
@@ -38,7 +38,7 @@ def periodic(image: ArrayLike) -> Float64Array:
     found = np.asarray(image, np.float64)
     for axis in (0, 1):
         found = np.moveaxis(found, axis, 0)
-        band = len(found) // FADE
+        band = len(found) // FADE_DIVISOR
         size = len(found) - band
         # 0 with a slope of 0 at the beginning, 1 with a slope of 0 at the end
         share = np.sin(0.5 * np.pi * np.sin(0.5 * np.pi * np.arange(band) / band) ** 2)

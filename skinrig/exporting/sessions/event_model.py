@@ -18,9 +18,9 @@ from typing import Any
 from capture.plan import Value
 from capture.session import FrameRecord, Session
 
-SPEC = "SKINRIG_DNG"
+HANDLER_SPEC = "SKINRIG_DNG"
 """Name of the handler that opens a datum: ``handler(resource_path)(file=...)`` reads a DNG."""
-_UNITS = {"_s": "s", "_deg": "deg", "_w": "W", "_mm": "mm", "_us": "us"}
+_UNIT_SUFFIXES = {"_s": "s", "_deg": "deg", "_w": "W", "_mm": "mm", "_us": "us"}
 
 Document = tuple[str, dict[str, Any]]
 
@@ -46,7 +46,7 @@ def documents(session: Session) -> Iterator[Document]:
         {
             "uid": resource,
             "run_start": start,
-            "spec": SPEC,
+            "spec": HANDLER_SPEC,
             "root": ".",
             "resource_path": "frames",
             "path_semantics": "posix",
@@ -159,4 +159,4 @@ def _dtype(value: Value) -> str:
 
 
 def _unit(key: str) -> dict[str, str]:
-    return next(({"units": unit} for end, unit in _UNITS.items() if key.endswith(end)), {})
+    return next(({"units": unit} for end, unit in _UNIT_SUFFIXES.items() if key.endswith(end)), {})

@@ -15,7 +15,7 @@ from skinrig.errors import UsageError
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
 from skinrig.exporting.sessions.event_model import documents
 
-FRAMES, DOCUMENTS = "frames", "documents.jsonl"
+FRAMES_FOLDER, DOCUMENTS_FILE = "frames", "documents.jsonl"
 
 
 def export_session(
@@ -36,8 +36,8 @@ def export_session(
     out
         New folder.
     to
-        One of `FORMATS`: "mhl" (the whole session), "frames" (DNG files alone), "event-model" (the
-        frames, and documents.jsonl as Bluesky's event model describes a run).
+        One of `SESSION_FORMATS`: "mhl" (the whole session), "frames" (DNG files alone),
+        "event-model" (the frames, and documents.jsonl as Bluesky's event model describes a run).
     use
         What the copy is for; must lie within the consent's scope, on a day before it ends.
     today, now
@@ -52,11 +52,11 @@ def export_session(
     SessionError
         Where the session is damaged.
     """
-    if to not in FORMATS:
-        raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
+    if to not in SESSION_FORMATS:
+        raise ExportError(f"to: got {to!r}, expected one of {', '.join(SESSION_FORMATS)}")
     target = fresh(out)
     session = allowed(session_path, use, today=today)
-    return sealed(target, lambda part: FORMATS[to](session, part), now)
+    return sealed(target, lambda part: SESSION_FORMATS[to](session, part), now)
 
 
 def allowed(path: str | Path, use: str, *, today: date | None = None) -> Session:
@@ -69,7 +69,7 @@ def allowed(path: str | Path, use: str, *, today: date | None = None) -> Session
     return session
 
 
-def named(use: str | None) -> str:
+def require_use(use: str | None) -> str:
     """Return the use that a command line names.
 
     Raises
@@ -94,19 +94,19 @@ def _copy_all(session: Session, out: Path) -> None:
 
 
 def _copy_frames(session: Session, out: Path) -> None:
-    (out / FRAMES).mkdir()
+    (out / FRAMES_FOLDER).mkdir()
     for record in session.frames():
         (out / record.file).write_bytes(check_file(session.path / record.file, record.line))
 
 
 def _copy_documents(session: Session, out: Path) -> None:
     _copy_frames(session, out)
-    with (out / DOCUMENTS).open("w", encoding="utf-8") as stream:
+    with (out / DOCUMENTS_FILE).open("w", encoding="utf-8") as stream:
         for name, document in documents(session):
             stream.write(json.dumps([name, document], allow_nan=False) + "\n")
 
 
-FORMATS: Mapping[str, Callable[[Session, Path], None]] = {
+SESSION_FORMATS: Mapping[str, Callable[[Session, Path], None]] = {
     "mhl": _copy_all,
     "frames": _copy_frames,
     "event-model": _copy_documents,

@@ -17,14 +17,14 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UI
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
 
-NAME: Final = "lp"
-LIST, POSITIONS, DOCUMENT = "lights.lp", "positions_mm.txt", "lights.json"
+LIGHT_LIST_FORMAT: Final = "lp"
+LIST_FILE, POSITIONS_FILE, DOCUMENT_FILE = "lights.lp", "positions_mm.txt", "lights.json"
 SCHEMA: Final = "skinrig.export.lights/1"
-TOP: Final = 65535
+SATURATED_CODE: Final = 65535
 """Code of saturated pixels; unsaturated ones stay below."""
-BRIGHT_SHARE: Final = 1e-4
+MAX_BRIGHT_FRACTION: Final = 1e-4
 """Share of a picture's values that may lie above the scale: single sparkles do not set it."""
-_UP = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
+_CAMERA_TO_LIST_SIGNS = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
 
 
 def export_light_list(
@@ -113,7 +113,7 @@ def _write(
 
     # twice through the pictures instead of all of them in memory
     top = max(_top(*picture(k)) for k in good)
-    scale = (TOP - 1) / top if top > 0.0 else 1.0
+    scale = (SATURATED_CODE - 1) / top if top > 0.0 else 1.0
     clipped: dict[str, float] = {}
     for k, name in zip(good, names, strict=True):
         codes, clipped[name] = _coded(*picture(k), scale)
@@ -126,22 +126,22 @@ def _write(
             software=False,
         )
     rows = [f"{n} {x:.9f} {y:.9f} {z:.9f}" for n, (x, y, z) in zip(names, toward, strict=True)]
-    (folder / LIST).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
+    (folder / LIST_FILE).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
     near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
-    (folder / POSITIONS).write_text(near, encoding="ascii")
+    (folder / POSITIONS_FILE).write_text(near, encoding="ascii")
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             "schema": SCHEMA,
             "frame": "x right, y up, z towards the camera; directions from the rig's origin",
             "encoding": f"linear camera values: fraction of full scale, per second of light where "
-            f"the exposure is known, = code / {scale:.9g}; {TOP} is saturated",
+            f"the exposure is known, = code / {scale:.9g}; {SATURATED_CODE} is saturated",
             "code_per_rate": scale,
             "clipped_share": clipped,
             "camera": images.views[view],
             "mm_per_px": dome.pixel_mm,
-            "near_lights": f"{POSITIONS}: mm around the rig's origin; `skinrig import lp DIR "
-            f"--lights DIR/{POSITIONS} --mm-per-px {dome.pixel_mm:.6g}`",
+            "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
+            f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
             "source": session.source,
             "inputs": evidence.hashes,
             "assumed": list(evidence.assumed),
@@ -168,7 +168,7 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
     >>> in_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
     [[0.0, -10.0, 700.0]]
     """
-    return np.asarray((position_mm @ np.asarray(rotation).T) * _UP)
+    return np.asarray((position_mm @ np.asarray(rotation).T) * _CAMERA_TO_LIST_SIGNS)
 
 
 def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
@@ -201,12 +201,12 @@ def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, Bo
 
 def _top(values: Float32Array, valid: BoolArray) -> float:
     shown = values[valid]
-    return float(np.quantile(shown, 1.0 - BRIGHT_SHARE)) if shown.size else 0.0
+    return float(np.quantile(shown, 1.0 - MAX_BRIGHT_FRACTION)) if shown.size else 0.0
 
 
 def _coded(values: Float32Array, valid: BoolArray, scale: float) -> tuple[UInt16Array, float]:
     codes = np.rint(np.nan_to_num(values.astype(np.float64)) * scale)
-    beyond = codes > TOP - 1
+    beyond = codes > SATURATED_CODE - 1
     beyond = (beyond if codes.ndim == 2 else beyond.any(axis=-1)) | ~valid
-    codes[beyond] = TOP
-    return np.clip(codes, 0, TOP).astype(np.uint16), float(beyond.mean())
+    codes[beyond] = SATURATED_CODE
+    return np.clip(codes, 0, SATURATED_CODE).astype(np.uint16), float(beyond.mean())

@@ -21,12 +21,12 @@ from model.skin import SkinAppearance
 from skinrig.arrays import Float64Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import Delivery
-from skinrig.exporting.provenance import ORIENTATION, provenance
+from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
 
-REFLECTANCE, STOKES, DOCUMENT = "reflectance.exr", "stokes.exr", "spectral.json"
+REFLECTANCE_FILE, STOKES_FILE, DOCUMENT_FILE = "reflectance.exr", "stokes.exr", "spectral.json"
 SCHEMA: Final = "skinrig.export.spectral/1"
-LAYOUT: Final = "1.0"
+LAYOUT_VERSION: Final = "1.0"
 """Version of the published layout."""
 
 
@@ -56,13 +56,13 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     files: dict[str, Any] = {}
     maps = appearance.maps
     if {"melanin", "hemoglobin"} <= set(maps):
-        files[REFLECTANCE] = _reflectance(appearance, folder)
+        files[REFLECTANCE_FILE] = _reflectance(appearance, folder)
     else:
-        left_out.append((REFLECTANCE, "the maps lack melanin or hemoglobin"))
+        left_out.append((REFLECTANCE_FILE, "the maps lack melanin or hemoglobin"))
     if {"diffuse", "specular"} <= set(maps):
-        files[STOKES] = _stokes(appearance, folder)
+        files[STOKES_FILE] = _stokes(appearance, folder)
     else:
-        left_out.append((STOKES, "the maps lack diffuse or specular"))
+        left_out.append((STOKES_FILE, "the maps lack diffuse or specular"))
     if not files:
         raise ExportError(
             f"spectral: got maps {', '.join(sorted(maps)) or 'none'}, expected melanin and "
@@ -74,11 +74,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
                 mask = np.asarray(maps[name].valid, np.float32)
                 write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             **provenance(appearance),
             "schema": SCHEMA,
-            "orientation": ORIENTATION,
+            "orientation": IMAGE_ORIENTATION,
             "files": files,
             "left_out": [list(row) for row in left_out],
         },
@@ -144,7 +144,9 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "the two-layer skin with the estimated melanin and hemoglobin; 0 where they are not known"
     )
     write_channels(
-        folder / REFLECTANCE, channels, {"spectralLayoutVersion": LAYOUT, "comments": what}
+        folder / REFLECTANCE_FILE,
+        channels,
+        {"spectralLayoutVersion": LAYOUT_VERSION, "comments": what},
     )
     return {
         "what": what,
@@ -181,12 +183,12 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "same place = 1"
     )
     attributes = {
-        "spectralLayoutVersion": LAYOUT,
+        "spectralLayoutVersion": LAYOUT_VERSION,
         "emissiveUnits": "1",
         "polarisationHandedness": "right",
         "comments": what,
     }
-    write_channels(folder / STOKES, channels, attributes)
+    write_channels(folder / STOKES_FILE, channels, attributes)
     return {
         "what": what,
         "origin": "measured",

@@ -26,10 +26,10 @@ from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
-from skinrig.exporting.sessions.spectral import LAYOUT, channel
+from skinrig.exporting.sessions.spectral import LAYOUT_VERSION, channel
 
-NAME: Final = "stokes"
-DOCUMENT: Final = "stokes.json"
+STOKES_FORMAT: Final = "stokes"
+DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
 S0, S1 = "S0", "S1"
@@ -140,7 +140,7 @@ def _write(
         "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
     )
     header = {
-        "spectralLayoutVersion": LAYOUT,
+        "spectralLayoutVersion": LAYOUT_VERSION,
         "emissiveUnits": "1",
         "polarisationHandedness": "right",
         "comments": what,
@@ -181,7 +181,7 @@ def _write(
             "expected `skinrig plan gradient` with both polarizations"
         )
     write_json(
-        folder / DOCUMENT,
+        folder / DOCUMENT_FILE,
         {
             "schema": SCHEMA,
             "what": what,

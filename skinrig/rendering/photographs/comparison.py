@@ -9,10 +9,10 @@ from typing import Any, Final
 
 from skinrig.console import Console
 from skinrig.evaluating.skin_bands import bands_of
-from skinrig.rendering.photographs.errors import LEAST_SIGNAL, LIMIT, Summary
+from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR, MIN_SIGNAL_SIGMAS, Summary
 from skinrig.rendering.render import Subsurface
 
-FULL: Final = "full model"
+FULL_MODEL: Final = "full model"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class Comparison:
     @property
     def passed(self) -> bool:
         """Whether the median relative error keeps to the limit."""
-        return self.full.median < LIMIT
+        return self.full.median < MAX_MEDIAN_ERROR
 
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
@@ -71,12 +71,12 @@ class Comparison:
             "typology_of": self.typology_of,
             "lit_pixels": (
                 "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
-                f"saturated, at least {LEAST_SIGNAL:g} times its noise"
+                f"saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"
             ),
-            "limit": LIMIT,
+            "limit": MAX_MEDIAN_ERROR,
             "passed": self.passed,
             "subsurface": self.subsurface,
-            FULL: dataclasses.asdict(self.full),
+            FULL_MODEL: dataclasses.asdict(self.full),
             "by_kind": {k: dataclasses.asdict(v) for k, v in self.by_kind.items()},
             "ablation": {k: dataclasses.asdict(v) for k, v in self.ablation.items()},
             "by_band": {
@@ -89,12 +89,12 @@ class Comparison:
         }
 
 
-def tell(console: Console, record: Mapping[str, Any]) -> None:
+def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     """Print a record of `evaluate_folders`."""
     for assumption in record["assumed"]:
         console.say(f"assumed: {assumption}")
-    full = record[FULL]
-    rows = [(FULL, full), *record["by_kind"].items(), *record["ablation"].items()]
+    full = record[FULL_MODEL]
+    rows = [(FULL_MODEL, full), *record["by_kind"].items(), *record["ablation"].items()]
     console.rows(
         ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
         [

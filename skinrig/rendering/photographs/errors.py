@@ -6,8 +6,9 @@ in place of its primaries.
 
 A pixel counts as **lit** where it and its eight neighbors lie wholly on skin that was measured and
 every ray of them sees the whole light, by the geometry that is rendered; and where the photograph
-is not saturated and at least `LEAST_SIGNAL` times its own noise. How well the two agree has no part
-in it. Everything else on the skin, shadows and their borders, counts in `total_error` only.
+is not saturated and at least `MIN_SIGNAL_SIGMAS` times its own noise. How well the
+two agree has no part in it. Everything else on the skin, shadows and their borders, counts in
+`total_error` only.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from scipy import ndimage
 
 from skinrig.arrays import BoolArray, Float64Array
 
-LUMINANCE: Final = (0.2126, 0.7152, 0.0722)
-LEAST_SIGNAL: Final = 10.0
+LUMINANCE_WEIGHTS: Final = (0.2126, 0.7152, 0.0722)
+MIN_SIGNAL_SIGMAS: Final = 10.0
 """Times its standard deviation that a photograph's luminance must be."""
-LIMIT: Final = 0.05
+MAX_MEDIAN_ERROR: Final = 0.05
 """Median relative error of the luminance on lit pixels that a model has to stay below."""
-PERCENTILES: Final = (50.0, 68.0, 90.0, 95.0)
+ERROR_PERCENTILES: Final = (50.0, 68.0, 90.0, 95.0)
 WHITE_PERCENTILE: Final = 99.0
 """Luminance of a photograph's skin that is shown as white before structures are compared."""
 
@@ -104,7 +105,7 @@ def luminance(rgb: ArrayLike) -> Float64Array:
     >>> round(float(luminance([1.0, 1.0, 1.0])), 6)
     1.0
     """
-    return np.asarray(np.asarray(rgb, np.float64) @ np.array(LUMINANCE))
+    return np.asarray(np.asarray(rgb, np.float64) @ np.array(LUMINANCE_WEIGHTS))
 
 
 def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> BoolArray:
@@ -123,7 +124,7 @@ def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) ->
         np.asarray(covered, bool) & np.asarray(lit, bool), np.ones((3, 3)), border_value=0
     )
     return np.asarray(
-        inner & photograph.valid & (light > 0) & (light >= LEAST_SIGNAL * sigma) & (sigma > 0)
+        inner & photograph.valid & (light > 0) & (light >= MIN_SIGNAL_SIGMAS * sigma) & (sigma > 0)
     )
 
 
@@ -254,7 +255,7 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
     if not values or not sum(len(v) for v in values):
         raise PhotographError("photographs: got no lit pixel; are they underexposed?")
     every = np.concatenate(values)
-    p50, p68, p90, p95 = (float(p) for p in np.percentile(every, PERCENTILES))
+    p50, p68, p90, p95 = (float(p) for p in np.percentile(every, ERROR_PERCENTILES))
     again = [
         float(np.median(np.concatenate(drawn)))
         for drawn in (
@@ -301,4 +302,6 @@ def by_band(
 
 
 def _sigma(photograph: Photograph) -> Float64Array:
-    return np.asarray(np.sqrt(np.asarray(photograph.variance, np.float64) @ np.square(LUMINANCE)))
+    return np.asarray(
+        np.sqrt(np.asarray(photograph.variance, np.float64) @ np.square(LUMINANCE_WEIGHTS))
+    )

@@ -26,17 +26,24 @@ from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.photographs import errors as photograph_errors
 from skinrig.rendering.photographs.ablation import without_parts
-from skinrig.rendering.photographs.comparison import FULL, Comparison, tell
+from skinrig.rendering.photographs.comparison import FULL_MODEL, Comparison, print_comparison
 from skinrig.rendering.photographs.errors import PairError, Photograph, Summary
 from skinrig.rendering.photographs.held_out import Photographs, Shot
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
 
-__all__ = ["FULL", "Comparison", "evaluate", "evaluate_folders", "reflectance_share", "tell"]
+__all__ = [
+    "FULL_MODEL",
+    "Comparison",
+    "evaluate",
+    "evaluate_folders",
+    "print_comparison",
+    "reflectance_share",
+]
 
-PICTURES: Final = 6
+N_PICTURES: Final = 6
 """Photographs that are drawn beside their renderings, even over all."""
-ERROR_SHOWN: Final = 0.2
+MAX_SHOWN_ERROR: Final = 0.2
 """Relative error at the end of the pictures' scale."""
 
 Tell = Callable[[str], None]
@@ -120,7 +127,7 @@ def evaluate(
         for name, less in (without_parts(whole, mesh) if ablation else {}).items()
     }
     chosen = photographs.chosen(count)
-    drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(PICTURES, len(chosen)))}
+    drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_PICTURES, len(chosen)))}
     pairs: list[PairError] = []
     bands: list[NDArray[np.str_]] = []
     parts: dict[str, list[PairError]] = {}
@@ -285,13 +292,15 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
     exposure = exposure_of(np.where(made.covered[..., None], photo.rgb, 0.0), made.coverage)
     on = made.coverage[..., None] > 0.5
     shown = [tone(np.where(on, image, 0.0), exposure) for image in (photo.rgb, made.radiance)]
-    error = png.colorize(pair.signed, -ERROR_SHOWN, ERROR_SHOWN, scale="RdBu_r", valid=pair.lit)
+    error = png.colorize(
+        pair.signed, -MAX_SHOWN_ERROR, MAX_SHOWN_ERROR, scale="RdBu_r", valid=pair.lit
+    )
     return sheet(
         [
             [
                 Panel("photograph", shown[0]),
                 Panel("rendering", shown[1]),
-                Panel(f"error, red +{100 * ERROR_SHOWN:.0f} %", error),
+                Panel(f"error, red +{100 * MAX_SHOWN_ERROR:.0f} %", error),
             ]
         ],
         title=f"{shot.view} {shot.light} ({shot.held_out} held out): "

@@ -13,7 +13,13 @@ from model.skin import SkinAppearance
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
-from skinrig.appearances.dynamic import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
+from skinrig.appearances.dynamic import (
+    DYNAMIC_KIND,
+    FACIAL_COLOR,
+    MICROSTRUCTURE,
+    WRINKLES,
+    parts_of,
+)
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.reporting import map_images, page
@@ -40,7 +46,7 @@ ZONE_COLORS = np.array(
 
 def is_dynamic(appearance: SkinAppearance) -> bool:
     """Return whether an appearance holds fitted parts of a moving face."""
-    return appearance.parameters.get("kind") == KIND
+    return appearance.parameters.get("kind") == DYNAMIC_KIND
 
 
 def section(

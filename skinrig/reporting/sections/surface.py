@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from model.skin import SkinAppearance
-from skinrig.appearances.front_view import WIDTH_PX, FrontView
+from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX, FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
@@ -67,7 +67,7 @@ def section(
             continue
         values = skin_map.values[rows, columns]
         good = valid_of(skin_map)[rows, columns]
-        width = WIDTH_PX if key in large else SMALL_WIDTH_PX
+        width = FRONT_VIEW_WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
         known_truth = truth is not None and true_name in truth.maps

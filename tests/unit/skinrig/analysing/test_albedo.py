@@ -39,7 +39,7 @@ def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
         for group in told["groups"]
     }
     np.testing.assert_allclose(list(share.values()), 1.0, rtol=1e-4)
-    assert {path.name for path in out.iterdir()} == set(analysing_albedo.FILES)
+    assert {path.name for path in out.iterdir()} == set(analysing_albedo.OUTPUT_FILES)
     assert (out / "figure-16.png").read_bytes()[:4] == b"\x89PNG"
 
 

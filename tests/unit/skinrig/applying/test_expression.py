@@ -193,4 +193,4 @@ def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
         for name in ("one", "two")
     )
     assert first == second
-    assert expression.OBSERVER == "linear sRGB"
+    assert expression.COLOR_OBSERVER == "linear sRGB"

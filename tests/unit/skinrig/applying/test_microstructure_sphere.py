@@ -6,7 +6,12 @@ import pytest
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.applying import microstructure_sphere as spheres
-from skinrig.applying.microstructure_sphere import DEFORMATIONS, PLACES, Sphere, SphereError
+from skinrig.applying.microstructure_sphere import (
+    DEFORMATION_RATIOS,
+    ROUGHNESS_POINTS,
+    Sphere,
+    SphereError,
+)
 
 SPHERE = Sphere(texels=400, radius_mm=1.95)
 
@@ -26,7 +31,7 @@ def states(relief):
     """Spheres by name, with relief that follows and with relief that does not."""
     return {
         (name, dynamic): spheres.deform(SPHERE, relief, ratios, dynamic=dynamic)
-        for name, ratios in DEFORMATIONS.items()
+        for name, ratios in DEFORMATION_RATIOS.items()
         for dynamic in (True, False)
     }
 
@@ -50,7 +55,7 @@ def test_noise_has_the_slopes_of_its_spectrum_everywhere(states):
     """Differences over two pixels p have the variance (C(0) - C(2 p)) / (2 p^2). On all places
     alike: no seam, no pole. Tolerance 20 %: some hundred grains a place."""
     neutral = states["neutral", True]
-    for place, direction in PLACES.items():
+    for place, direction in ROUGHNESS_POINTS.items():
         near = SPHERE.points_mm() @ np.asarray(direction) > 1.95 * np.cos(0.4)
         p = 1e-3 * SPHERE.pixel_um()[near].mean()
         expected = (NOISE.covariance(0.0) - NOISE.covariance(2 * p)) / (2 * (1e3 * p) ** 2)
@@ -62,7 +67,7 @@ def test_noise_has_the_slopes_of_its_spectrum_everywhere(states):
 def test_shrunk_is_rougher_and_grown_is_smoother_by_more_than_the_stretch(states, name, sign):
     """In both directions alike, at all places; and more than unchanged heights would be."""
     neutral, moved, fixed = states["neutral", True], states[name, True], states[name, False]
-    for place in PLACES:
+    for place in ROUGHNESS_POINTS:
         for before, after, unchanged in zip(
             *(one.roughness(place) for one in (neutral, moved, fixed)), strict=True
         ):
@@ -98,8 +103,8 @@ def test_grown_patches_keep_their_slopes_over_the_chart(rng):
     skin = make_micro_skin("cheek", seed=1, size_mm=4.0, texel_um=16.0)
     patch = skin.height_um - skin.height_um.mean()
     relief = SPHERE.grown_relief([patch], patch_pixel_um=16.0, rng=rng)
-    neutral = spheres.deform(SPHERE, relief, DEFORMATIONS["neutral"])
-    found = [sum(neutral.roughness(place, within_rad=0.4)) for place in PLACES]
+    neutral = spheres.deform(SPHERE, relief, DEFORMATION_RATIOS["neutral"])
+    found = [sum(neutral.roughness(place, within_rad=0.4)) for place in ROUGHNESS_POINTS]
     assert max(found) / min(found) < 1.4
 
 

@@ -115,7 +115,7 @@ def test_names_that_nothing_answers_to_are_refused_and_nothing_is_written(folder
 
 
 def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
-    monkeypatch.setattr("skinrig.applying.relief.ASIDE_FROM_PX", 256)
+    monkeypatch.setattr("skinrig.applying.relief.MAX_EXR_SIDE_PX", 256)
     out = tmp_path / "out"
     applied(folder, sheet, out, {"drawn": 1.0})
     large = np.load(tmp_path / "out-large" / "displacement.npy", mmap_mode="r")

@@ -14,7 +14,7 @@ from skinrig.appearances import face_textures
 from skinrig.cli import main
 from skinrig.drawing import png
 from skinrig.editing import edit as editing
-from skinrig.editing.edit import EditError, Order
+from skinrig.editing.edit import EditError, EditRequest
 from skinrig.editing.spots import SpotOrder
 
 
@@ -62,7 +62,7 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
 
 
 def test_a_tan_darkens_by_what_it_did_in_the_population_and_only_the_albedo(source, library):
-    done = editing.edited(source, Order(traits={"tan": 1.0}), library)
+    done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
     assert done.changed == ("r_d",)
     old, new = source.appearance.maps["r_d"], done.appearance.maps["r_d"]
     good = old.valid
@@ -77,10 +77,10 @@ def test_a_tan_darkens_by_what_it_did_in_the_population_and_only_the_albedo(sour
 
 
 def test_an_edit_and_its_opposite_return_the_source_within_the_error_that_is_told(source, library):
-    order = Order(traits={"tan": 0.8, "oily": 0.6})
+    order = EditRequest(traits={"tan": 0.8, "oily": 0.6})
     there = editing.edited(source, order, library)
     face = dataclasses.replace(source, appearance=there.appearance)
-    opposite = Order(traits={"tan": -0.8, "oily": -0.6}, seed=7)
+    opposite = EditRequest(traits={"tan": -0.8, "oily": -0.6}, seed=7)
     back = editing.edited(face, opposite, library)
     good = source.r_d.valid
     moved = rms(there.appearance.maps["r_d"].values, source.r_d.values, good)
@@ -100,7 +100,7 @@ def test_an_edit_and_its_opposite_return_the_source_within_the_error_that_is_tol
 
 
 def test_oil_changes_the_lobes_as_it_did_in_the_population_and_not_the_albedo(source, library):
-    done = editing.edited(source, Order(traits={"oily": 1.0}), library)
+    done = editing.edited(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
     assert "lobe_residual" not in done.appearance.maps
     assert ("lobe_residual", "is of the lobes before the edit") in done.appearance.left_out
@@ -126,7 +126,7 @@ def test_a_mask_keeps_every_bit_where_it_is_black(traits, source, library, tmp_p
     mask = np.zeros(shape, np.uint8)
     mask[10:40, 8:24] = 255
     (tmp_path / "mask.png").write_bytes(png.encode(mask))
-    order = Order(
+    order = EditRequest(
         traits=traits, mask=tmp_path / "mask.png", spots=(SpotOrder("freckles", 1.0, 3.0),)
     )
     done = editing.edited(source, order, library)
@@ -139,7 +139,7 @@ def test_a_mask_keeps_every_bit_where_it_is_black(traits, source, library, tmp_p
 
 
 def test_a_region_changes_the_beard_and_not_the_forehead(source, library):
-    done = editing.edited(source, Order(traits={"tan": 1.0}, region="beard"), library)
+    done = editing.edited(source, EditRequest(traits={"tan": 1.0}, region="beard"), library)
     height = source.position[..., 1]
     good = source.r_d.valid
     ratio = done.appearance.maps["r_d"].values / source.r_d.values
@@ -150,7 +150,7 @@ def test_a_region_changes_the_beard_and_not_the_forehead(source, library):
 
 def test_an_edit_has_no_seam_between_the_islands_of_a_texture(source, library):
     """Both sides of the cut at height 0 darken alike."""
-    done = editing.edited(source, Order(traits={"tan": 1.0}), library)
+    done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
     change = np.log(done.appearance.maps["r_d"].values / source.r_d.values).mean(axis=-1)
     half = change.shape[1] // 2
     across = change[4:-4, half - 3] - change[4:-4, half + 2]
@@ -167,9 +167,11 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
     good = face.r_d.valid
     old = face.r_d.values[good]
     for amount in (2.0, -2.0):
-        new = editing.edited(face, Order(traits={"tan": amount}), library)
+        new = editing.edited(face, EditRequest(traits={"tan": amount}), library)
         spotted = dataclasses.replace(face, appearance=new.appearance)
-        moles = editing.edited(spotted, Order(traits={}, spots=(SpotOrder("moles", 1.0, 1.0),)))
+        moles = editing.edited(
+            spotted, EditRequest(traits={}, spots=(SpotOrder("moles", 1.0, 1.0),))
+        )
         for one in (new, moles):
             values = one.appearance.maps["r_d"].values[good]
             assert np.isfinite(values).all()
@@ -185,7 +187,7 @@ def test_reflectance_above_white_is_left_where_it_is_not_edited_and_never_made(s
     values[20:23, 12:15] = 1.3
     maps = {**source.appearance.maps, "r_d": dataclasses.replace(r_d, values=values)}
     face = dataclasses.replace(source, appearance=dataclasses.replace(source.appearance, maps=maps))
-    done = editing.edited(face, Order(traits={"tan": -1.0}), library)
+    done = editing.edited(face, EditRequest(traits={"tan": -1.0}), library)
     new = done.appearance.maps["r_d"].values
     assert new[r_d.valid].max() <= np.float32(1.3)
     outlier = (values > 1).any(axis=-1)
@@ -197,13 +199,13 @@ def test_a_face_without_lobes_is_edited_in_its_albedo(source, library):
     face = dataclasses.replace(
         source, appearance=dataclasses.replace(source.appearance, maps=maps, files={})
     )
-    assert editing.edited(face, Order(traits={"tan": 0.5}), library).changed == ("r_d",)
+    assert editing.edited(face, EditRequest(traits={"tan": 0.5}), library).changed == ("r_d",)
     with pytest.raises(EditError, match="the appearance has albedo"):
-        editing.edited(face, Order(traits={"oily": 1.0}, parts=("surface",)), library)
+        editing.edited(face, EditRequest(traits={"oily": 1.0}, parts=("surface",)), library)
 
 
 def test_the_same_seed_makes_the_same_face(source, library):
-    order = Order(traits={"tan": 1.0}, spots=(SpotOrder("freckles", 1.0),), seed=5)
+    order = EditRequest(traits={"tan": 1.0}, spots=(SpotOrder("freckles", 1.0),), seed=5)
     one, two = (editing.edited(source, order, library).appearance.maps["r_d"] for _ in range(2))
     np.testing.assert_array_equal(one.values, two.values)
     other = editing.edited(source, dataclasses.replace(order, seed=6), library)
@@ -248,7 +250,7 @@ def test_masks_that_are_none_are_refused_by_name(source, library, tmp_path):
     for name, says in (("black", "black everywhere"), ("wide", "64 x 32"), ("text", "as PNG")):
         with pytest.raises(ValueError, match=says):
             editing.edited(
-                source, Order(traits={"tan": 1.0}, mask=tmp_path / f"{name}.png"), library
+                source, EditRequest(traits={"tan": 1.0}, mask=tmp_path / f"{name}.png"), library
             )
 
 
@@ -348,5 +350,5 @@ def test_a_map_without_error_or_mask_is_edited_too(source, library):
     }
     maps = {**bare, "position": source.appearance.maps["position"]}
     face = dataclasses.replace(source, appearance=dataclasses.replace(source.appearance, maps=maps))
-    done = editing.edited(face, Order(traits={"tan": 1.0}), library)
+    done = editing.edited(face, EditRequest(traits={"tan": 1.0}), library)
     assert done.appearance.maps["r_d"].stderr is None

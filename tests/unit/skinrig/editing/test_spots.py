@@ -8,7 +8,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import common_parameterization, common_regions
 from reconstruction.correspondence.common_parameterization import Correspondence, find_cylinder
 from skinrig.editing import pigment_spots, spot_removal
-from skinrig.editing.pigment_spots import KINDS, SpotError
+from skinrig.editing.pigment_spots import SPOT_KINDS, SpotError
 
 SIDE = 120
 RIM = 8
@@ -57,7 +57,9 @@ def test_nothing_changes_outside_the_mask_and_by_an_amount_of_zero(cheek):
 
 def test_a_spot_has_the_color_of_more_melanin(cheek):
     """On the curve of the color table at the skin's own blood, and fainter on darker skin."""
-    table = build(pigment_spots.CAMERA, pigment_spots.ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+    table = build(
+        pigment_spots.DOME_CAMERA, pigment_spots.DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN
+    )
     position, _, on = cheek
 
     def left(c_m):
@@ -66,7 +68,7 @@ def test_a_spot_has_the_color_of_more_melanin(cheek):
             "freckles", skin, position, on, on, rng=np.random.default_rng(0)
         ).transmitted
 
-    expected = table.lookup(0.02 + KINDS["freckles"].melanin, 0.03) / table.lookup(0.02, 0.03)
+    expected = table.lookup(0.02 + SPOT_KINDS["freckles"].melanin, 0.03) / table.lookup(0.02, 0.03)
     np.testing.assert_allclose(left(0.02), expected, rtol=0.05)
     assert np.all(left(0.25) > left(0.02))
     assert np.all((left(0.25) > 0) & (left(0.25) <= 1))
@@ -96,7 +98,7 @@ def test_spots_that_were_added_are_found_and_taken_away(cheek, kind, density):
     spotted = skin * spots.gain
     chart, frame = chart_of(position, on)
     found = spot_removal.find(
-        spotted, on, chart, pixel_mm=frame.pixel_mm, range_mm=KINDS[kind].range_mm
+        spotted, on, chart, pixel_mm=frame.pixel_mm, range_mm=SPOT_KINDS[kind].range_mm
     )
     share = found.share[..., None]
     cleaned = spotted * (1 - share) + found.fill * share

@@ -12,7 +12,7 @@ from model.facial_color.document import to_maps
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.errors import UsageError
-from skinrig.exporting.appearances import FORMATS, export_appearance, export_brdfs
+from skinrig.exporting.appearances import APPEARANCE_FORMATS, export_appearance, export_brdfs
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
 
@@ -136,7 +136,7 @@ def test_a_failure_on_the_way_leaves_nothing(patch, tmp_path):
 def test_an_existing_folder_and_an_unknown_format_are_refused(face_folder, tmp_path):
     with pytest.raises(ExportError, match="exists"):
         export_appearance(face_folder, tmp_path, to="maps")
-    with pytest.raises(ExportError, match=", ".join(FORMATS)):
+    with pytest.raises(ExportError, match=", ".join(APPEARANCE_FORMATS)):
         export_appearance(face_folder, tmp_path / "out", to="fbx")
 
 

@@ -157,7 +157,7 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
 
 
 def test_an_edited_face_leaves_within_the_consent_alone(dome, tmp_path):
-    order = editing.Order(traits={}, spots=(SpotOrder("freckles", 1.0, 3.0),))
+    order = editing.EditRequest(traits={}, spots=(SpotOrder("freckles", 1.0, 3.0),))
     editing.edit(dome("dome"), order, out=tmp_path / "edited")
     assert store.read(tmp_path / "edited").parameters["edit"]["spots"]
     refused_beyond(tmp_path / "edited", tmp_path, "mtlx")
@@ -257,6 +257,6 @@ def test_a_report_on_a_session_names_its_subject(tmp_path):
 
 
 def test_a_rendering_bears_the_consent_of_whom_it_shows(dome):
-    from skinrig.rendering.figures import Subject as Rendered
+    from skinrig.rendering.figures import RenderModel as Rendered
 
     assert Rendered.of(dome("dome")).record()[consent.CONSENT_KEY] == [NARROW]

@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 
 from skinrig.errors import UnusableError
-from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder, coded
+from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder, coded
 from skinrig.exporting.options import Delivery
 
 
@@ -38,11 +38,11 @@ def test_an_exr_holds_every_value_exactly_and_says_its_unit(tmp_path, ramp):
 def test_only_linear_srgb_claims_srgb_primaries(tmp_path, ramp):
     out = ImageFolder(tmp_path, Delivery())
     claims = {}
-    for space in (SRGB, CAMERA):
+    for space in (SRGB_SPACE, CAMERA_SPACE):
         name = out.exr(Image(name=space[:3].lower(), values=ramp, unit="1", space=space))
         with OpenEXR.File(str(tmp_path / name)) as file:
             claims[space] = "chromaticities" in file.header()
-    assert claims == {SRGB: True, CAMERA: False}
+    assert claims == {SRGB_SPACE: True, CAMERA_SPACE: False}
 
 
 def test_a_16_bit_png_decodes_to_the_values_by_what_its_record_says(tmp_path, ramp):
@@ -60,7 +60,7 @@ def test_a_16_bit_png_decodes_to_the_values_by_what_its_record_says(tmp_path, ra
 
 def test_a_color_png_decodes_by_the_srgb_curve_and_counts_what_it_clips(tmp_path, ramp):
     out = ImageFolder(tmp_path, Delivery())
-    name = out.png(Image(name="color", values=ramp, unit="1", space=SRGB))
+    name = out.png(Image(name="color", values=ramp, unit="1", space=SRGB_SPACE))
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535.0
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     inside = (ramp >= 0.0) & (ramp <= 1.0)

@@ -9,12 +9,12 @@ from model import store
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering.environment import directions, environment_lights, read_environment
 from skinrig.rendering.lights import Light, LightError
-from skinrig.rendering.request import Stage, lights_of, subpixels_of
+from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
 
 
 @pytest.fixture
 def stage():
-    return Stage.of("dome", None)
+    return RenderRig.of("dome", None)
 
 
 def test_a_light_of_the_rig_stands_where_it_is_drawn_and_shows_one_on_white_at_the_origin(stage):

@@ -10,9 +10,9 @@ from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, nearest_shares, reduced
 from skinrig.rendering.geometry import FittedSurface
-from skinrig.rendering.images import KNEE, Panel, sheet, tone
-from skinrig.rendering.lookup_kernels import NEAR_TEXELS, look_up
-from skinrig.rendering.shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
+from skinrig.rendering.images import TONE_KNEE, Panel, sheet, tone
+from skinrig.rendering.lookup_kernels import MAX_TEXEL_DISTANCE, look_up
+from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
 
 SIZE = 48
 
@@ -64,7 +64,7 @@ def test_lookups_blend_the_texels_of_the_same_place_as_a_plain_loop_does():
         for r in range(6):
             for c in range(7):
                 weight = max(0.0, 1 - abs(r - y)) * max(0.0, 1 - abs(c - x))
-                near = np.linalg.norm(place[r, c] - point[i]) <= NEAR_TEXELS * 0.5
+                near = np.linalg.norm(place[r, c] - point[i]) <= MAX_TEXEL_DISTANCE * 0.5
                 if known[r, c] and near:
                     total += weight
                     blend += weight * values[r, c]
@@ -126,12 +126,12 @@ def test_a_shadow_is_the_wider_the_smaller_sigma_tr(model, monkeypatch):
     monkeypatch.setattr(shadow, "PATCH_TEXELS", 128)
     boundary = Boundary.on_plane(model, size_px=160)
     rise = {}
-    for sigma in (MOST_TRANSLUCENT, LEAST_TRANSLUCENT, None):
+    for sigma in (MIN_SIGMA_TR_PER_MM, MAX_SIGMA_TR_PER_MM, None):
         rise[sigma] = shadow.rise_mm(*shadow.profile(boundary.shown(sigma, subpixels=1)))
     assert np.all(rise[None] < 0.35)
-    assert np.all(rise[MOST_TRANSLUCENT] > rise[LEAST_TRANSLUCENT])
-    ratio = rise[MOST_TRANSLUCENT][:2] / rise[LEAST_TRANSLUCENT][:2]
-    expected = np.array(LEAST_TRANSLUCENT[:2]) / MOST_TRANSLUCENT[:2]
+    assert np.all(rise[MIN_SIGMA_TR_PER_MM] > rise[MAX_SIGMA_TR_PER_MM])
+    ratio = rise[MIN_SIGMA_TR_PER_MM][:2] / rise[MAX_SIGMA_TR_PER_MM][:2]
+    expected = np.array(MAX_SIGMA_TR_PER_MM[:2]) / MIN_SIGMA_TR_PER_MM[:2]
     np.testing.assert_allclose(ratio, expected, rtol=0.15)
 
 
@@ -146,7 +146,7 @@ def test_a_shadow_lies_right_of_the_middle(model, monkeypatch):
 def test_tones_are_linear_below_the_knee_and_still_grow_above_white():
     linear = np.array([0.0, 0.2, 0.4])
     np.testing.assert_array_equal(tone(2.0 * linear, 0.5), tone(linear, 1.0))
-    bright = tone(np.array([KNEE, 1.0, 1.5, 2.0]), 1.0).astype(int)
+    bright = tone(np.array([TONE_KNEE, 1.0, 1.5, 2.0]), 1.0).astype(int)
     assert np.all(np.diff(bright) > 0)
 
 

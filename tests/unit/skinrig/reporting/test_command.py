@@ -9,7 +9,7 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig.appearances.front_view import WIDTH_PX
+from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import folders, map_images, verdict
 from skinrig.reporting.comparison import maps as map_comparison
@@ -91,7 +91,7 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
         (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
         (r"has (\d+) colors", map_images.SCALE_COLORS),
-        (r"faces from the front (\d+)", WIDTH_PX),
+        (r"faces from the front (\d+)", FRONT_VIEW_WIDTH_PX),
     ],
 )
 def test_the_page_on_reports_tells_the_numbers_of_the_program(words, value):

@@ -24,7 +24,7 @@ def test_each_condition_is_given_to_as_many_people_and_replaces_what_they_wore()
 def test_directions_are_even_over_the_cap_above_the_horizon():
     found = trait_truth.directions((20_000,), rng=np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
-    assert found[:, 2].min() >= trait_truth.LEAST_COSINE
+    assert found[:, 2].min() >= trait_truth.MIN_SAMPLED_COSINE
     # even in z: the mean of 20,000 has a deviation of 0.88 / sqrt(12 * 20,000)
     assert found[:, 2].mean() == pytest.approx(0.56, abs=4 * 0.0018)
 

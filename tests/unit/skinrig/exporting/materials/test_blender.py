@@ -74,7 +74,7 @@ def in_blender(simulated_face, shapes_file, tmp_path_factory):
                 pytest.importorskip("pxr")
                 told = {"unit": "cm", "normal_y": "dx", "udim": "dot"} if "dx" in format_ else {}
                 usd.write(simulated_face, out, Delivery(mesh=shapes_file, **told))
-            kept[format_] = read(out / blender.FILE, out / "read.npz")
+            kept[format_] = read(out / blender.SCRIPT_FILE, out / "read.npz")
         return kept[format_]
 
     return get
@@ -172,7 +172,7 @@ def test_without_the_script_blender_shows_no_light_below_the_surface(
 ):
     """The reason for the script: an importer that fills this in makes it needless."""
     gltf.write(simulated_face, tmp_path, Delivery(mesh=shapes_file))
-    _, facts = read(tmp_path / gltf.FILE, tmp_path / "read.npz", bake=0)
+    _, facts = read(tmp_path / gltf.GLB_FILE, tmp_path / "read.npz", bake=0)
     assert facts["subsurface_weight"] == 0.0
 
 
@@ -207,7 +207,7 @@ def test_blender_loads_a_texture_of_each_tile(simulated_face, patch, tmp_path):
         uv=np.concatenate([mesh.uv, mesh.uv + np.array([1.0, 0.0])]),
     )
     usd.write(simulated_face, tmp_path, Delivery(mesh=tmp_path / "head.npz", udim="dot"))
-    found, facts = read(tmp_path / blender.FILE, tmp_path / "read.npz", bake=0)
+    found, facts = read(tmp_path / blender.SCRIPT_FILE, tmp_path / "read.npz", bake=0)
     for name in ("base_color", "roughness", "normal", "specular", "radius"):
         assert facts[f"{name}_tiles"] == [1001, 1002]
     assert (found["uv"][..., 0].min(), found["uv"][..., 0].max()) == (0.0, 2.0)
