@@ -55,7 +55,7 @@ class Order:
     traits
         Name to amount.
     region
-        One of `common_regions.REGIONS` that the library has: "face", "beard" or "no-beard".
+        One of `common_regions.REGION_NAMES` that the library has: "face", "beard" or "no-beard".
     parts
         Of `PARTS`; None: where the library tells a trait from chance.
     mask

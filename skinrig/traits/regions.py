@@ -104,7 +104,7 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
         else common_regions.standard_frame(side_mm=SIDE_MM, center_mm=(0.0, 0.0), size=SIZE)
     )
     albedo = {}
-    for region in common_regions.REGIONS:
+    for region in common_regions.REGION_NAMES:
         if space_name(region) in library.spaces:
             albedo[region] = AlbedoTraits(
                 kind, _texture(library), library.spaces[space_name(region)]
