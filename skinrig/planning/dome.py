@@ -69,7 +69,7 @@ def choose(
     if len(rig.lights) < least or len(rig.views) < surface_estimates.MIN_VIEWS:
         raise PlanningError(
             f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
-            f"{least} and {surface_estimates.LEAST_VIEWS}"
+            f"{least} and {surface_estimates.MIN_VIEWS}"
         )
     look = sight(rig, subject, seed=seed)
     every_view = range(len(rig.views))
@@ -135,7 +135,7 @@ def foresee(
     if len(lights) < surface_estimates.MIN_LIGHTS or len(views) < surface_estimates.MIN_VIEWS:
         raise PlanningError(
             f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
-            f"least {surface_estimates.LEAST_LIGHTS} and {surface_estimates.LEAST_VIEWS}"
+            f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
     look = sight(rig, subject, seed=seed)
     prediction = light_selection.predict(
