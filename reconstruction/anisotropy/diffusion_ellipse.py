@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from reconstruction.anisotropy.direction_harmonics import AXIAL, ODD, HarmonicFit
+from reconstruction.anisotropy.direction_harmonics import AXIAL_COLUMNS, ODD_COLUMNS, HarmonicFit
 from reconstruction.arrays import BoolArray, Float64Array
 
-MEAN_DIRECTIONS = 360
+N_MEAN_DIRECTIONS = 360
 """Directions over which sigma_tr is averaged; exact to rounding up to ratios of 25."""
-ITERATIONS = 100
-LARGEST_STEP = 1.0
+MAX_ELLIPSE_ITERATIONS = 100
+MAX_ELLIPSE_STEP = 1.0
 """Of u and v in one iteration."""
-SETTLED = 1e-11
+ELLIPSE_STEP_TOL = 1e-11
 """Of the parameters' steps."""
 
 
@@ -59,8 +59,8 @@ def relative_sigma_tr(
 
 
 def all_directions() -> Float64Array:
-    """Return directions that go evenly over all axes, rad, (`MEAN_DIRECTIONS`,)."""
-    return np.asarray(np.arange(MEAN_DIRECTIONS) * (np.pi / MEAN_DIRECTIONS))
+    """Return directions that go evenly over all axes, rad, (`N_MEAN_DIRECTIONS`,)."""
+    return np.asarray(np.arange(N_MEAN_DIRECTIONS) * (np.pi / N_MEAN_DIRECTIONS))
 
 
 def fit(
@@ -94,21 +94,21 @@ def fit(
     y, w = values.T, np.where(start.told, weight, 0.0).T
     mean = np.where(start.told, start.coefficients[:, 0], 1.0)
     mean = np.where(mean > 0, mean, 1.0)
-    axial = -start.coefficients[:, AXIAL] / mean[:, None]
+    axial = -start.coefficients[:, AXIAL_COLUMNS] / mean[:, None]
     size = np.hypot(axial[:, 0], axial[:, 1])
     # an amplitude a of sigma_tr makes the ratio (1 + a) / (1 - a)
     lengthen = 2.0 * np.arctanh(np.minimum(size, 0.9)) / np.where(size > 0, size, 1.0)
     p = np.zeros((count, 5))
     p[:, 0] = 2.0 * np.log(mean)
     p[:, 1:3] = axial * np.where(size > 0, lengthen, 2.0)[:, None]
-    p[:, 3:] = start.coefficients[:, ODD] / mean[:, None]
+    p[:, 3:] = start.coefficients[:, ODD_COLUMNS] / mean[:, None]
     p *= free
     error, jacobian = _linearized(angle_rad, y, p, free)
     cost = (w * error**2).sum(axis=1)
     damping = np.full(count, 1e-3)
     eye = np.eye(5)
     active = np.arange(count)
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ELLIPSE_ITERATIONS):
         now, weights, free_now = jacobian[active], w[active], free[active]
         weighted = now * weights[..., None]
         normal = now.transpose(0, 2, 1) @ weighted
@@ -116,7 +116,7 @@ def fit(
         damped = normal + eye * np.where(free_now, diagonal, 1.0)[:, None, :]
         right = np.einsum("bni,bn->bi", weighted, error[active])
         step = np.linalg.solve(damped, right[..., None])[..., 0]
-        step /= np.maximum(1.0, np.abs(step[:, 1:3]).max(axis=1) / LARGEST_STEP)[:, None]
+        step /= np.maximum(1.0, np.abs(step[:, 1:3]).max(axis=1) / MAX_ELLIPSE_STEP)[:, None]
         there = _linearized(angle_rad, y[active], p[active] + step, free_now)
         tried = (weights * there[0] ** 2).sum(axis=1)
         better = tried <= cost[active]
@@ -124,7 +124,7 @@ def fit(
         p[at] += step[better]
         cost[at], error[at], jacobian[at] = tried[better], there[0][better], there[1][better]
         damping[active] = np.clip(damping[active] * np.where(better, 0.2, 5.0), 1e-12, 1e12)
-        active = active[np.abs(step).max(axis=1) > SETTLED]
+        active = active[np.abs(step).max(axis=1) > ELLIPSE_STEP_TOL]
         if not active.size:
             break
     # a factor that is 1 where nothing is fitted keeps the decomposition regular

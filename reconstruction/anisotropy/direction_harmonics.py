@@ -18,17 +18,17 @@ from scipy import stats
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
-CONSTANT, ODD, AXIAL = slice(0, 1), slice(1, 3), slice(3, 5)
+CONSTANT_COLUMNS, ODD_COLUMNS, AXIAL_COLUMNS = slice(0, 1), slice(1, 3), slice(3, 5)
 """Columns of `design`."""
-LEAST_DIRECTIONS = 5
+MIN_DIRECTIONS = 5
 """Different directions without which nothing is said: three are fitted, two show the errors."""
-ODD_DIRECTIONS = 8
+MIN_ODD_DIRECTIONS = 8
 """Different directions from which the first harmonic is fitted, too."""
-LARGEST_CONDITION = 50.0
+MAX_CONDITION = 50.0
 """Of the design matrix for an axis; directions close together do not tell a harmonic."""
-LARGEST_CONDITION_ODD = 6.0
+MAX_ODD_CONDITION = 6.0
 """Beyond, directions do not go around: the first harmonic would cost more than it tells."""
-OUTLIER_RATE = 1e-3
+OUTLIER_FALSE_ALARM_RATE = 1e-3
 """Chance that a fit loses a good direction as an outlier; no more is added to false alarms."""
 DIRECTIONS_PER_OUTLIER = 8
 """One of so many directions may be left out as an outlier."""
@@ -105,8 +105,8 @@ def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> 
     directions = different_directions(angle_rad, used)
     told, odd = np.zeros(count, bool), np.zeros(count, bool)
     for chosen, least, most, flag in (
-        ([0, 3, 4], LEAST_DIRECTIONS, LARGEST_CONDITION, told),
-        ([0, 1, 2, 3, 4], ODD_DIRECTIONS, LARGEST_CONDITION_ODD, odd),
+        ([0, 3, 4], MIN_DIRECTIONS, MAX_CONDITION, told),
+        ([0, 1, 2, 3, 4], MIN_ODD_DIRECTIONS, MAX_ODD_CONDITION, odd),
     ):
         # singular values of the design on used directions, whatever their weights
         gram = np.einsum("ni,nb,nj->bij", x[:, chosen], used.astype(float), x[:, chosen])
@@ -132,9 +132,9 @@ def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> 
         # the last two columns of an orthogonal decomposition are what the others leave over
         axial[series] = (turned[:, -2:] ** 2).sum(axis=1)
         if columns.size == 5:
-            spread = np.einsum("bij,bkj->bik", inverse[:, ODD], inverse[:, ODD])
-            solved = np.linalg.solve(spread, b[:, ODD, None])[..., 0]
-            first[series] = (b[:, ODD] * solved).sum(axis=1)
+            spread = np.einsum("bij,bkj->bik", inverse[:, ODD_COLUMNS], inverse[:, ODD_COLUMNS])
+            solved = np.linalg.solve(spread, b[:, ODD_COLUMNS, None])[..., 0]
+            first[series] = (b[:, ODD_COLUMNS] * solved).sum(axis=1)
         leverage[:, series] = (q * q).sum(axis=2).T
         dof[series] = used[:, series].sum(axis=0) - columns.size
     error = (values - x @ coefficients.T) * root
@@ -157,7 +157,7 @@ def without_outliers(
     """Return the weights with those of outliers set to 0, and which ones these are, (N, B).
 
     One at a time the direction of largest deleted residual is left out, while that is less likely
-    than `OUTLIER_RATE` over the number of directions, and at most one of
+    than `OUTLIER_FALSE_ALARM_RATE` over the number of directions, and at most one of
     `DIRECTIONS_PER_OUTLIER`.
     """
     kept = weight.copy()
@@ -171,7 +171,9 @@ def without_outliers(
         here = np.arange(active.size)
         n = np.maximum((kept[:, active] > 0).sum(axis=0), 1)
         chance = 2 * n * stats.t.sf(size[worst, here], np.maximum(found.dof - 1, 1))
-        bad = (chance < OUTLIER_RATE / np.maximum(most[active], 1)) & (number < most[active])
+        bad = (chance < OUTLIER_FALSE_ALARM_RATE / np.maximum(most[active], 1)) & (
+            number < most[active]
+        )
         outlier[worst[bad], active[bad]] = True
         kept[worst[bad], active[bad]] = 0.0
         active = active[bad]

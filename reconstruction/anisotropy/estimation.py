@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 
 from reconstruction.anisotropy import diffusion_ellipse, direction_harmonics
-from reconstruction.anisotropy.direction_harmonics import LEAST_DIRECTIONS
+from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
 from reconstruction.anisotropy.plane_vectors import (
     UNKNOWN_AXIS_RAD,
     axis_stderr,
@@ -40,11 +40,11 @@ from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 Errors: TypeAlias = Literal["relative", "absolute"]
 
-FAR = 300
+MAX_EXPONENT = 300
 """Powers of two from 1 beyond which values are brought near it: their squares keep within range."""
-LEAST_ERROR, MOST_ERROR = 1e-307, 1e150
+MIN_DIRECTION_ERROR, MAX_DIRECTION_ERROR = 1e-307, 1e150
 """Relative standard errors of one direction: less would divide 0 by 0, more is no reading."""
-MOST_APART = 1e12
+MAX_ERROR_RATIO = 1e12
 """Standard errors over the least: directions of greater ones are left out, since beside the best
 ones rounding hides what they tell."""
 
@@ -142,7 +142,8 @@ def estimate(
         error of a fit knows of.
     outliers : bool
         Leave out directions that contradict the others, one of eight at most: t test of deleted
-        residuals, with a chance of `direction_harmonics.OUTLIER_RATE` to lose a good one.
+        residuals. The chance to lose a good one is
+        `direction_harmonics.OUTLIER_FALSE_ALARM_RATE`.
     log_ratio_error : float
         Error of the log of the ratio over itself that all directions have in common; it widens
         the ratio's standard error.
@@ -154,7 +155,7 @@ def estimate(
     Raises
     ------
     AnisotropyError
-        For fewer than `LEAST_DIRECTIONS` different directions, shapes that do not fit, a standard
+        For fewer than `MIN_DIRECTIONS` different directions, shapes that do not fit, a standard
         error below 0, of 0 beside others, or none where "absolute" ones are asked.
 
     Examples
@@ -176,12 +177,12 @@ def estimate(
     scale = np.where(scale > 0, scale, 1.0)
     y = np.where(good, values / scale, 0.0)
     with np.errstate(over="ignore"):
-        relative = np.clip(stderr / scale, LEAST_ERROR, MOST_ERROR)
+        relative = np.clip(stderr / scale, MIN_DIRECTION_ERROR, MAX_DIRECTION_ERROR)
     relative = np.where(good, relative, math.inf)
     least = relative.min(axis=0, initial=math.inf)
     least = np.where(np.isfinite(least), least, 1.0)
     # weights of 1 at most: errors of any size keep within range
-    weight = np.where(good & (relative <= MOST_APART * least), (least / relative) ** 2, 0.0)
+    weight = np.where(good & (relative <= MAX_ERROR_RATIO * least), (least / relative) ** 2, 0.0)
     outlier = np.zeros(weight.shape, bool)
     if outliers:
         weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
@@ -272,9 +273,9 @@ def _checked(
     if errors not in ("relative", "absolute"):
         raise AnisotropyError(f'errors: got {errors!r}, expected "relative" or "absolute"')
     several = direction_harmonics.different_directions(angle, np.ones((angle.size, 1), bool))[0]
-    if several < LEAST_DIRECTIONS:
+    if several < MIN_DIRECTIONS:
         raise AnisotropyError(
-            f"angle_rad: got {several} different directions, expected {LEAST_DIRECTIONS} or more"
+            f"angle_rad: got {several} different directions, expected {MIN_DIRECTIONS} or more"
         )
     stderr: Float64Array = np.zeros_like(given)
     if stderr_per_mm is not None:
@@ -300,7 +301,7 @@ def _checked(
 def _far_exponent(largest: Float64Array) -> Int64Array:
     """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
     exponent = np.frexp(largest)[1].astype(np.int64)
-    return np.where((largest > 0) & (np.abs(exponent) > FAR), exponent, 0)
+    return np.where((largest > 0) & (np.abs(exponent) > MAX_EXPONENT), exponent, 0)
 
 
 def _reasons(angle: Float64Array, used: BoolArray, told: BoolArray) -> NDArray[np.str_]:
@@ -309,8 +310,8 @@ def _reasons(angle: Float64Array, used: BoolArray, told: BoolArray) -> NDArray[n
         [
             ""
             if ok
-            else f"{n} usable directions, expected {LEAST_DIRECTIONS} or more"
-            if n < LEAST_DIRECTIONS
+            else f"{n} usable directions, expected {MIN_DIRECTIONS} or more"
+            if n < MIN_DIRECTIONS
             else "directions lie too close together to tell an axis"
             for ok, n in zip(told, several, strict=True)
         ],

@@ -70,7 +70,7 @@ def estimate_from_profiles(
     -------
     Anisotropy
         Directions with too few readings are not in `used`. The ratio's standard error holds
-        `profile_comparison.MODEL_ERROR`.
+        `profile_comparison.LOG_RATIO_MODEL_ERROR`.
 
     Raises
     ------
@@ -155,5 +155,5 @@ def estimate_from_profiles(
         valid=told.reshape(back),
         errors=errors,
         outliers=outliers,
-        log_ratio_error=profile_comparison.MODEL_ERROR,
+        log_ratio_error=profile_comparison.LOG_RATIO_MODEL_ERROR,
     )

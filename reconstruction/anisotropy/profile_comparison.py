@@ -26,20 +26,20 @@ from reconstruction.arrays import BoolArray, Float64Array
 Table: TypeAlias = Callable[[Float64Array, Float64Array], tuple[Float64Array, Float64Array]]
 """sigma_a (B, 1, 1) and sigma_s' (B, N, 1) to T and dT / d sigma_s', (B, N, F)."""
 
-LEAST_FIBRES = 6
+MIN_COMPARED_FIBERS = 6
 """A direction has two numbers of its own; fewer fibres tell little beside them."""
-FIBRE_SIGNAL = 3.0
+MIN_FIBER_SIGNAL_SIGMAS = 3.0
 """Readings of a fibre, averaged over directions, that stand out of their errors so many times
 count; a rule on each reading by itself would keep those that noise made large."""
-MODEL_ERROR = 0.05
+LOG_RATIO_MODEL_ERROR = 0.05
 """Relative error of logs of ratios of sigma_tr, from a model whose scattering is the same in all
 directions: against fits of each direction, and Monte Carlo of directed scattering."""
-ROUNDS = 10
-LARGEST_STEP = 0.3
+N_COMPARISON_ROUNDS = 10
+MAX_COMPARISON_STEP = 0.3
 """Of b and d in a round."""
-LEAST_CHANGE = 1e-3
+MIN_ROUND_RATIO = 1e-3
 """A mean reading stays above so much of what it was in the round before."""
-LEAST_FLOOR = 1e-4
+MIN_READING_ERROR = 1e-4
 """Relative error of readings, where none is stated and a variance is 0."""
 
 
@@ -104,18 +104,18 @@ def compare(
     count = np.maximum(good.sum(axis=1), 1)
     m = y.sum(axis=1) / count
     noise = np.sqrt(v.sum(axis=1) / count)
-    used = (2 * good.sum(axis=1) > n) & (m > FIBRE_SIGNAL * noise)
+    used = (2 * good.sum(axis=1) > n) & (m > MIN_FIBER_SIGNAL_SIGMAS * noise)
     used &= table(a, s)[0][:, 0] > 0
-    told = ((good & used[:, None]).sum(axis=2) >= LEAST_FIBRES) & known[:, None]
+    told = ((good & used[:, None]).sum(axis=2) >= MIN_COMPARED_FIBERS) & known[:, None]
     keep = good & used[:, None] & told[..., None]
     m = np.asarray(np.where(used, m, 1.0)[:, None], np.float64)
-    relative = np.where((keep & (v == 0)).any(axis=(1, 2)), max(floor, LEAST_FLOOR), floor)
+    relative = np.where((keep & (v == 0)).any(axis=(1, 2)), max(floor, MIN_READING_ERROR), floor)
     relative = relative[:, None, None]
     at_mean = np.where(used[:, None], table(a, s)[0], 1.0)
     d, b = np.zeros((series, n)), np.zeros((series, n))
     inverse = np.zeros((series, n, 2, 2))
     members = np.maximum(told.sum(axis=1), 1)[:, None]
-    for _ in range(ROUNDS):
+    for _ in range(N_COMPARISON_ROUNDS):
         scattering = s * np.exp(d)[..., None]
         light, slope = table(a, scattering)
         shape = light / at_mean * np.exp(b)[..., None]
@@ -133,12 +133,14 @@ def compare(
         right = np.stack(
             [(weight * model * off).sum(axis=2), (weight * by_d * off).sum(axis=2)], -1
         )
-        step = np.clip((inverse @ right[..., None])[..., 0], -LARGEST_STEP, LARGEST_STEP)
+        step = np.clip(
+            (inverse @ right[..., None])[..., 0], -MAX_COMPARISON_STEP, MAX_COMPARISON_STEP
+        )
         b, d = (np.where(told, x + step[..., k], 0.0) for k, x in enumerate((b, d)))
         b, d = (np.where(told, x - x.sum(axis=1, keepdims=True) / members, 0.0) for x in (b, d))
         shape = table(a, s * np.exp(d)[..., None])[0] / at_mean * np.exp(b)[..., None]
         below = (weight * shape**2).sum(axis=1, keepdims=True)
         fresh = (weight * shape * y).sum(axis=1, keepdims=True) / np.where(below > 0, below, 1.0)
-        m = np.where(below > 0, np.maximum(fresh, LEAST_CHANGE * m), m)
+        m = np.where(below > 0, np.maximum(fresh, MIN_ROUND_RATIO * m), m)
     stderr = np.where(told, np.sqrt(inverse[..., 1, 1]), np.inf)
     return ProfileComparison(d.T, stderr.T, b.T, told.T, used & told.any(axis=1)[:, None])

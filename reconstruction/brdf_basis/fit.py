@@ -31,11 +31,11 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import boundary_kernels
 
-LEAST_COSINE = 0.1
+MIN_SAMPLE_COSINE = 0.1
 """Samples whose light or view is nearer to the horizon are not used."""
-REWEIGHTINGS = 3
-BLOCK = 64  # points that share their working memory
-PLATEAU = 0.05
+N_REWEIGHTINGS = 3
+POINTS_PER_BLOCK = 64  # points that share their working memory
+PLATEAU_FRACTION = 0.05
 
 
 class SampleError(ValueError):
@@ -162,8 +162,8 @@ def surface_samples(
     cos_v = np.einsum("pmc,pc->pm", view, n)
     through = boundary_kernels.transmitted(np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta)
     surface = f - (through[..., None] * albedo[:, None] / np.pi)
-    usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= LEAST_COSINE)
-    usable &= cos_v >= LEAST_COSINE
+    usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= MIN_SAMPLE_COSINE)
+    usable &= cos_v >= MIN_SAMPLE_COSINE
     if valid is not None:
         usable &= np.asarray(valid, dtype=bool)
     if variance is None:
@@ -232,8 +232,8 @@ def fit_weights(
             )
         ),
         np.ascontiguousarray(samples.valid),
-        REWEIGHTINGS if compress == "cbrt" else 0,
-        BLOCK,
+        N_REWEIGHTINGS if compress == "cbrt" else 0,
+        POINTS_PER_BLOCK,
         weights,
     )
     return BasisWeights(weights, residual, stderr, np.isfinite(residual))
@@ -328,7 +328,7 @@ def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]
     return found, np.asarray(model.components_)
 
 
-def plateau(errors: ArrayLike, *, share: float = PLATEAU) -> int:
+def plateau(errors: ArrayLike, *, share: float = PLATEAU_FRACTION) -> int:
     """Return the rank from which more do not help: within `share` of all that ranks gained.
 
     Parameters

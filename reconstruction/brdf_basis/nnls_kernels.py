@@ -20,20 +20,20 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, uint64
 
 NODES_D, NODES_PHI, NODES_H = 32, 12, 90  # of model.brdf.tables; its tests hold them equal
-MOST = 32
+MAX_ACTIVE_COLUMNS = 32
 """Most columns in a working set; when it is full, the unused ones leave it."""
-JOIN = 4
+MAX_JOINING_COLUMNS = 4
 """Most columns that join a working set at once."""
-STOP = 4e-5
+MISFIT_TOL = 4e-5
 """A column joins while it alone would lower the squared misfit by more than this squared."""
-DEPENDENT = 1e-7
+MIN_INDEPENDENT_FRACTION = 1e-7
 """A column whose part outside those in use is a smaller share of its square than this is refused:
 the Gram matrix, summed in float32, knows no more."""
-HUBER = 3.0
+HUBER_SIGMAS = 3.0
 """Residuals beyond so many standard deviations pull with constant force."""
 
 _HALF_PI = 0.5 * math.pi
-_FAST = {"contract", "reassoc", "nsz"}
+_FAST_MATH = {"contract", "reassoc", "nsz"}
 
 
 @njit(inline="always")
@@ -78,7 +78,7 @@ def _places(light, view, normal, picked, count, cos_l, place):  # type: ignore[n
 def _row_filler(fixed: int) -> Callable[..., Any]:
     """Return the kernel that fills a matrix; one of fixed width runs in unrolled vectors."""
 
-    @njit(nogil=True, fastmath=_FAST)
+    @njit(nogil=True, fastmath=_FAST_MATH)
     def fill(flat, cos_l, place, weight, count, rows, square):  # type: ignore[no-untyped-def]
         """Fill the matrix and the weighted squares of its columns."""
         lanes = uint64(fixed) if fixed > 0 else uint64(rows.shape[1])
@@ -119,7 +119,7 @@ _fill_16 = _row_filler(16)
 _fill_any = _row_filler(0)
 
 
-@njit(nogil=True, fastmath=_FAST)
+@njit(nogil=True, fastmath=_FAST_MATH)
 def _pull(rows, force, count, total):  # type: ignore[no-untyped-def]
     """Fill the matrix' transpose times ``force``, in blocks of float32 added up in float64."""
     lanes = rows.shape[1]
@@ -143,7 +143,7 @@ def _pull(rows, force, count, total):  # type: ignore[no-untyped-def]
             total[k] += block[k]
 
 
-@njit(nogil=True, fastmath=_FAST)
+@njit(nogil=True, fastmath=_FAST_MATH)
 def _squares(rows, weight, count, total):  # type: ignore[no-untyped-def]
     """Fill the weighted square of each column."""
     lanes = rows.shape[1]
@@ -159,7 +159,7 @@ def _squares(rows, weight, count, total):  # type: ignore[no-untyped-def]
             total[k] += block[k]
 
 
-@njit(nogil=True, fastmath=_FAST)
+@njit(nogil=True, fastmath=_FAST_MATH)
 def _dot(a, b, count):  # type: ignore[no-untyped-def]
     total = float32(0.0)
     for i in range(count):
@@ -167,7 +167,7 @@ def _dot(a, b, count):  # type: ignore[no-untyped-def]
     return float64(total)
 
 
-@njit(nogil=True, fastmath=_FAST)
+@njit(nogil=True, fastmath=_FAST_MATH)
 def _gather(rows, root, material, count, column):  # type: ignore[no-untyped-def]
     """Copy a column of the matrix, times the roots of the weights."""
     for i in range(count):
@@ -192,7 +192,7 @@ def _cholesky(gram, rhs, active, used, low, trial):  # type: ignore[no-untyped-d
             for k in range(j):
                 s -= low[i, k] * low[j, k]
             if i == j:
-                if s <= DEPENDENT * gram[active[i], active[i]]:
+                if s <= MIN_INDEPENDENT_FRACTION * gram[active[i], active[i]]:
                     return i
                 low[i, i] = math.sqrt(s)
             else:
@@ -249,7 +249,7 @@ def _small(gram, rhs, size, norm, x, active, low, trial, refused):  # type: igno
             used -= 1
             for i in range(first, used):
                 active[i] = active[i + 1]
-        best = STOP * norm
+        best = MISFIT_TOL * norm
         entering = -1
         for p in range(size):
             if x[p] == 0.0 and gram[p, p] > 0.0 and not refused[p]:
@@ -265,7 +265,7 @@ def _small(gram, rhs, size, norm, x, active, low, trial, refused):  # type: igno
         used += 1
 
 
-@njit(nogil=True, fastmath=_FAST)
+@njit(nogil=True, fastmath=_FAST_MATH)
 def _misfit(column, x, size, target, count, residual):  # type: ignore[no-untyped-def]
     """Fill target - columns x, return its norm."""
     for i in range(count):
@@ -320,7 +320,7 @@ def _solve(  # type: ignore[no-untyped-def]
         _pull(rows, force, count, pull)
         for p in range(size):
             pull[working[p]] = 0.0
-        if size + JOIN > MOST:
+        if size + MAX_JOINING_COLUMNS > MAX_ACTIVE_COLUMNS:
             kept = 0
             for p in range(size):
                 if x[p] > 0.0:
@@ -329,14 +329,14 @@ def _solve(  # type: ignore[no-untyped-def]
                         column[kept, q] = column[p, q]
                     kept += 1
             size = kept
-            if size + JOIN > MOST:
+            if size + MAX_JOINING_COLUMNS > MAX_ACTIVE_COLUMNS:
                 break
             _join(0, size, column, target, count, gram, rhs)
         before = size
         for k in range(materials):
             pull[k] = pull[k] / math.sqrt(square[k]) if square[k] > 0.0 else 0.0
-        for _ in range(JOIN):
-            best = STOP * norm
+        for _ in range(MAX_JOINING_COLUMNS):
+            best = MISFIT_TOL * norm
             joining = -1
             for k in range(materials):
                 if pull[k] > best:
@@ -379,14 +379,14 @@ def _reweigh(value, variance, model, count, weight, scatter):  # type: ignore[no
         share = spread / (total * total)
         r = float64(value[i]) - model[i]
         # An outlier tells nothing of the others' misfit.
-        above += share * (min(r * r, HUBER * HUBER * total) - variance[i])
+        above += share * (min(r * r, HUBER_SIGMAS * HUBER_SIGMAS * total) - variance[i])
         below += share * spread
     scatter = max(above / below, 1e-8 * mean ** (2.0 / 3.0))
     for i in range(count):
         u = max(float64(model[i]), floor)
         total = float64(variance[i]) + scatter * 9.0 * u * u ** (1.0 / 3.0)
         z = abs(float64(value[i]) - model[i]) / math.sqrt(total)
-        weight[i] = min(1.0, HUBER / max(z, 1e-9)) / total
+        weight[i] = min(1.0, HUBER_SIGMAS / max(z, 1e-9)) / total
     return scatter
 
 
@@ -447,15 +447,17 @@ def fit_points(  # type: ignore[no-untyped-def]
         residual = np.empty(samples, dtype=np.float32)  # root x (y - model)
         force = np.empty(samples, dtype=np.float32)  # weight x (y - model)
         model = np.empty(samples, dtype=np.float32)
-        column = np.empty((MOST, samples), dtype=np.float32)  # of the working set, x root
-        working = np.empty(MOST, dtype=np.int64)  # its materials
-        active = np.empty(MOST + 1, dtype=np.int64)  # those of them in use
-        refused = np.empty(MOST, dtype=np.bool_)
-        gram = np.empty((MOST, MOST))
-        low = np.empty((MOST + 1, MOST + 1))
-        rhs = np.empty(MOST)
-        x = np.zeros(MOST)
-        trial = np.empty(MOST + 1)
+        column = np.empty(
+            (MAX_ACTIVE_COLUMNS, samples), dtype=np.float32
+        )  # of the working set, x root
+        working = np.empty(MAX_ACTIVE_COLUMNS, dtype=np.int64)  # its materials
+        active = np.empty(MAX_ACTIVE_COLUMNS + 1, dtype=np.int64)  # those of them in use
+        refused = np.empty(MAX_ACTIVE_COLUMNS, dtype=np.bool_)
+        gram = np.empty((MAX_ACTIVE_COLUMNS, MAX_ACTIVE_COLUMNS))
+        low = np.empty((MAX_ACTIVE_COLUMNS + 1, MAX_ACTIVE_COLUMNS + 1))
+        rhs = np.empty(MAX_ACTIVE_COLUMNS)
+        x = np.zeros(MAX_ACTIVE_COLUMNS)
+        trial = np.empty(MAX_ACTIVE_COLUMNS + 1)
         square = np.empty(lanes)
         pull = np.empty(lanes)
         size = 0

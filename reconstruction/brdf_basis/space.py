@@ -26,13 +26,13 @@ from reconstruction.brdf_basis import fit as brdf_basis
 
 Method = Literal["shares", "brdf"]
 
-RANKS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
-SWEEPS: Final = 60
-SETTLED: Final = 1e-7
+CURVE_RANKS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
+MAX_SWEEPS: Final = 60
+SWEEP_TOL: Final = 1e-7
 """Relative change of what is lowered below which a refinement ends."""
-UNUSUAL: Final = 8.0
+UNHELD_STRENGTH_RATIO: Final = 8.0
 """Times the median strength from which on a point's mixture counts as not held down by samples."""
-SHARES: Final = (0.02, 0.05, 0.1)
+PLATEAU_FRACTIONS: Final = (0.02, 0.05, 0.1)
 """Shares of the plateau's rule at which it is told."""
 
 
@@ -71,7 +71,9 @@ class SpaceCurve:
     held_out_points: int
     left_out: tuple[tuple[int, str], ...]
 
-    def plateau(self, *, share: float = brdf_basis.PLATEAU, most: int | None = None) -> int:
+    def plateau(
+        self, *, share: float = brdf_basis.PLATEAU_FRACTION, most: int | None = None
+    ) -> int:
         """Return the number of mixtures from which on more do not help.
 
         The first rank whose error exceeds the least one by no more than `share` of the fall from
@@ -99,18 +101,20 @@ def usable(weights: ArrayLike, basis: BrdfBasis) -> BoolArray:
     """Return which points' mixtures are held down by their samples, (P,).
 
     A lobe so narrow that no pair of light and view met it can have any share: mixtures of more
-    than `UNUSUAL` times the median strength, and empty ones, are not used.
+    than `UNHELD_STRENGTH_RATIO` times the median strength, and empty ones, are not used.
     """
     strength = _checked(weights, basis) @ basis.strength()
     some = strength[strength > 0.0]
-    return (strength > 0.0) & (strength < UNUSUAL * (np.median(some) if len(some) else 0.0))
+    return (strength > 0.0) & (
+        strength < UNHELD_STRENGTH_RATIO * (np.median(some) if len(some) else 0.0)
+    )
 
 
 def curve(
     weights: ArrayLike,
     basis: BrdfBasis,
     *,
-    ranks: Sequence[int] = RANKS,
+    ranks: Sequence[int] = CURVE_RANKS,
     held_out: ArrayLike | None = None,
     groups: ArrayLike | None = None,
     method: Method = "brdf",
@@ -204,7 +208,7 @@ def curve(
 
 
 def refine(
-    weights: ArrayLike, mix: ArrayLike, basis: BrdfBasis, *, sweeps: int = SWEEPS
+    weights: ArrayLike, mix: ArrayLike, basis: BrdfBasis, *, sweeps: int = MAX_SWEEPS
 ) -> Float64Array:
     """Lower the BRDFs' error of common mixtures, shares and mixtures in turn.
 
@@ -243,7 +247,7 @@ def refine(
             target = rows[k] + (outer[k] - inner[k] @ rows) / inner[k, k]
             _descend(rows[k : k + 1], (target @ gram)[None], gram)
         left = float(np.sum(((inner @ rows - 2.0 * outer) @ gram) * rows))
-        if last - left < SETTLED * abs(left):
+        if last - left < SWEEP_TOL * abs(left):
             break
         last = left
     size = rows.sum(axis=1, keepdims=True)

@@ -24,25 +24,25 @@ from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.chromophores.inversion import ChromophoreError
-from reconstruction.chromophores.posterior import WeighedChromophores
+from reconstruction.chromophores.posterior import ChromophorePosterior
 
-DARKER: Final = 0.1
+MIN_LOG_CONTRAST: Final = 0.1
 """Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more
 on skin of 1 %, which is within or near a face's own spread. Less needs no second look."""
-NOISES: Final = 3.0
+CONTRAST_SIGMAS: Final = 3.0
 """The same, in standard deviations of a pixel's noise."""
-PART: Final = 20
+WINDOW_DIVISOR: Final = 20
 """The surroundings are a square whose side is the skin's, as a square, over this: 9 mm of
 skin 180 mm across; larger ones hold more that is darker for its slope alone."""
-LEAST_SIDE: Final = 7
+MIN_WINDOW_PX: Final = 7
 """Pixels; fewer have no median that a mole would not move."""
-_BLOCKS: Final = 11
+_MAX_WINDOW_BLOCKS: Final = 11
 """Odd; finer squares than this are medians of blocks of pixels, or large pictures take minutes."""
-_WINDOWS: Final = 1 << 14
-_BAND: Final = 128
+_WINDOWS_PER_PASS: Final = 1 << 14
+_BAND_ROWS: Final = 128
 
 
-def darker_than_around(
+def is_locally_dark(
     colors: ArrayLike, *, variance: ArrayLike | None = None, valid: ArrayLike | None = None
 ) -> BoolArray:
     """Return where skin is darker than the median of its surroundings.
@@ -70,7 +70,7 @@ def darker_than_around(
     --------
     >>> skin = np.ones((20, 20, 3))
     >>> skin[9:11, 9:11] = 0.5
-    >>> np.argwhere(darker_than_around(skin)).tolist()
+    >>> np.argwhere(is_locally_dark(skin)).tolist()
     [[9, 9], [9, 10], [10, 9], [10, 10]]
     """
     light = np.asarray(colors)
@@ -92,9 +92,9 @@ def darker_than_around(
                 f"variance: expected to broadcast to {light.shape}, got {np.shape(variance)}"
             ) from problem
     log_light = np.full(good.shape, np.nan, dtype=np.float32)
-    least = np.full(good.shape, DARKER, dtype=np.float32)
-    for start in range(0, len(good), _BAND):  # copies of a whole picture need gigabytes
-        band = slice(start, start + _BAND)
+    least = np.full(good.shape, MIN_LOG_CONTRAST, dtype=np.float32)
+    for start in range(0, len(good), _BAND_ROWS):  # copies of a whole picture need gigabytes
+        band = slice(start, start + _BAND_ROWS)
         kept = light[band][good[band]].astype(np.float64)
         log_light[band][good[band]] = np.log(kept).mean(axis=-1)
         if whole is not None:
@@ -102,12 +102,14 @@ def darker_than_around(
                 noise = np.sqrt((whole[band][good[band]] / np.square(kept)).sum(axis=-1))
             # noise that is no number says nothing; nothing then stands out of it
             noise = np.where(noise >= 0.0, noise, np.inf) / light.shape[-1]
-            least[band][good[band]] = np.maximum(DARKER, NOISES * noise)
+            least[band][good[band]] = np.maximum(MIN_LOG_CONTRAST, CONTRAST_SIGMAS * noise)
     with np.errstate(invalid="ignore"):
         return np.asarray(_median_around(log_light, good) - log_light > least)
 
 
-def lighter_by_itself(by_face: WeighedChromophores, alone: WeighedChromophores) -> BoolArray:
+def is_lighter_than_face_prior(
+    by_face: ChromophorePosterior, alone: ChromophorePosterior
+) -> BoolArray:
     """Return where a pixel alone has less melanin than by its face, outside its 68 % interval.
 
     Parameters
@@ -134,9 +136,9 @@ def lighter_by_itself(by_face: WeighedChromophores, alone: WeighedChromophores) 
         return np.asarray(by_face.melanin - alone.melanin > alone.stderr_melanin)
 
 
-def either(
-    by_face: WeighedChromophores, alone: WeighedChromophores, where: ArrayLike
-) -> WeighedChromophores:
+def average_hypotheses(
+    by_face: ChromophorePosterior, alone: ChromophorePosterior, where: ArrayLike
+) -> ChromophorePosterior:
     """Return estimates that hold both of two explanations, where they are equally probable.
 
     Parameters
@@ -183,8 +185,8 @@ def _median_around(values: Float32Array, good: BoolArray) -> Float32Array:
     """Return the median of the good pixels in the square around each pixel, NaN without any."""
     if not good.any():
         return np.full(values.shape, np.nan, dtype=np.float32)
-    side = max(LEAST_SIDE, round(math.sqrt(int(good.sum())) / PART))
-    block = -(-side // _BLOCKS)
+    side = max(MIN_WINDOW_PX, round(math.sqrt(int(good.sum())) / WINDOW_DIVISOR))
+    block = -(-side // _MAX_WINDOW_BLOCKS)
     coarse = _by_blocks(values, block)
     reach = max(1, round(side / block) // 2)
     padded = np.pad(coarse, reach, constant_values=np.nan)
@@ -192,8 +194,8 @@ def _median_around(values: Float32Array, good: BoolArray) -> Float32Array:
     windows = np.lib.stride_tricks.sliding_window_view(padded, (width, width))
     around = np.full(coarse.shape, np.nan, dtype=np.float32)
     wanted = np.argwhere(np.isfinite(coarse))
-    for start in range(0, len(wanted), _WINDOWS):
-        rows, columns = wanted[start : start + _WINDOWS].T
+    for start in range(0, len(wanted), _WINDOWS_PER_PASS):
+        rows, columns = wanted[start : start + _WINDOWS_PER_PASS].T
         around[rows, columns] = _medians(windows[rows, columns].reshape(len(rows), -1))
     whole = around.repeat(block, axis=0).repeat(block, axis=1)
     return whole[: values.shape[0], : values.shape[1]]

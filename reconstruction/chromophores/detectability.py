@@ -12,7 +12,7 @@ from scipy import ndimage
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 NEIGHBORHOOD_PX = 15
-LIMIT = 0.5
+MAX_RELATIVE_STDERR = 0.5
 
 
 def detectable(
@@ -21,7 +21,7 @@ def detectable(
     valid: BoolArray,
     *,
     size_px: int = NEIGHBORHOOD_PX,
-    limit: float = LIMIT,
+    limit: float = MAX_RELATIVE_STDERR,
 ) -> BoolArray:
     """Return where the mean standard error around is small against the mean estimate around.
 

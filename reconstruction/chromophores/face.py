@@ -20,25 +20,25 @@ from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.face_distribution import FaceDistribution, fit, with_common_errors
 from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import LOWEST, evaluate
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
 
-PIXELS: Final = 1500
+N_SAMPLE_PIXELS: Final = 1500
 """Evenly spread over the face: its mean is known to a thirtieth of its spread by them, less than
 what they have in common."""
-FEWEST_PIXELS: Final = 200
+MIN_FACE_PIXELS: Final = 200
 """With fewer, pixels are weighed by themselves."""
-STEP: Final = 0.02
+LOG_MELANIN_STEP: Final = 0.02
 """From place to place in log melanin."""
-BLOOD_PLACES: Final = 96
+N_BLOOD_NODES: Final = 96
 _SUMMED: Final = 3
-RESOLVED: Final = 0.003
+MIN_COLOR_ERROR: Final = 0.003
 """Relative error of colors below which places stand too far apart; smaller ones are taken for this
 much, which of light skin is 3 % of melanin, where a face scatters by 10 to 20 %."""
-MARGIN: Final = 0.7
+LOG_MELANIN_MARGIN: Final = 0.7
 """Of log melanin that is looked at beyond what 98 % of the pixels have by themselves."""
 
 
-def of_colors(
+def fit_face_distribution(
     rgb: ArrayLike,
     table: ColorTable,
     *,
@@ -87,7 +87,7 @@ def of_colors(
     >>> melanin = 0.05 * np.exp(0.15 * rng.standard_normal(1000))
     >>> light = 0.7 * np.exp(0.3 * rng.standard_normal((1000, 1)))
     >>> seen = light * table.lookup(melanin, 0.02) * (1 + 3e-3 * rng.standard_normal((1000, 3)))
-    >>> found = of_colors(seen, table, prior=lognormal(0.7, 0.3), common_light=0.1,
+    >>> found = fit_face_distribution(seen, table, prior=lognormal(0.7, 0.3), common_light=0.1,
     ...                   variance=(3e-3 * seen) ** 2).melanin
     >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.spread < 0.2)
     (True, True)
@@ -95,22 +95,28 @@ def of_colors(
     if not (math.isfinite(common_light) and common_light > 0.0):
         raise ChromophoreError(f"common_light: expected above 0, got {common_light}")
     colors, noise, errors = _sampled(rgb, variance, model_error, valid)
-    if len(colors) < FEWEST_PIXELS:
+    if len(colors) < MIN_FACE_PIXELS:
         return None
-    alone = chromophore_posterior.weigh(
+    alone = chromophore_posterior.estimate(
         colors, table, prior=prior, variance=noise, model_error=errors
     )
     colors, noise = colors[alone.valid].astype(np.float64), noise[alone.valid]
     errors = errors if errors.ndim == 2 else errors[alone.valid]
-    if len(colors) < FEWEST_PIXELS:
+    if len(colors) < MIN_FACE_PIXELS:
         return None
     weights, mean = _weights(noise / np.square(colors), errors)
-    melanin_ends = math.log(table.c_m_max * LOWEST**3), math.log(table.c_m_max)
+    melanin_ends = math.log(table.c_m_max * MIN_AXIS_FRACTION**3), math.log(table.c_m_max)
     low, high = np.quantile(np.log(alone.melanin[alone.valid]), [0.01, 0.99])
-    low, high = max(low - MARGIN, melanin_ends[0]), min(high + MARGIN, melanin_ends[1])
-    rows = max(math.ceil((high - low) / STEP), 2)
+    low, high = (
+        max(low - LOG_MELANIN_MARGIN, melanin_ends[0]),
+        min(high + LOG_MELANIN_MARGIN, melanin_ends[1]),
+    )
+    rows = max(math.ceil((high - low) / LOG_MELANIN_STEP), 2)
     log_melanin = low + (np.arange(rows) + 0.5) * (high - low) / rows
-    blood = LOWEST + (np.arange(BLOOD_PLACES) + 0.5) * (1.0 - LOWEST) / BLOOD_PLACES
+    blood = (
+        MIN_AXIS_FRACTION
+        + (np.arange(N_BLOOD_NODES) + 0.5) * (1.0 - MIN_AXIS_FRACTION) / N_BLOOD_NODES
+    )
     axis = np.cbrt(np.exp(log_melanin) / table.c_m_max)
     plane = np.log(evaluate(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
 
@@ -119,7 +125,7 @@ def of_colors(
     ) -> FaceDistribution:
         from reconstruction.chromophores import face_kernels as kernels  # compiled when imported
 
-        shape = (len(colors), rows, BLOOD_PLACES // _SUMMED)
+        shape = (len(colors), rows, N_BLOOD_NODES // _SUMMED)
         probability = np.zeros(shape, dtype=np.float32)
         kernels.plane_probability(
             np.log(colors) + color,
@@ -137,7 +143,7 @@ def of_colors(
             log_melanin,
             blood.reshape(-1, _SUMMED).mean(axis=1),
             melanin_ends=melanin_ends,
-            blood_ends=(LOWEST, 1.0),
+            blood_ends=(MIN_AXIS_FRACTION, 1.0),
             begin=begin,
         )
 
@@ -149,7 +155,7 @@ def of_colors(
     return with_common_errors(usual, moved)
 
 
-def in_known_light(
+def fit_with_white_reference(
     rgb: ArrayLike, table: ColorTable, *, variance: ArrayLike, model_error: ArrayLike
 ) -> FaceDistribution | None:
     """Return the distribution over a face before the flash rig, whose white tile was captured.
@@ -157,18 +163,18 @@ def in_known_light(
     Parameters
     ----------
     rgb, table, variance, model_error
-        As of `of_colors`.
+        As of `fit_face_distribution`.
 
     Returns
     -------
     FaceDistribution or None
         With what the place of the face and the layered model have wrong in all pixels alike.
     """
-    return of_colors(
+    return fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
-        common_light=shading_prior.SOFTNESS,
+        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
+        common_light=shading_prior.LOG_SHADING_SOFTNESS,
         common_color=color_errors.color_errors().transport,
         variance=variance,
         model_error=model_error,
@@ -190,7 +196,9 @@ def _sampled(
     if valid is not None:
         good &= np.asarray(valid, dtype=np.bool_)
     places = np.flatnonzero(good)
-    places = places[np.linspace(0, places.size, min(PIXELS, places.size), False).astype(np.intp)]
+    places = places[
+        np.linspace(0, places.size, min(N_SAMPLE_PIXELS, places.size), False).astype(np.intp)
+    ]
     chosen = colors.reshape(-1, 3)[places]
     if variance is None:
         noise = np.square(0.01 * chosen.astype(np.float64))
@@ -207,7 +215,7 @@ def _sampled(
 
 def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return weights of color, brightness projected out, and those of the mean that tells light."""
-    total = (relative + RESOLVED**2)[:, :, None] * np.eye(3) + errors
+    total = (relative + MIN_COLOR_ERROR**2)[:, :, None] * np.eye(3) + errors
     weights = np.linalg.inv(without_brightness(total))
     row = weights.sum(axis=-1)
     whole = row.sum(axis=-1)

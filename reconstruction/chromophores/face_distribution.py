@@ -28,28 +28,28 @@ from scipy.special import ndtr
 
 from reconstruction.arrays import Float64Array, FloatArray
 
-UNEXPECTED: Final = 0.01
+MIN_CONTAMINATION: Final = 0.01
 """Least part of the skin that follows no distribution at all, as of the light
-(`reconstruction.chromophores.shading_prior.UNEXPECTED`): moles and lips are not pulled to the
-face's mean."""
-MOST_UNEXPECTED: Final = 0.5
-LEAST_SPREAD: Final = (0.02, 0.05)
+(`reconstruction.chromophores.shading_prior.UNEXPECTED_PROBABILITY`): moles and lips are not pulled
+to the face's mean."""
+MAX_CONTAMINATION: Final = 0.5
+MIN_SIGMAS: Final = (0.02, 0.05)
 """Least standard deviations of log melanin, below which no colors tell it, and of blood's cube
 root: blood varies by a third to a half over a face, as on simulated subjects of seeds 0 to 7 (0.045
 to 0.050, lips with the rest), less than what pixels err by, from which colors tell it badly."""
-MOST_SPREAD: Final = (2.0, 0.5)
-_BEGIN_SPREAD: Final = (0.3, 0.1)
-_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
+MAX_SIGMAS: Final = (2.0, 0.5)
+_START_SIGMAS: Final = (0.3, 0.1)
+_SEARCH_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
 """Of means, logs of spreads and of parts: what the search takes for one."""
-_DIFFERENCE: Final = 1e-5
-AT_END: Final = 0.02
+_DIFFERENCE_STEP: Final = 1e-5
+END_DISTANCE: Final = 0.02
 """Distance from an end, of log melanin and of blood's axis, within which a mean is held by it: the
 last place that a mean may have lies up to 0.016 before the end."""
-_ROUNDS: Final = 60
+_MAX_ROUNDS: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Bell:
+class ContaminatedNormal:
     """A normal distribution over part of the skin, and any value alike over the rest."""
 
     mean: float
@@ -96,7 +96,7 @@ class Bell:
 
         Examples
         --------
-        >>> bell = Bell(0.0, 1.0, 0.1, -10.0, 10.0)
+        >>> bell = ContaminatedNormal(0.0, 1.0, 0.1, -10.0, 10.0)
         >>> at = np.linspace(-10.0, 10.0, 1001)
         >>> round(float(bell.relative_density(at).mean()), 2), round(bell.height, 3)
         (1.0, 7.979)
@@ -119,9 +119,9 @@ class Bell:
 class FaceDistribution:
     """What one person's skin may be: melanin and blood, each by itself."""
 
-    melanin: Bell
+    melanin: ContaminatedNormal
     """Of the logarithm of the volume fraction in the epidermis."""
-    blood: Bell
+    blood: ContaminatedNormal
     """Of the cube root of the volume fraction in the dermis, as a part of the table's end."""
 
 
@@ -182,10 +182,10 @@ def fit(
         np.concatenate([[1.5 * at[0] - 0.5 * at[1]], at + 0.5 * (at[1] - at[0])]) for at in places
     ]
 
-    def bells(unknowns: Float64Array) -> tuple[Bell, Bell]:
-        unknowns = unknowns * _SCALE
+    def bells(unknowns: Float64Array) -> tuple[ContaminatedNormal, ContaminatedNormal]:
+        unknowns = unknowns * _SEARCH_SCALE
         first, second = (
-            Bell(
+            ContaminatedNormal(
                 float(unknowns[3 * k]),
                 math.exp(unknowns[3 * k + 1]),
                 math.exp(unknowns[3 * k + 2]),
@@ -209,15 +209,17 @@ def fit(
         gradient = np.empty(6)
         for k in range(6):
             step = np.zeros(6)
-            step[k] = _DIFFERENCE
+            step[k] = _DIFFERENCE_STEP
             more, less = densities(unknowns + step), densities(unknowns - step)
-            gradient[k] = by_density[k // 3] @ (more[k // 3] - less[k // 3]) / (2.0 * _DIFFERENCE)
+            gradient[k] = (
+                by_density[k // 3] @ (more[k // 3] - less[k // 3]) / (2.0 * _DIFFERENCE_STEP)
+            )
         return -float(np.log(each).mean()), -gradient / len(share)
 
     if begin is None:
         usual = share.mean(axis=0, dtype=np.float64).reshape(shape)
         means = usual.sum(axis=1) @ log_melanin, usual.sum(axis=0) @ blood
-        start = [(means[k], math.log(_BEGIN_SPREAD[k]), math.log(0.1)) for k in range(2)]
+        start = [(means[k], math.log(_START_SIGMAS[k]), math.log(0.1)) for k in range(2)]
     else:
         start = [
             (bell.mean, math.log(bell.spread), math.log(bell.unexpected))
@@ -228,18 +230,18 @@ def fit(
         for k in range(2)
         for bound in (
             (float(places[k][0]), float(places[k][-1])),
-            (math.log(LEAST_SPREAD[k]), math.log(MOST_SPREAD[k])),
-            (math.log(UNEXPECTED), math.log(MOST_UNEXPECTED)),
+            (math.log(MIN_SIGMAS[k]), math.log(MAX_SIGMAS[k])),
+            (math.log(MIN_CONTAMINATION), math.log(MAX_CONTAMINATION)),
         )
     ]
-    low, high = np.array(bounds).T / _SCALE
+    low, high = np.array(bounds).T / _SEARCH_SCALE
     found = minimize(
         misfit,
-        np.clip(np.ravel(start) / _SCALE, low, high),
+        np.clip(np.ravel(start) / _SEARCH_SCALE, low, high),
         jac=True,
         method="L-BFGS-B",
         bounds=np.stack([low, high], axis=1),
-        options={"maxiter": _ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
+        options={"maxiter": _MAX_ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
     )
     return FaceDistribution(*bells(found.x))
 
@@ -260,8 +262,8 @@ def with_common_errors(
     Examples
     --------
     >>> def face(mean):
-    ...     blood = Bell(0.4, 0.1, 0.01, 0.0, 1.0)
-    ...     return FaceDistribution(Bell(mean, 0.3, 0.01, -9.0, -0.7), blood)
+    ...     blood = ContaminatedNormal(0.4, 0.1, 0.01, 0.0, 1.0)
+    ...     return FaceDistribution(ContaminatedNormal(mean, 0.3, 0.01, -9.0, -0.7), blood)
     >>> known = with_common_errors(face(-3.0), [(face(-3.4), face(-2.6)), (face(-3.3), face(-2.7))])
     >>> round(known.melanin.stderr, 6), known.blood.stderr
     (0.5, 0.0)
@@ -276,24 +278,25 @@ def with_common_errors(
         for pick in (_melanin_of, _blood_of)
     ]
     blood = replace(usual.blood, stderr=errors[1])
-    if blood.mean - blood.low < AT_END:
+    if blood.mean - blood.low < END_DISTANCE:
         blood = replace(blood, unexpected=1.0)
     return FaceDistribution(replace(usual.melanin, stderr=errors[0]), blood)
 
 
-def _moves_by(usual: Bell, minus: float, plus: float) -> float:
+def _moves_by(usual: ContaminatedNormal, minus: float, plus: float) -> float:
     """Return by how much a mean moves with one standard error of what moved it to both sides."""
     held = any(
-        min(mean - usual.low, usual.high - mean) < AT_END for mean in (minus, usual.mean, plus)
+        min(mean - usual.low, usual.high - mean) < END_DISTANCE
+        for mean in (minus, usual.mean, plus)
     )
     if held:
         return max(abs(usual.mean - minus), abs(plus - usual.mean))
     return 0.5 * (plus - minus)
 
 
-def _melanin_of(face: FaceDistribution) -> Bell:
+def _melanin_of(face: FaceDistribution) -> ContaminatedNormal:
     return face.melanin
 
 
-def _blood_of(face: FaceDistribution) -> Bell:
+def _blood_of(face: FaceDistribution) -> ContaminatedNormal:
     return face.blood

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import float32, float64, int64, njit, prange, types, void
 
-_FAST = {"contract"}
-NEGLIGIBLE = 36.0
+_FAST_MATH = {"contract"}
+NEGLIGIBLE_DEVIANCE = 36.0
 """-2 log p above the pixel's lowest from which on probability is left out."""
 
 
@@ -30,7 +30,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         float32[:, :, ::1],  # probability (n, m, b / summed), 0 before
     ),
     parallel=True,
-    fastmath=_FAST,
+    fastmath=_FAST_MATH,
     cache=True,
     nogil=True,
     boundscheck=False,
@@ -61,5 +61,5 @@ def plane_probability(  # type: ignore[no-untyped-def]
         for i in range(rows):
             for j in range(columns):
                 more = cost[i, j] - lowest
-                if more < NEGLIGIBLE:
+                if more < NEGLIGIBLE_DEVIANCE:
                     probability[n, i, j // summed] += np.float32(math.exp(-0.5 * more))

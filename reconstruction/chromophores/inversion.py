@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
-from reconstruction.chromophores.start import LOWEST, Start, evaluate, start_for
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, Start, evaluate, start_for
 
 Shading = Literal["known"] | ArrayLike | None
 
-RELATIVE_NOISE = 0.01
+DEFAULT_RELATIVE_NOISE = 0.01
 """Relative noise of each channel that is assumed when no variance is given."""
-IDENTIFIABLE = 1.0
+MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not seen."""
 _TASK_PIXELS = 8192
 
@@ -77,7 +77,7 @@ def invert(
     model_error: ArrayLike | None = None,
     valid: ArrayLike | None = None,
     shading_max: float | None = None,
-    limit: float = IDENTIFIABLE,
+    limit: float = MAX_IDENTIFIABLE_STDERR,
 ) -> ChromophoreMaps:
     """Estimate melanin and hemoglobin of every pixel.
 
@@ -146,8 +146,8 @@ def invert(
     shape = colors.shape[:-1]
     free, known = _shading(shading, shape)
     pixels = int(np.prod(shape, dtype=np.int64))
-    maps = np.empty((len(kernels.MAPS), pixels), dtype=np.float32)
-    masks = np.empty((len(kernels.MASKS), pixels), dtype=np.bool_)
+    maps = np.empty((len(kernels.INVERSION_MAPS), pixels), dtype=np.float32)
+    masks = np.empty((len(kernels.INVERSION_MASKS), pixels), dtype=np.bool_)
     covariance = model_covariance(model_error, variance is None)
     covariance = without_brightness(covariance) if free else covariance
     start = start_for(table, free)
@@ -172,8 +172,8 @@ def invert(
         masks,
         _TASK_PIXELS,
     )
-    named = {name: maps[k].reshape(shape) for k, name in enumerate(kernels.MAPS)}
-    flags = {name: masks[k].reshape(shape) for k, name in enumerate(kernels.MASKS)}
+    named = {name: maps[k].reshape(shape) for k, name in enumerate(kernels.INVERSION_MAPS)}
+    flags = {name: masks[k].reshape(shape) for k, name in enumerate(kernels.INVERSION_MASKS)}
     return ChromophoreMaps(**named, **flags)
 
 
@@ -212,7 +212,7 @@ def identifiability(
     variance: ArrayLike | Callable[[Float64Array], ArrayLike] | None = None,
     model_error: ArrayLike | None = None,
     shading_max: float | None = None,
-    limit: float = IDENTIFIABLE,
+    limit: float = MAX_IDENTIFIABLE_STDERR,
     size: int = 64,
 ) -> Identifiability:
     """Return the Cramer-Rao bounds of both chromophores over the table.
@@ -248,7 +248,7 @@ def identifiability(
     if size < 2:
         raise ChromophoreError(f"size: expected at least 2 points, got {size}")
     level = shading if isinstance(shading, int | float) else 1.0
-    fraction = np.linspace(LOWEST, 1.0, size)
+    fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, size)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
     color, by_a, by_b = evaluate(table, a, b)
     seen = level * color
@@ -303,7 +303,7 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
             f"model_error: expected a number, shape (3,) or (3, 3), got {error.shape}"
         )
     # Single precision of the colors themselves keeps the weights finite.
-    floor = RELATIVE_NOISE**2 if default_noise else 1e-12
+    floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
     return np.asarray(covariance + floor * np.eye(3))
 
 

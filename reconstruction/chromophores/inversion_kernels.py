@@ -11,28 +11,28 @@ import math
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
 
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
-MAX_STEPS = 12
-REACH = 0.12
+MAX_FIT_STEPS = 12
+MAX_AXIS_STEP = 0.12
 """Longest step along an axis, as a fraction of it."""
-DONE = 4e-3
+RELATIVE_STEP_TOL = 4e-3
 """Step, relative to the place, after which the next one would be below 5e-5."""
-DONE_AXIS = 1e-3
+AXIS_STEP_TOL = 1e-3
 """The same as a fraction of the axis."""
-DONE_GAIN = 1e-3
+GAIN_TOL = 1e-3
 """The same as the square of the step in standard errors."""
-DONE_MISFIT = 1e-2
+MISFIT_GAIN_TOL = 1e-2
 """What a misfit adds to it, per square of the residual: noise makes more digits worthless."""
-DONE_NOISY = 3e-2
+NOISY_STEP_TOL = 3e-2
 """Step, relative to the place, that is the last one if noise leaves more than it gains."""
-CONVERGED = 2e-2
+CONVERGED_STEP = 2e-2
 """Step, relative to the place, up to which the last one counts as converged."""
 OUTSIDE_SIGMAS = 4.0
 """Residual, in standard errors, from which on a color does not belong to the table ..."""
 OUTSIDE_DISTANCE = 0.02
 """... if it is also this far from it, as a relative difference of color."""
-MAPS = (
+INVERSION_MAPS = (
     "melanin",
     "hemoglobin",
     "shading",
@@ -41,13 +41,19 @@ MAPS = (
     "residual",
     "gamut_distance",
 )
-MASKS = ("valid", "outside", "melanin_identifiable", "hemoglobin_identifiable", "ambiguous")
-HUGE = 1e30
+INVERSION_MASKS = (
+    "valid",
+    "outside",
+    "melanin_identifiable",
+    "hemoglobin_identifiable",
+    "ambiguous",
+)
+MAX_FINITE = 1e30
 """Colors and variances from here on count as infinite."""
 
 # Contraction only: NaN and infinity must keep their meaning.
-_FAST = {"contract"}
-_LOW = np.float32(LOWEST)
+_FAST_MATH = {"contract"}
+_LOW = np.float32(MIN_AXIS_FRACTION)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
 _THREE = np.float32(3.0)
@@ -56,7 +62,7 @@ _HALF = np.float32(0.5)
 _ZERO = np.float32(0.0)
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _cell(q, x, y):  # type: ignore[no-untyped-def]
     """Return one channel's value and derivatives v, v_x, v_y in its cell."""
     v = v_x = v_y = _ZERO
@@ -68,7 +74,7 @@ def _cell(q, x, y):  # type: ignore[no-untyped-def]
     return v, v_x, v_y
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
     """Return one channel's second derivatives v_xx, v_xy, v_yy in its cell."""
     v = v_x = v_y = v_xx = v_xy = v_yy = _ZERO
@@ -83,7 +89,7 @@ def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
     return _TWO * v_xx, v_xy, _TWO * v_yy
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
     """Solve the 2 x 2 normal equations; a singular one gets a ridge."""
     det = float64(haa) * hbb - float64(hab) * hab
@@ -93,7 +99,7 @@ def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
     return step_a, step_b
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -106,7 +112,7 @@ def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
     """Invert a symmetric 3 x 3 covariance; return w00, w01, w02, w11, w12, w22."""
     c00 = a11 * a22 - a12 * a12
@@ -123,7 +129,7 @@ def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
     """Take log RGB to the coordinates of a start grid."""
     return (
@@ -132,7 +138,7 @@ def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     """Interpolate the start grid bilinearly, clamped to it."""
     last = axes.shape[0] - 1
@@ -149,7 +155,7 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     return min(max(a, _LOW), _ONE), min(max(b, _LOW), _ONE)
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(inline="always", fastmath=_FAST_MATH)
 def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
     """Stop a step at the table's edge, where the other chromophore is fitted alone."""
     if a + step_a < _LOW or a + step_a > _ONE:
@@ -164,8 +170,8 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
     step_a = min(max(step_a, _LOW - a), _ONE - a)
     step_b = min(max(step_b, _LOW - b), _ONE - b)
     longest = max(abs(step_a), abs(step_b))
-    if longest > REACH:
-        shorter = np.float32(REACH) / np.float32(longest)
+    if longest > MAX_AXIS_STEP:
+        shorter = np.float32(MAX_AXIS_STEP) / np.float32(longest)
         step_a *= shorter
         step_b *= shorter
     return np.float32(step_a), np.float32(step_b)
@@ -197,7 +203,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         int64,  # pixels a task
     ),
     parallel=True,
-    fastmath=_FAST,
+    fastmath=_FAST_MATH,
     cache=True,
     nogil=True,
     boundscheck=False,
@@ -243,15 +249,15 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             good = (
                 usable[n if each_usable else 0]
                 and known > _ZERO
-                and known < HUGE
+                and known < MAX_FINITE
                 and d0 > _ZERO
                 and d1 > _ZERO
                 and d2 > _ZERO
-                and d0 + d1 + d2 < HUGE
+                and d0 + d1 + d2 < MAX_FINITE
                 and v0 >= _ZERO
                 and v1 >= _ZERO
                 and v2 >= _ZERO
-                and v0 + v1 + v2 < HUGE
+                and v0 + v1 + v2 < MAX_FINITE
             )
             if not good:
                 for m in range(7):
@@ -309,7 +315,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             e0 = e1 = e2 = _ZERO
             ga0 = ga1 = ga2 = gb0 = gb1 = gb2 = _ZERO
             done = False
-            for step in range(MAX_STEPS):
+            for step in range(MAX_FIT_STEPS):
                 i, j = a * length, b * length
                 row, column = min(int(i), last - 1), min(int(j), last - 1)
                 x, y = i - np.float32(row), j - np.float32(column)
@@ -335,7 +341,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
                 facing = (ga1 * gb2 - ga2 * gb1) + (ga2 * gb0 - ga0 * gb2) + (ga0 * gb1 - ga1 * gb0)
                 # Beyond the fold, where gray sees the other side, lies the second solution.
-                beyond = free and cost_before < HUGE and facing * light_side < _ZERO
+                beyond = free and cost_before < MAX_FINITE and facing * light_side < _ZERO
                 if beyond or cost > cost_before * np.float32(1.01) + np.float32(1e-9):
                     # Overshot: half of the way back to the last good place.
                     a, b = _HALF * (a + a_before), _HALF * (b + b_before)
@@ -393,9 +399,12 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 longest = max(abs(step_a) / a, abs(step_b) / b)
                 misfit = cost - gain
                 if (
-                    gain < DONE_GAIN + DONE_MISFIT * misfit
-                    or (longest < DONE and max(abs(step_a), abs(step_b)) < DONE_AXIS)
-                    or (longest < DONE_NOISY and gain < misfit)
+                    gain < GAIN_TOL + MISFIT_GAIN_TOL * misfit
+                    or (
+                        longest < RELATIVE_STEP_TOL
+                        and max(abs(step_a), abs(step_b)) < AXIS_STEP_TOL
+                    )
+                    or (longest < NOISY_STEP_TOL and gain < misfit)
                 ):
                     done = True
                     break
@@ -430,7 +439,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             maps[6, n] = distance
             twin = free and (l0 + l1 + l2) / _THREE <= twin_brightness + log_shading_max
             outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
-            close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED
+            close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED_STEP
             masks[0, n] = (done or close) and not outside
             masks[1, n] = outside
             masks[2, n] = relative_a <= limit and a < _ONE and not twin

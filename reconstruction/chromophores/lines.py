@@ -1,6 +1,7 @@
 """Lines of equal melanin over a color table, which the weighing of chromophores goes along.
 
-Both axes run evenly in the cube root of the volume fraction over its largest, from `LOWEST` to 1.
+Both axes run evenly in the cube root of the volume fraction over its largest, from
+`MIN_AXIS_FRACTION` to 1.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ import numpy as np
 
 from model.color_table import ColorTable
 from reconstruction.arrays import Float64Array
-from reconstruction.chromophores.start import LOWEST, evaluate
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
 
-LINES = 49
+N_LINES = 49
 """Values of melanin at which there is a line."""
-NODES = 65
+N_LINE_NODES = 65
 """Values of blood that each line's colors are stored at."""
-PER_LINE = 32
+NODES_PER_LINE = 32
 """Nodes of melanin's probability from line to line."""
-MELANIN_AXIS = np.linspace(float(LOWEST), 1.0, (LINES - 1) * PER_LINE + 1)
+MELANIN_AXIS = np.linspace(float(MIN_AXIS_FRACTION), 1.0, (N_LINES - 1) * NODES_PER_LINE + 1)
 """Fractions of the melanin axis, its cube root, that they stand at."""
 
 
@@ -39,7 +40,9 @@ class Lines:
 @lru_cache(maxsize=16)
 def lines_of(table: ColorTable) -> Lines:
     """Return the lines of a table; kept for the tables used last."""
-    low = float(LOWEST)
-    a, b = np.meshgrid(np.linspace(low, 1.0, LINES), np.linspace(low, 1.0, NODES), indexing="ij")
+    low = float(MIN_AXIS_FRACTION)
+    a, b = np.meshgrid(
+        np.linspace(low, 1.0, N_LINES), np.linspace(low, 1.0, N_LINE_NODES), indexing="ij"
+    )
     color, by_a, by_b = evaluate(table, a, b)
     return Lines(np.log(color), by_a / color, by_b / color)

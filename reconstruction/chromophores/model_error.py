@@ -28,14 +28,14 @@ from scipy.ndimage import gaussian_filter
 
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
-FILE = "data/chromophore_model_error.json"
+MODEL_ERROR_FILE = "data/chromophore_model_error.json"
 
 
-SMOOTH: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+FOURTH_DIFFERENCE: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
 """Fourth differences, 1 at the middle: what is cubic over 5 pixels leaves nothing."""
-AROUND_PX: Final = 1.5
+STRUCTURE_WINDOW_PX: Final = 1.5
 """Standard deviation of the window that squares of differences are averaged in, px."""
-_AROUND_REACH: Final = int(4.0 * AROUND_PX + 0.5)
+_WINDOW_REACH_PX: Final = int(4.0 * STRUCTURE_WINDOW_PX + 0.5)
 _BAND_PIXELS: Final = 1 << 16
 
 
@@ -179,7 +179,7 @@ def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> F
     >>> bool(fine_structure(smooth, 0.0 * smooth, np.ones((12, 12), bool)).max() < 1e-24)
     True
     """
-    reach = SMOOTH.size // 2
+    reach = FOURTH_DIFFERENCE.size // 2
     squares, count = np.empty(valid.shape), np.empty(valid.shape, np.uint8)
     for rows in _bands(valid.shape):
         wide, own = _with_rim(rows, reach, valid.shape[0])
@@ -189,10 +189,12 @@ def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> F
     usual = squares.sum() / total if total else 0.0
     structure = np.empty(valid.shape)
     for rows in _bands(valid.shape):
-        wide, own = _with_rim(rows, _AROUND_REACH, valid.shape[0])
-        around = gaussian_filter(count[wide].astype(np.float64), AROUND_PX, mode="constant")[own]
+        wide, own = _with_rim(rows, _WINDOW_REACH_PX, valid.shape[0])
+        around = gaussian_filter(
+            count[wide].astype(np.float64), STRUCTURE_WINDOW_PX, mode="constant"
+        )[own]
         known = around > 1e-6
-        mean = gaussian_filter(squares[wide], AROUND_PX, mode="constant")[own]
+        mean = gaussian_filter(squares[wide], STRUCTURE_WINDOW_PX, mode="constant")[own]
         mean = np.where(known, mean / np.where(known, around, 1.0), usual)
         structure[rows] = np.where(valid[rows], np.maximum(mean, 0.0), 0.0)
     return structure
@@ -206,17 +208,21 @@ def _squared_differences(
     log_rgb = np.log(safe)
     noise = np.where(valid, (variance / safe**2).mean(axis=-1), 0.0)
     squares, count = np.zeros(valid.shape), np.zeros(valid.shape)
-    reach = SMOOTH.size // 2
+    reach = FOURTH_DIFFERENCE.size // 2
     for axis in (0, 1):
         length = valid.shape[axis] - 2 * reach
         if length <= 0:
             continue
         parts = [
             tuple(slice(k, k + length) if a == axis else slice(None) for a in (0, 1))
-            for k in range(SMOOTH.size)
+            for k in range(FOURTH_DIFFERENCE.size)
         ]
-        step = sum(weight * log_rgb[part] for weight, part in zip(SMOOTH, parts, strict=True))
-        noise_here = sum(w**2 * noise[part] for w, part in zip(SMOOTH, parts, strict=True))
+        step = sum(
+            weight * log_rgb[part] for weight, part in zip(FOURTH_DIFFERENCE, parts, strict=True)
+        )
+        noise_here = sum(
+            w**2 * noise[part] for w, part in zip(FOURTH_DIFFERENCE, parts, strict=True)
+        )
         whole = np.logical_and.reduce([valid[part] for part in parts])
         here = parts[reach]
         squares[here] += np.where(whole, np.mean(np.square(step), axis=-1) - noise_here, 0.0)
@@ -237,6 +243,6 @@ def identity() -> dict[str, str]:
 
 
 def _document() -> dict[str, Any]:
-    text = resources.files("reconstruction").joinpath(FILE).read_text(encoding="utf-8")
+    text = resources.files("reconstruction").joinpath(MODEL_ERROR_FILE).read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)
     return found

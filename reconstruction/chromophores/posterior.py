@@ -20,7 +20,7 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
-    RELATIVE_NOISE,
+    DEFAULT_RELATIVE_NOISE,
     ChromophoreError,
     invert,
     model_covariance,
@@ -29,9 +29,9 @@ from reconstruction.chromophores.inversion import (
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophores.lines import MELANIN_AXIS, lines_of
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
-FINEST = 2e-4
+MIN_RELATIVE_NOISE = 2e-4
 """Least relative error of a color that is told apart: smaller noise is taken for this much, with
 which melanin is known to some 0.3 percent."""
 _TASK_PIXELS = 1024
@@ -39,7 +39,7 @@ _BAND_PIXELS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class WeighedChromophores:
+class ChromophorePosterior:
     """Medians and 68 % reaches; every map has the pixels' shape."""
 
     melanin: Float32Array
@@ -64,7 +64,7 @@ class WeighedChromophores:
     """Usable input, and not `outside`."""
 
 
-def weigh(
+def estimate(
     rgb: ArrayLike,
     table: ColorTable,
     *,
@@ -73,7 +73,7 @@ def weigh(
     variance: ArrayLike | None = None,
     model_error: ArrayLike | None = None,
     valid: ArrayLike | None = None,
-) -> WeighedChromophores:
+) -> ChromophorePosterior:
     """Estimate melanin and hemoglobin of every pixel from all solutions that are possible.
 
     Parameters
@@ -97,7 +97,7 @@ def weigh(
 
     Returns
     -------
-    WeighedChromophores
+    ChromophorePosterior
         Estimates, 68 % reaches and masks of the pixels' shape.
 
     Raises
@@ -122,7 +122,7 @@ def weigh(
     >>> from reconstruction.chromophores.shading_prior import lognormal
     >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
     >>> color = 0.8 * table.lookup([[0.01, 0.02]], [[0.05, 0.05]])
-    >>> found = weigh(color, table, prior=lognormal(0.7, 0.6), variance=(1e-3 * color) ** 2)
+    >>> found = estimate(color, table, prior=lognormal(0.7, 0.6), variance=(1e-3 * color) ** 2)
     >>> [f"{value:.3f}" for value in found.melanin[0]]
     ['0.010', '0.020']
     >>> [f"{value:.2f}" for value in found.shading[0]]
@@ -136,10 +136,10 @@ def weigh(
     usable = np.isfinite(fitted.melanin) & np.isfinite(fitted.hemoglobin)
     ends = np.array([table.c_m_max, table.c_hd_max])
     fractions = np.stack([fitted.melanin, fitted.hemoglobin], axis=-1) / ends
-    begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), LOWEST, 1.0)
+    begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), MIN_AXIS_FRACTION, 1.0)
     noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
     lines = lines_of(table)
-    maps = np.empty((len(ridge.MAPS), pixels), dtype=np.float32)
+    maps = np.empty((len(ridge.POSTERIOR_MAPS), pixels), dtype=np.float32)
     ridge.weigh_pixels(
         np.ascontiguousarray(colors).reshape(-1, 3),
         np.ascontiguousarray(np.broadcast_to(noise, colors.shape), np.float32).reshape(-1, 3),
@@ -157,13 +157,13 @@ def weigh(
         maps,
         _TASK_PIXELS,
     )
-    named = {name: maps[k].reshape(shape) for k, name in enumerate(ridge.MAPS)}
+    named = {name: maps[k].reshape(shape) for k, name in enumerate(ridge.POSTERIOR_MAPS)}
     # the rough fit knew the usual model error alone: of a picture with much else than skin it is
     # far too large
     outside = fitted.outside | (
         (named["residual"] > OUTSIDE_SIGMAS) & (fitted.gamut_distance > OUTSIDE_DISTANCE)
     )
-    return WeighedChromophores(
+    return ChromophorePosterior(
         **named,
         gamut_distance=fitted.gamut_distance,
         outside=outside,
@@ -196,14 +196,14 @@ def _covariances(
     each = np.asarray(0.0 if model_error is None else model_error, dtype=np.float64)
     if each.ndim < 3:
         usual = model_covariance(model_error, default_noise)
-        covariances = without_brightness(usual + FINEST**2 * np.eye(3))[None]
+        covariances = without_brightness(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
         return model_error, covariances[(..., *_UPPER)]
     if each.shape != (*shape, 3, 3):
         raise ChromophoreError(
             f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {each.shape}"
         )
     each = each.reshape(-1, 3, 3)
-    floor = (RELATIVE_NOISE**2 if default_noise else 1e-12) + FINEST**2
+    floor = (DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12) + MIN_RELATIVE_NOISE**2
     triangles = np.empty((len(each), 6))
     for start in range(0, len(each), _BAND_PIXELS):  # copies of a whole picture need gigabytes
         band = each[start : start + _BAND_PIXELS]

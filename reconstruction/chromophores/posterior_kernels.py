@@ -27,47 +27,54 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
 
 from reconstruction.arrays import BoolArray, Float64Array
-from reconstruction.chromophores.lines import LINES, NODES, PER_LINE
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.lines import N_LINE_NODES, N_LINES, NODES_PER_LINE
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
-NEWTON_STEPS = 4
-REACH = 0.12
+N_NEWTON_STEPS = 4
+MAX_RIDGE_STEP = 0.12
 """Longest step in blood, as a fraction of its axis."""
-CLOSE = 0.02
+STEP_TOL = 0.02
 """Step, in standard errors of blood, after which the next one would not matter."""
-ROUGH = 1.0
+ACCEPT_TOL = 1.0
 """The same up to which the last step is taken for granted."""
-MISSED = 2.0
+RIDGE_JUMP_COST = 2.0
 """Cost below the ridge's from which on a place beside it is taken for the ridge."""
-PROBES = 8
+N_PROBES = 8
 """Places between two lines where the cost is looked at first."""
-FINE = 160
+N_FINE = 160
 """Places that the probability is summed at, along melanin, spread over where there is any."""
-FEWEST = 5
+MIN_NODES = 5
 """Fewest of them between two lines."""
-ACROSS = 8
+N_ACROSS = 8
 """Places in blood, across the ridge, at each of them."""
-WIDE = 0.25
+SHAPE_EXTENT = 0.25
 """Extent across the ridge, as a fraction of the axis, from which on its shape is looked at."""
-COARSE = 24
+N_COARSE = 24
 """Places that it is looked at, over the whole axis."""
-FAR = 8.0
+TAIL_COST = 8.0
 """Cost above the lowest where the ends are set."""
-NEGLIGIBLE = 18.0
+NEGLIGIBLE_COST = 18.0
 """Cost above the lowest from which on probability is left out: 1e-4 of the greatest."""
-BINS = 128
+N_BINS = 128
 """Bins of blood's probability."""
-STEPS_TO_REACH = 20
+N_HALVINGS = 20
 """Halvings of the distance that holds one sigma's probability."""
-WITHIN = 0.682689492137086
+ONE_SIGMA_PROBABILITY = 0.682689492137086
 """Probability within one standard error of a normal distribution."""
-MAPS = ("melanin", "hemoglobin", "shading", "stderr_melanin", "stderr_hemoglobin", "residual")
+POSTERIOR_MAPS = (
+    "melanin",
+    "hemoglobin",
+    "shading",
+    "stderr_melanin",
+    "stderr_hemoglobin",
+    "residual",
+)
 
-_LOW = float(LOWEST)
-_STEP_A = (1.0 - _LOW) / (LINES - 1)
-_STEP_B = (1.0 - _LOW) / (NODES - 1)
-_ROOM = (LINES - 1) * FEWEST + FINE
-_FAST = {"contract"}
+_LOW = float(MIN_AXIS_FRACTION)
+_STEP_A = (1.0 - _LOW) / (N_LINES - 1)
+_STEP_B = (1.0 - _LOW) / (N_LINE_NODES - 1)
+_ROOM = (N_LINES - 1) * MIN_NODES + N_FINE
+_FAST_MATH = {"contract"}
 
 
 class _Ridge(NamedTuple):
@@ -101,12 +108,12 @@ class _Beside(NamedTuple):
     width: Float64Array
     """(LINES,): of a place."""
     wide: BoolArray
-    """(LINES,): the curvature says little, see `WIDE`."""
+    """(LINES,): the curvature says little, see `SHAPE_EXTENT`."""
     coarse: Float64Array
     """(COARSE,): costs on one wide line."""
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -119,7 +126,7 @@ def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     """Return the cubic with these values and derivatives at the ends, and its derivative."""
     rise = v1 - v0
@@ -130,11 +137,11 @@ def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     return value, slope
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     """Return the log color and its derivative by blood on line k, the node and the way past it."""
     y = (b - _LOW) / _STEP_B
-    j = min(int(y), NODES - 2)
+    j = min(int(y), N_LINE_NODES - 2)
     x = y - j
     f0, g0 = _hermite(
         log_rgb[k, j, 0], log_rgb[k, j + 1, 0], by_b[k, j, 0], by_b[k, j + 1, 0], x, _STEP_B
@@ -148,7 +155,7 @@ def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     return f0, f1, f2, g0, g1, g2, j, x
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
     """Return -2 log p of a log shading; beyond the table its ends go on straight."""
     y = (t - low) / step
@@ -156,7 +163,7 @@ def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
     return prior[i] + (y - i) * (prior[i + 1] - prior[i])
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
 
@@ -171,39 +178,39 @@ def _blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     return cost, -share * away / of_face[1], share / (of_face[1] * of_face[1])
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
     """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
-    y = x * PER_LINE
-    i = min(int(y), PER_LINE - 1)
-    i0 = k * PER_LINE + i
+    y = x * NODES_PER_LINE
+    i = min(int(y), NODES_PER_LINE - 1)
+    i0 = k * NODES_PER_LINE + i
     return of_face[i0] + (y - i) * (of_face[i0 + 1] - of_face[i0])
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-def]
     """Return the blood on line k near which color and face are the most probable.
 
     Also the last step that would be left, by how much blood is stiff there by the color and in
     all, the residuals' products with the color's derivative and themselves, and residuals.
     """
-    for turn in range(NEWTON_STEPS + 1):
+    for turn in range(N_NEWTON_STEPS + 1):
         f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
         e0, e1, e2 = seen[0] - f0, seen[1] - f1, seen[2] - f2
         by_color = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
         pushed = _form(w, g0, g1, g2, e0, e1, e2)
         _, force, stiff = _blood_cost(of_face, b)
         step = (pushed + force) / (by_color + stiff)
-        moved = min(max(b + min(max(step, -REACH), REACH), _LOW), 1.0) - b
-        if turn == NEWTON_STEPS or moved * moved * (by_color + stiff) < CLOSE * CLOSE:
+        moved = min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), _LOW), 1.0) - b
+        if turn == N_NEWTON_STEPS or moved * moved * (by_color + stiff) < STEP_TOL * STEP_TOL:
             break
         b += moved
-    if step * step * (by_color + stiff) > ROUGH * ROUGH:
+    if step * step * (by_color + stiff) > ACCEPT_TOL * ACCEPT_TOL:
         step = 0.0  # not found: what a parabola says of places that far off is worth nothing
     return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     """Return blood, cost, the face's part of it and shading after the last step of `_descend`.
 
@@ -222,14 +229,14 @@ def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     return after, max(square, 0.0) + more, more, shade, held
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
     a = _LOW + (k + x) * _STEP_A
     return end * a * a * a
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
     """Interpolate `at` where the ascending `values`, count + 1 of them, reach `wanted`."""
     if wanted <= values[0]:
@@ -247,7 +254,7 @@ def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
     return at[low] + part * (at[high] - at[low])
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     """Return the median, and the distance from it within which one sigma's probability lies.
 
@@ -255,18 +262,18 @@ def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     """
     center = _place(total, edges, count, 0.5 * total[count])
     low, high = 0.0, max(edges[count] - center, center - edges[0])
-    for _ in range(STEPS_TO_REACH):
+    for _ in range(N_HALVINGS):
         middle = 0.5 * (low + high)
         above = _place(edges, total, count, center + middle)
         below = _place(edges, total, count, center - middle)
-        if above - below < WITHIN * total[count]:
+        if above - below < ONE_SIGMA_PROBABILITY * total[count]:
             low = middle
         else:
             high = middle
     return center, 0.5 * (low + high)
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     """Return the weights of relative errors of a color, brightness projected out, and its own.
 
@@ -297,19 +304,19 @@ def _weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     return w, (s0, s1, s2)
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
     """Write the ridge, followed to both sides of where the fit ended."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
     blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
     spread, pull = ridge.spread, ridge.pull
     prior, prior_low, prior_step = light
-    first = min(max(int((begin[0] - _LOW) / _STEP_A + 0.5), 0), LINES - 1)
+    first = min(max(int((begin[0] - _LOW) / _STEP_A + 0.5), 0), N_LINES - 1)
     for side in range(2):
         b = float64(begin[1])
         if side == 1:
             b = blood[first]
-        count = LINES - first if side == 0 else first
+        count = N_LINES - first if side == 0 else first
         for index in range(count):
             k = first + index if side == 0 else first - 1 - index
             found = _descend(log_rgb, by_b, k, b, seen, w, blood_of_face)
@@ -322,7 +329,7 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
                 better = least + _prior_cost(prior, prior_low, prior_step, t)
                 better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
                 if better > 0.0:
-                    second[k] = after if better < FAR else o_after
+                    second[k] = after if better < TAIL_COST else o_after
                     found, after, least, more, t, held = (
                         other,
                         o_after,
@@ -331,7 +338,7 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
                         o_t,
                         o_held,
                     )
-                elif better > -FAR:
+                elif better > -TAIL_COST:
                     second[k] = o_after
             _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
             h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
@@ -348,16 +355,16 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
             shade[k] = t
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
     """Return the lowest cost along the ridge, and of colors alone; write it between the lines."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
     prior, prior_low, prior_step = light
     lowest, color_lowest = np.inf, np.inf
-    for k in range(LINES - 1):
+    for k in range(N_LINES - 1):
         least = np.inf
-        for i in range(PROBES + 1):
-            x = float64(i) / PROBES
+        for i in range(N_PROBES + 1):
+            x = float64(i) / N_PROBES
             value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
             value = max(value, 0.0)
             more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
@@ -371,7 +378,7 @@ def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-
     return lowest, color_lowest
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _look_across(  # type: ignore[no-untyped-def]
     log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
 ):
@@ -384,9 +391,9 @@ def _look_across(  # type: ignore[no-untyped-def]
     s0, s1, s2 = s
     prior, prior_low, prior_step = light
     b_low, b_high = 1.0, _LOW
-    for k in range(LINES):
-        beside = min(between[max(k - 1, 0)], between[min(k, LINES - 2)])
-        if not beside < lowest + NEGLIGIBLE:
+    for k in range(N_LINES):
+        beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
+        if not beside < lowest + NEGLIGIBLE_COST:
             continue
         b = blood[k]
         reach = 2.6 * spread[k]
@@ -394,12 +401,12 @@ def _look_across(  # type: ignore[no-untyped-def]
             reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
         low = max(min(b, second[k]) - reach, _LOW)
         high = min(max(b, second[k]) + reach, 1.0)
-        wide[k] = high - low > WIDE
+        wide[k] = high - low > SHAPE_EXTENT
         if wide[k]:
             # The curvature says little of the far ends: look where probability ends.
-            width = (1.0 - _LOW) / COARSE
+            width = (1.0 - _LOW) / N_COARSE
             least = np.inf
-            for i in range(COARSE):
+            for i in range(N_COARSE):
                 f0, f1, f2 = _color(log_rgb, by_b, k, _LOW + (i + 0.5) * width)[:3]
                 e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                 t = s0 * e0 + s1 * e1 + s2 * e2
@@ -410,35 +417,35 @@ def _look_across(  # type: ignore[no-untyped-def]
                 coarse[i] = value
                 least = min(least, value)
             low, high = 1.0, _LOW
-            for i in range(COARSE):
-                if coarse[i] < least + FAR:
+            for i in range(N_COARSE):
+                if coarse[i] < least + TAIL_COST:
                     low = min(low, _LOW + max(i - 0.5, 0.0) * width)
-                    high = max(high, _LOW + min(i + 1.5, COARSE + 0.0) * width)
-        width = (high - low) / ACROSS
+                    high = max(high, _LOW + min(i + 1.5, N_COARSE + 0.0) * width)
+        width = (high - low) / N_ACROSS
         across_low[k], across_width[k] = low, width
         if beside < lowest + 10.0:
             b_low, b_high = min(b_low, low), max(b_high, high)
         here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
         deepest = 0.0
-        for i in range(ACROSS):
+        for i in range(N_ACROSS):
             f0, f1, f2 = _color(log_rgb, by_b, k, low + (i + 0.5) * width)[:3]
             e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
             t = s0 * e0 + s1 * e1 + s2 * e2
             more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
             more += _form(w, e0, e1, e2, e0, e1, e2) - here
             more += _prior_cost(prior, prior_low, prior_step, t)
-            across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
-            deepest = min(deepest, max(more, -NEGLIGIBLE))
-        if deepest < -MISSED:
+            across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE_COST))
+            deepest = min(deepest, max(more, -NEGLIGIBLE_COST))
+        if deepest < -RIDGE_JUMP_COST:
             # The ridge is not where the probability is; what lines have must not differ by
             # much more than their neighbors', or the sum between them is of neither.
             cost[k] += deepest
-            for i in range(ACROSS):
+            for i in range(N_ACROSS):
                 across[k, i] *= math.exp(0.5 * deepest)
     return b_low, b_high
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _sum_up(  # type: ignore[no-untyped-def]
     ridge, beside_ridge, between, lowest, light, melanin_of_face, end, b_low, b_high, sums
 ):
@@ -453,18 +460,18 @@ def _sum_up(  # type: ignore[no-untyped-def]
     edges_a, total_a, bins = sums
     prior, prior_low, prior_step = light
     live = 0
-    for k in range(LINES - 1):
-        live += between[k] < lowest + NEGLIGIBLE
-    per_b = BINS / max(b_high - b_low, 1e-9)
+    for k in range(N_LINES - 1):
+        live += between[k] < lowest + NEGLIGIBLE_COST
+    per_b = N_BINS / max(b_high - b_low, 1e-9)
     bins[:] = 0.0
-    each = max(FEWEST, FINE // live)
+    each = max(MIN_NODES, N_FINE // live)
     count = 0
     total_a[0] = 0.0
     mean_shade = 0.0
-    for k in range(LINES - 1):
-        if not between[k] < lowest + NEGLIGIBLE:
+    for k in range(N_LINES - 1):
+        if not between[k] < lowest + NEGLIGIBLE_COST:
             continue
-        if count > 0 and not between[k - 1] < lowest + NEGLIGIBLE:
+        if count > 0 and not between[k - 1] < lowest + NEGLIGIBLE_COST:
             # a gap without probability
             count += 1
             total_a[count] = total_a[count - 1]
@@ -477,7 +484,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
             value += _prior_cost(prior, prior_low, prior_step, t) - lowest
             value += _melanin_cost(melanin_of_face, k, x)
             mass = 0.0
-            if value < NEGLIGIBLE:
+            if value < NEGLIGIBLE_COST:
                 # every ratio of melanin is as likely as any other
                 weight = math.exp(-0.5 * value) / (each * (_LOW + (k + x) * _STEP_A))
                 b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
@@ -488,12 +495,12 @@ def _sum_up(  # type: ignore[no-untyped-def]
                     b += bent - (1.0 - x) * blood[k] - x * blood[k + 1]
                 width = across_width[k] + x * (across_width[k + 1] - across_width[k])
                 place, size = (b - b_low) * per_b, width * per_b
-                for i in range(ACROSS):
+                for i in range(N_ACROSS):
                     part = weight * (across[k, i] + x * (across[k + 1, i] - across[k, i]))
                     mass += part
                     # one of the places fills as many bins as it is wide
-                    start = min(max(place + i * size, 0.0), BINS - 0.001)
-                    stop = min(max(place + (i + 1) * size, start + 0.001), float64(BINS))
+                    start = min(max(place + i * size, 0.0), N_BINS - 0.001)
+                    stop = min(max(place + (i + 1) * size, start + 0.001), float64(N_BINS))
                     density = part / (stop - start)
                     m = int(start)
                     while m < stop:
@@ -531,7 +538,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         int64,  # pixels a task
     ),
     parallel=True,
-    fastmath=_FAST,
+    fastmath=_FAST_MATH,
     cache=True,
     nogil=True,
     boundscheck=False,
@@ -561,27 +568,27 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     light = prior, prior_low, prior_step
     for task in prange((pixels + block - 1) // block):
         ridge = _Ridge(
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
         )
         beside = _Beside(
-            np.empty((LINES, ACROSS)),
-            np.empty(LINES),
-            np.empty(LINES),
-            np.empty(LINES, dtype=np.bool_),
-            np.empty(COARSE),
+            np.empty((N_LINES, N_ACROSS)),
+            np.empty(N_LINES),
+            np.empty(N_LINES),
+            np.empty(N_LINES, dtype=np.bool_),
+            np.empty(N_COARSE),
         )
-        between = np.empty(LINES - 1)
-        edges_a, total_a = np.empty(_ROOM + LINES), np.empty(_ROOM + LINES)
-        edges_b, total_b = np.empty(BINS + 1), np.empty(BINS + 1)
-        bins = np.empty(BINS)
+        between = np.empty(N_LINES - 1)
+        edges_a, total_a = np.empty(_ROOM + N_LINES), np.empty(_ROOM + N_LINES)
+        edges_b, total_b = np.empty(N_BINS + 1), np.empty(N_BINS + 1)
+        bins = np.empty(N_BINS)
         for n in range(task * block, min(pixels, (task + 1) * block)):
             if not usable[n]:
                 for m in range(6):
@@ -608,7 +615,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 (edges_a, total_a, bins),
             )
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
-            for m in range(BINS):
+            for m in range(N_BINS):
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
                 total_b[m + 1] = total_b[m] + bins[m]
             if not total_a[count] > 0.0:  # no place along the ridge has any probability
@@ -617,7 +624,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 continue
             center, reach = _center_and_reach(edges_a, total_a, count)
             maps[0, n], maps[3, n] = center, reach
-            center, reach = _center_and_reach(edges_b, total_b, BINS)
+            center, reach = _center_and_reach(edges_b, total_b, N_BINS)
             maps[1, n], maps[4, n] = center, reach
             maps[2, n] = math.exp(mean_shade / total_a[count])
             maps[5, n] = math.sqrt(color_lowest)

@@ -15,9 +15,9 @@ from model.color_table import ColorTable
 from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import LOWEST, evaluate, start_for
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate, start_for
 
-_STEPS = 200
+_MAX_STEPS = 200
 
 
 def fit(
@@ -44,22 +44,22 @@ def fit(
     start = start_for(table, free_shading)
     place = np.log(rgb) @ start.projection[:, :3].T + start.projection[:, 3]
     i, j = np.clip(np.rint(place), 0, start.axes.shape[0] - 1).astype(np.intp).T
-    x = np.clip(start.axes[i, j].astype(np.float64), LOWEST, 1.0)
+    x = np.clip(start.axes[i, j].astype(np.float64), MIN_AXIS_FRACTION, 1.0)
     damping = np.full(len(x), 1e-3)
     shading, residual, gradient = _linearise(rgb, table, x, free_shading)
     cost = _square(residual, weights)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         normal = np.swapaxes(gradient, -1, -2) @ weights @ gradient
         right = np.einsum("nci,ncd,nd->ni", gradient, weights, residual)
         # A coordinate at its bound whose step leads outside is kept there.
-        held = ((x <= LOWEST) & (right < 0.0)) | ((x >= 1.0) & (right > 0.0))
+        held = ((x <= MIN_AXIS_FRACTION) & (right < 0.0)) | ((x >= 1.0) & (right > 0.0))
         right = np.where(held, 0.0, right)
         normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
         diagonal = np.einsum("nii->ni", normal) * (1.0 + damping[:, None])
         normal = normal.copy()
         normal[:, [0, 1], [0, 1]] = np.where(held, 1.0, np.maximum(diagonal, 1e-300))
         step = np.linalg.solve(normal, right[..., None])[..., 0]
-        tried = np.clip(x + np.clip(step, -0.1, 0.1), LOWEST, 1.0)
+        tried = np.clip(x + np.clip(step, -0.1, 0.1), MIN_AXIS_FRACTION, 1.0)
         new_shading, new_residual, new_gradient = _linearise(rgb, table, tried, free_shading)
         new_cost = _square(new_residual, weights)
         better = new_cost <= cost
@@ -90,7 +90,7 @@ def _square(residual: Float64Array, weights: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("nc,ncd,nd->n", residual, weights, residual))
 
 
-def weigh(
+def estimate(
     rgb: Float64Array,
     table: ColorTable,
     covariance: Float64Array,
@@ -121,7 +121,7 @@ def weigh(
     ndarray
         Shape (2, 2): median and 68 % reach of C_m, and of C_hd.
     """
-    edges = [np.linspace(LOWEST, 1.0, count + 1) for count in size]
+    edges = [np.linspace(MIN_AXIS_FRACTION, 1.0, count + 1) for count in size]
     a, b = np.meshgrid(*[0.5 * (edge[1:] + edge[:-1]) for edge in edges], indexing="ij")
     residual = np.log(rgb / evaluate(table, a, b)[0])
     weights = np.linalg.inv(covariance)

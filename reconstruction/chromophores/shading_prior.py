@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike
 from reconstruction.arrays import Float64Array
 from reconstruction.chromophores import model_error
 
-SOFTNESS = 0.1
+LOG_SHADING_SOFTNESS = 0.1
 """Spread of log shading that is added to the measured one: a face 5 % of its distance off the
 tile's place gets 10 % more or less light."""
-UNEXPECTED = 0.01
+UNEXPECTED_PROBABILITY = 0.01
 """Probability that a pixel does not follow the distribution at all ..."""
-UNEXPECTED_SPREAD = 1.5
+UNEXPECTED_LOG_SIGMA = 1.5
 """... but a normal one this wide in log shading, about the same mean."""
-_LOW, _HIGH, _STEP = -8.0, 5.0, 0.05
-SHARPEST = _STEP
+_LOG_LOW, _LOG_HIGH, _LOG_STEP = -8.0, 5.0, 0.05
+MIN_SOFTNESS = _LOG_STEP
 """Least softness: the bins' and nodes' own width."""
 
 
@@ -113,7 +113,7 @@ def lognormal(center: float, spread: float) -> ShadingPrior:
 
 
 def from_samples(
-    low: float, step: float, counts: ArrayLike, *, softness: float = SOFTNESS
+    low: float, step: float, counts: ArrayLike, *, softness: float = LOG_SHADING_SOFTNESS
 ) -> ShadingPrior:
     """Return the prior that a histogram of log shading gives, a little softened.
 
@@ -126,23 +126,27 @@ def from_samples(
     softness
         Spread of log shading that is added, 0.05 or more: the nodes stand that far apart.
     """
-    if not _STEP <= softness < 2.0:
-        raise ShadingPriorError(f"softness: got {softness}, expected {_STEP} up to 2")
+    if not _LOG_STEP <= softness < 2.0:
+        raise ShadingPriorError(f"softness: got {softness}, expected {_LOG_STEP} up to 2")
     heights = np.asarray(counts, dtype=np.float64)
     if heights.ndim != 1 or (heights < 0.0).any() or not heights.sum() > 0.0:
         raise ShadingPriorError("counts: expected a list of numbers, not negative, not all zero")
     places = low + step * (np.arange(heights.size) + 0.5)
-    nodes = np.arange(_LOW, _HIGH + 0.5 * _STEP, _STEP)
-    if places[0] < _LOW + 1.0 or places[-1] > _HIGH - 1.0:
+    nodes = np.arange(_LOG_LOW, _LOG_HIGH + 0.5 * _LOG_STEP, _LOG_STEP)
+    if places[0] < _LOG_LOW + 1.0 or places[-1] > _LOG_HIGH - 1.0:
         raise ShadingPriorError(f"bins: got {places[0]:.2f} to {places[-1]:.2f}, expected -7 to 4")
     share = heights / heights.sum()
     density = (share * _normal(nodes[:, None] - places, softness)).sum(axis=1)
     mean = float((share * places).sum())
-    rest = _normal(nodes - mean, UNEXPECTED_SPREAD)
-    return ShadingPrior(_LOW, _STEP, (1.0 - UNEXPECTED) * density + UNEXPECTED * rest)
+    rest = _normal(nodes - mean, UNEXPECTED_LOG_SIGMA)
+    return ShadingPrior(
+        _LOG_LOW,
+        _LOG_STEP,
+        (1.0 - UNEXPECTED_PROBABILITY) * density + UNEXPECTED_PROBABILITY * rest,
+    )
 
 
-def of_faces(*, softness: float = SOFTNESS) -> ShadingPrior:
+def of_faces(*, softness: float = LOG_SHADING_SOFTNESS) -> ShadingPrior:
     """Return the prior of a face before the flash rig, relative to a white tile in its place.
 
     The distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, in

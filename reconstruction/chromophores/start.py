@@ -20,12 +20,12 @@ from scipy.spatial import cKDTree
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
-LOWEST = 0.04
+MIN_AXIS_FRACTION = 0.04
 """Smallest fraction of an axis that is fitted: 6.4e-5 of the largest volume fraction."""
-GRID = 256
+START_GRID_SIZE = 256
 """Nodes along each axis of the start grid."""
-_SAMPLES = 384  # colors along each axis of the table that the grid is filled from
-_MARGIN = 0.02  # share of the plane's extent around the table's colors
+_SAMPLES_PER_AXIS = 384  # colors along each axis of the table that the grid is filled from
+_PLANE_MARGIN = 0.02  # share of the plane's extent around the table's colors
 _POLISH_STEPS = 3
 
 
@@ -48,7 +48,7 @@ class Start:
 @lru_cache(maxsize=16)
 def start_for(table: ColorTable, free_shading: bool) -> Start:
     """Return the turned table; kept for the tables used last."""
-    fraction = np.linspace(LOWEST, 1.0, _SAMPLES)
+    fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, _SAMPLES_PER_AXIS)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
     rgb, by_a, by_b = evaluate(table, a, b)
     log_rgb = np.log(rgb)
@@ -59,11 +59,11 @@ def start_for(table: ColorTable, free_shading: bool) -> Start:
     plane = _plane(log_rgb[chosen], normal)
     y = log_rgb @ plane.T
     low, high = y[chosen].min(axis=0), y[chosen].max(axis=0)
-    margin = _MARGIN * (high - low)
-    scale = (GRID - 1) / (high - low + 2.0 * margin)
+    margin = _PLANE_MARGIN * (high - low)
+    scale = (START_GRID_SIZE - 1) / (high - low + 2.0 * margin)
     projection = plane * scale[:, None]
     offset = -(low - margin) * scale
-    line = np.arange(GRID, dtype=np.float64)
+    line = np.arange(START_GRID_SIZE, dtype=np.float64)
     nodes = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
     # Distances in log color, not in grid units: the nearest color is the natural start outside.
     tree = cKDTree(y[chosen])
@@ -73,7 +73,7 @@ def start_for(table: ColorTable, free_shading: bool) -> Start:
     twin = _twin_grid(log_rgb[~chosen], projection, offset)
     return Start(
         np.column_stack([projection, offset]),
-        axes.reshape(GRID, GRID, 2).astype(np.float32),
+        axes.reshape(START_GRID_SIZE, START_GRID_SIZE, 2).astype(np.float32),
         twin,
         normal,
         float(np.sign(np.median(facing[chosen]))),
@@ -119,10 +119,10 @@ def _light_side(facing: Float64Array) -> BoolArray:
 
     Behind the first fold may lie a second one, where skin is dark and faces as light skin does.
     """
-    corner = facing[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
+    corner = facing[: _SAMPLES_PER_AXIS // 8, _SAMPLES_PER_AXIS // 4 : _SAMPLES_PER_AXIS // 2]
     same = facing * np.sign(np.median(corner)) > 0.0
     regions, _ = ndimage.label(np.logical_and.accumulate(same, axis=0))
-    seed = regions[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
+    seed = regions[: _SAMPLES_PER_AXIS // 8, _SAMPLES_PER_AXIS // 4 : _SAMPLES_PER_AXIS // 2]
     return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
 
 
@@ -162,8 +162,8 @@ def _polish(
             ],
             axis=-1,
         )
-        reach = 2.0 / _SAMPLES
-        axes = np.clip(best + np.clip(step, -reach, reach), LOWEST, 1.0)
+        reach = 2.0 / _SAMPLES_PER_AXIS
+        axes = np.clip(best + np.clip(step, -reach, reach), MIN_AXIS_FRACTION, 1.0)
     return best
 
 
@@ -171,9 +171,9 @@ def _twin_grid(
     log_rgb: Float64Array, projection: Float64Array, offset: Float64Array
 ) -> Float32Array:
     """Return, per grid cell, the mean log RGB of the lightest second solution."""
-    grid = np.full((GRID, GRID), -np.inf)
+    grid = np.full((START_GRID_SIZE, START_GRID_SIZE), -np.inf)
     place = np.rint(log_rgb @ projection.T + offset).astype(np.intp)
-    inside = np.all((place >= 0) & (place < GRID), axis=-1)
+    inside = np.all((place >= 0) & (place < START_GRID_SIZE), axis=-1)
     place = place[inside]
     np.maximum.at(grid, (place[:, 0], place[:, 1]), log_rgb[inside].mean(axis=-1))
     return np.asarray(ndimage.grey_dilation(grid, size=(3, 3)), dtype=np.float32)

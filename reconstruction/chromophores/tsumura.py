@@ -87,7 +87,7 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
     if count < MIN_SAMPLES:
         raise UnmixingError(f"valid: got {count} usable pixels, expected at least {MIN_SAMPLES}")
     density = -np.log(image[good])
-    chroma = density @ _BASIS.T  # (N, 2)
+    chroma = density @ _CHROMA_BASIS.T  # (N, 2)
     center = chroma.mean(axis=0)
     spread = np.linalg.svd(
         (chroma - center)[:: max(1, count // MAX_SAMPLES)], compute_uv=False, full_matrices=False
@@ -113,17 +113,17 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
         full = np.zeros(image.shape[:2], np.float32)
         full[good] = values
         maps.append(full)
-        axes[pigment] = sign * mixing[:, component] @ _BASIS
+        axes[pigment] = sign * mixing[:, component] @ _CHROMA_BASIS
     return PigmentMaps(maps[0], maps[1], good, axes)
 
 
-_BASIS = np.array([[1.0, 0.0, -1.0], [-0.5, 1.0, -0.5]])
-_BASIS /= np.linalg.norm(_BASIS, axis=1, keepdims=True)
+_CHROMA_BASIS = np.array([[1.0, 0.0, -1.0], [-0.5, 1.0, -0.5]])
+_CHROMA_BASIS /= np.linalg.norm(_CHROMA_BASIS, axis=1, keepdims=True)
 """Two unit vectors across (1, 1, 1): density without brightness."""
 
 
 def _plane(vector: Float64Array) -> Float64Array:
-    inside = _BASIS @ vector
+    inside = _CHROMA_BASIS @ vector
     return np.asarray(inside / np.linalg.norm(inside))
 
 

@@ -30,17 +30,17 @@ from reconstruction.correspondence.landmark_field import LandmarkField, Landmark
 
 Point = tuple[float, float, float]
 
-RADIUS_MM: Final = 90.0
+CYLINDER_RADIUS_MM: Final = 90.0
 """Of the cylinder; about that of a head, so that lengths on a cheek stay about what they are."""
-LEAST: Final = 6
+MIN_SHARED_LANDMARKS: Final = 6
 """Named landmarks that two faces need in common: three for the affine part, as many again."""
-TIP_SHARE: Final = 1e-3
+NOSE_TIP_FRACTION: Final = 1e-3
 """Foremost texels that stand for the tip of the nose where no landmark names it."""
-BEHIND_MM: Final = 10.0
+SHADOW_DEPTH_MM: Final = 10.0
 """Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
-SIZES: Final = (16, 4096)
-_BATCH: Final = 40_000
-NOSE: Final = "nose tip"
+CHART_SIZE_RANGE_PX: Final = (16, 4096)
+_TEXELS_PER_BATCH: Final = 40_000
+NOSE_LANDMARK: Final = "nose tip"
 
 
 class ParameterizationError(ValueError):
@@ -55,7 +55,7 @@ class Cylinder:
     ----------
     tip_mm
         Tip of the nose, rig frame (+y up, +z out of the face); the axis is vertical,
-        `RADIUS_MM` behind it.
+        `CYLINDER_RADIUS_MM` behind it.
     """
 
     tip_mm: Point
@@ -74,7 +74,7 @@ class Cylinder:
         [[141.37, 5.0]]
         """
         at = np.asarray(position_mm, np.float64) - np.asarray(self.tip_mm)
-        arc = RADIUS_MM * np.arctan2(at[..., 0], at[..., 2] + RADIUS_MM)
+        arc = CYLINDER_RADIUS_MM * np.arctan2(at[..., 0], at[..., 2] + CYLINDER_RADIUS_MM)
         return np.stack([arc, at[..., 1]], axis=-1)
 
 
@@ -113,10 +113,9 @@ class CommonFrame:
             raise ParameterizationError("landmarks_mm: got a place that is not finite")
         if not (math.isfinite(self.side_mm) and self.side_mm > 0):
             raise ParameterizationError(f"side_mm: got {self.side_mm}, expected above 0")
-        if not SIZES[0] <= self.size <= SIZES[1]:
-            raise ParameterizationError(
-                f"size: got {self.size}, expected {SIZES[0]} to {SIZES[1]} pixels"
-            )
+        low, high = CHART_SIZE_RANGE_PX
+        if not low <= self.size <= high:
+            raise ParameterizationError(f"size: got {self.size}, expected {low} to {high} pixels")
 
     @property
     def pixel_mm(self) -> float:
@@ -151,7 +150,7 @@ class CommonFrame:
             "center_mm": list(self.center_mm),
             "side_mm": self.side_mm,
             "size": self.size,
-            "radius_mm": RADIUS_MM,
+            "radius_mm": CYLINDER_RADIUS_MM,
         }
 
     @staticmethod
@@ -164,9 +163,9 @@ class CommonFrame:
             Naming what is missing or of another kind.
         """
         try:
-            if float(told["radius_mm"]) != RADIUS_MM:  # type: ignore[arg-type]
+            if float(told["radius_mm"]) != CYLINDER_RADIUS_MM:  # type: ignore[arg-type]
                 raise ParameterizationError(
-                    f"radius_mm: got {told['radius_mm']}, expected {RADIUS_MM}"
+                    f"radius_mm: got {told['radius_mm']}, expected {CYLINDER_RADIUS_MM}"
                 )
             u, v = (float(x) for x in told["center_mm"])  # type: ignore[attr-defined]
             return CommonFrame(
@@ -216,8 +215,8 @@ class Correspondence:
         if self.field is None:
             return flat.reshape(*shape, 2), np.full(shape, np.nan)
         moved, error = np.empty_like(flat), np.empty(len(flat))
-        for start in range(0, len(flat), _BATCH):
-            part = slice(start, start + _BATCH)
+        for start in range(0, len(flat), _TEXELS_PER_BATCH):
+            part = slice(start, start + _TEXELS_PER_BATCH)
             by, off = self.field.at(flat[part])
             moved[part], error[part] = flat[part] + by, np.hypot(off, self.field.stderr_px)
         return moved.reshape(*shape, 2), error.reshape(shape)
@@ -329,13 +328,13 @@ def find_cylinder(
     ParameterizationError
         When no texel is valid.
     """
-    if landmarks and NOSE in landmarks:
-        x, y, z = landmarks[NOSE]
+    if landmarks and NOSE_LANDMARK in landmarks:
+        x, y, z = landmarks[NOSE_LANDMARK]
         return Cylinder((float(x), float(y), float(z)))
     points = np.asarray(position_mm, np.float64)[np.asarray(valid, np.bool_)]
     if not len(points):
         raise ParameterizationError("position: no texel is valid")
-    count = max(1, round(TIP_SHARE * len(points)))
+    count = max(1, round(NOSE_TIP_FRACTION * len(points)))
     front = points[np.argpartition(points[:, 2], len(points) - count)[-count:]]
     x, y, z = np.median(front, axis=0)
     return Cylinder((float(x), float(y), float(z)))
@@ -358,21 +357,25 @@ def common_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, .
     Raises
     ------
     ParameterizationError
-        When fewer than `LEAST` are common, or one face lacks the nose's tip.
+        When fewer than `MIN_SHARED_LANDMARKS` are common, or one face lacks the nose's tip.
     """
     if not faces:
         raise ParameterizationError("landmarks: got no face")
     names = tuple(name for name in faces[0] if all(name in face for face in faces))
-    if NOSE not in names:
-        raise ParameterizationError(f"landmarks: {NOSE!r} is missing of a face, expected it of all")
-    if len(names) < LEAST:
+    if NOSE_LANDMARK not in names:
+        raise ParameterizationError(
+            f"landmarks: {NOSE_LANDMARK!r} is missing of a face, expected it of all"
+        )
+    if len(names) < MIN_SHARED_LANDMARKS:
         raise ParameterizationError(
             f"landmarks: all faces have {len(names)} in common ({', '.join(names) or 'none'}), "
-            f"expected at least {LEAST}, better 20"
+            f"expected at least {MIN_SHARED_LANDMARKS}, better 20"
         )
     places = np.stack(
         [
-            Cylinder(face[NOSE]).unroll(np.array([face[name] for name in names], np.float64))
+            Cylinder(face[NOSE_LANDMARK]).unroll(
+                np.array([face[name] for name in names], np.float64)
+            )
             for face in faces
         ]
     )
@@ -381,7 +384,7 @@ def common_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, .
     if not np.all(spread > 0):
         raise ParameterizationError("landmarks: all of a face lie at one point")
     mean = ((places - middle) / spread).mean(axis=0) * float(spread.mean())
-    return names, mean - mean[names.index(NOSE)]
+    return names, mean - mean[names.index(NOSE_LANDMARK)]
 
 
 def correspond(
@@ -409,12 +412,13 @@ def correspond(
         fits the others least.
     """
     names = [name for name in frame.names if name in landmarks]
-    if NOSE not in names or len(names) < LEAST:
+    if NOSE_LANDMARK not in names or len(names) < MIN_SHARED_LANDMARKS:
         raise ParameterizationError(
             f"landmarks: got {len(names)} that the common map knows "
-            f"({', '.join(names) or 'none'}), expected at least {LEAST} and {NOSE!r} among them"
+            f"({', '.join(names) or 'none'}), expected at least {MIN_SHARED_LANDMARKS} and "
+            f"{NOSE_LANDMARK!r} among them"
         )
-    cylinder = Cylinder(landmarks[NOSE])
+    cylinder = Cylinder(landmarks[NOSE_LANDMARK])
     own = cylinder.unroll(np.array([landmarks[name] for name in names], np.float64))
     common = np.array([frame.landmark(name) for name in names])
     try:
@@ -461,7 +465,9 @@ def chart(
     place[shown], error[shown] = frame.pixel(uv), off
     tip = np.asarray(correspondence.cylinder.tip_mm)
     reach = np.zeros(shown.shape)
-    reach[shown] = np.hypot(position[shown, 0] - tip[0], position[shown, 2] - tip[2] + RADIUS_MM)
+    reach[shown] = np.hypot(
+        position[shown, 0] - tip[0], position[shown, 2] - tip[2] + CYLINDER_RADIUS_MM
+    )
     return Chart(frame.size, place, shown, shown & _outermost(place, reach, shown, frame), error)
 
 
@@ -486,7 +492,7 @@ def frame_around(
     low = np.median([np.quantile(at, 0.01, axis=0) for at in places_mm], axis=0)
     high = np.median([np.quantile(at, 0.99, axis=0) for at in places_mm], axis=0)
     # no wider than a quarter turn to either side: beyond it a face shows ears and hair
-    reach = 0.5 * math.pi * RADIUS_MM
+    reach = 0.5 * math.pi * CYLINDER_RADIUS_MM
     low[0], high[0] = max(low[0], -reach), min(high[0], reach)
     middle = 0.5 * (low + high)
     side = float(np.max(high - low))
@@ -517,7 +523,7 @@ def _outermost(
     np.maximum.at(highest, index[inside], reach[inside])
     highest = maximum_filter(highest.reshape(cells, cells), size=3, mode="nearest").ravel()
     out = shown & ~inside
-    out[inside] = reach[inside] >= highest[index[inside]] - BEHIND_MM
+    out[inside] = reach[inside] >= highest[index[inside]] - SHADOW_DEPTH_MM
     return np.asarray(out, np.bool_)
 
 

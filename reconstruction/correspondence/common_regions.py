@@ -15,7 +15,7 @@ import numpy as np
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.correspondence.common_parameterization import CommonFrame
 
-STANDARD_MM: Final = MappingProxyType(
+STANDARD_LANDMARKS_MM: Final = MappingProxyType(
     {
         "nose tip": (0.0, 0.0),
         "nose bridge": (0.0, 30.0),
@@ -42,7 +42,7 @@ STANDARD_MM: Final = MappingProxyType(
 """Twenty points that a face is marked by, left and right as seen in the image, and about where they
 lie when it is unrolled from the tip of its nose, mm; round figures for faces without landmarks."""
 
-REGIONS: Final = ("face", "beard", "no-beard", "skin")
+REGION_NAMES: Final = ("face", "beard", "no-beard", "skin")
 
 
 class RegionError(ValueError):
@@ -51,8 +51,8 @@ class RegionError(ValueError):
 
 def standard_frame(*, side_mm: float, center_mm: tuple[float, float], size: int) -> CommonFrame:
     """Return a common map with the standard landmarks."""
-    names = tuple(STANDARD_MM)
-    places = np.array([STANDARD_MM[name] for name in names], np.float64)
+    names = tuple(STANDARD_LANDMARKS_MM)
+    places = np.array([STANDARD_LANDMARKS_MM[name] for name in names], np.float64)
     return CommonFrame(names, places, center_mm, side_mm, size)
 
 
@@ -73,14 +73,14 @@ def region(name: str, frame: CommonFrame) -> BoolArray:
     RegionError
         For another name.
     """
-    if name not in REGIONS:
-        raise RegionError(f"region: got {name!r}, expected one of {', '.join(REGIONS)}")
+    if name not in REGION_NAMES:
+        raise RegionError(f"region: got {name!r}, expected one of {', '.join(REGION_NAMES)}")
     grid = frame.grid_mm()
     if name == "face":
         return np.ones(grid.shape[:2], np.bool_)
     at = {
         mark: frame.landmark(mark) if mark in frame.names else np.array(place)
-        for mark, place in STANDARD_MM.items()
+        for mark, place in STANDARD_LANDMARKS_MM.items()
     }
     if name == "skin":
         return ~(_lips(at, grid) | _eyes(at, grid) | _nostrils(at, grid))

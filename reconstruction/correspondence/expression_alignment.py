@@ -23,18 +23,23 @@ from numpy.typing import ArrayLike
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_field, landmark_table
-from reconstruction.registration import RegistrationError, dense_flow, evened, feature_matches
+from reconstruction.registration import (
+    RegistrationError,
+    dense_flow,
+    feature_matches,
+    normalize_local_contrast,
+)
 
 Points = Mapping[str, tuple[float, float]]
 
 LANDMARK_STDERR_PX = 1.0
 """Of a landmark in one picture along each axis, as placed by hand."""
 FEATURE_STDERR_PX = 0.5
-LARGEST_ERROR_PX = 4.0
+MAX_ALIGNMENT_ERROR_PX = 4.0
 """Pixels whose estimated error is larger are invalid."""
-FEW_LANDMARKS = 20
+MIN_LANDMARKS = 20
 """Fewer than these leave much of a face to the flow alone."""
-LEAST_SIDE_PX = 32
+MIN_ALIGNED_SIDE_PX = 32
 
 
 class AlignmentError(RegistrationError):
@@ -230,8 +235,8 @@ def align(
     valid_moving: ArrayLike | None = None,
     valid_neutral: ArrayLike | None = None,
     landmark_stderr_px: float = LANDMARK_STDERR_PX,
-    largest_error_px: float = LARGEST_ERROR_PX,
-    rounds: int = dense_flow.ROUNDS,
+    largest_error_px: float = MAX_ALIGNMENT_ERROR_PX,
+    rounds: int = dense_flow.N_WARP_ROUNDS,
 ) -> Alignment:
     """Find where each pixel of the neutral picture lies in that of an expression.
 
@@ -347,10 +352,10 @@ def read_landmarks(path: str | Path) -> dict[str, tuple[float, float]]:
 def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, BoolArray]:
     """Return the local contrast of a picture and where it means something."""
     image = np.asarray(picture, np.float64)
-    if image.ndim not in (2, 3) or min(image.shape[:2]) < LEAST_SIDE_PX:
+    if image.ndim not in (2, 3) or min(image.shape[:2]) < MIN_ALIGNED_SIDE_PX:
         raise AlignmentError(
             f"{name}: got shape {image.shape}, expected (H, W) or (H, W, 3), "
-            f"{LEAST_SIDE_PX} x {LEAST_SIDE_PX} or more"
+            f"{MIN_ALIGNED_SIDE_PX} x {MIN_ALIGNED_SIDE_PX} or more"
         )
     good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
     if good.shape != image.shape[:2]:
@@ -367,15 +372,15 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
     around = cv2.GaussianBlur(value * weight, (0, 0), 8.0) / np.maximum(share, 1e-6)
     middle = float(np.median(value[good]))
     around = np.where(share > 1e-3, around, middle)
-    return evened(np.where(good, value, around)), good
+    return normalize_local_contrast(np.where(good, value, around)), good
 
 
 def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, Float64Array]:
     names = sorted(set(moving) & set(neutral))
-    if len(names) < landmark_field.LEAST:
+    if len(names) < landmark_field.MIN_FIELD_POINTS:
         raise AlignmentError(
             f"landmarks: {len(names)} names are in both pictures, expected at least "
-            f"{landmark_field.LEAST}, best {FEW_LANDMARKS} or more"
+            f"{landmark_field.MIN_FIELD_POINTS}, best {MIN_LANDMARKS} or more"
         )
     return (
         names,

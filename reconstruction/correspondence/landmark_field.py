@@ -26,13 +26,13 @@ from scipy.optimize import minimize_scalar
 from reconstruction.arrays import Float64Array
 from reconstruction.registration import RegistrationError
 
-LEAST = 4
+MIN_FIELD_POINTS = 4
 """Fewer points than these leave nothing to tell noise from deformation by."""
-GRID_PX = 8
+FIELD_GRID_PX = 8
 """Distance of the nodes at which a field is evaluated before it is interpolated."""
-ROUNDING_PX = 1e-3
+MIN_LANDMARK_STDERR_PX = 1e-3
 """No landmark is placed more precisely."""
-_STRONGEST = 1e8
+_MAX_STRENGTH = 1e8
 
 
 class LandmarkFieldError(RegistrationError):
@@ -71,7 +71,7 @@ class LandmarkField:
     @property
     def smoothing(self) -> float:
         """Smoothing of the thin-plate spline: noise over strength."""
-        return self.stderr_px**2 / max(self.strength, self.stderr_px**2 / _STRONGEST)
+        return self.stderr_px**2 / max(self.strength, self.stderr_px**2 / _MAX_STRENGTH)
 
     def on_grid(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
         """Return the displacement (H, W, 2) and its standard error along each axis (H, W), px.
@@ -81,14 +81,14 @@ class LandmarkField:
         shape
             Rows and columns of the first picture.
         """
-        rows = np.arange(0.0, shape[0] - 1 + GRID_PX, GRID_PX)
-        columns = np.arange(0.0, shape[1] - 1 + GRID_PX, GRID_PX)
+        rows = np.arange(0.0, shape[0] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
+        columns = np.arange(0.0, shape[1] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
         nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
         moved, error = self.at(nodes.reshape(-1, 2))
         coarse = np.dstack([moved.reshape(*nodes.shape[:2], 2), error.reshape(nodes.shape[:2])])
         x, y = np.meshgrid(
-            np.arange(shape[1], dtype=np.float32) / GRID_PX,
-            np.arange(shape[0], dtype=np.float32) / GRID_PX,
+            np.arange(shape[1], dtype=np.float32) / FIELD_GRID_PX,
+            np.arange(shape[0], dtype=np.float32) / FIELD_GRID_PX,
         )
         fine = cv2.remap(
             coarse.astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
@@ -127,7 +127,7 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
     Parameters
     ----------
     points_px, moved_px : array_like, shape (K, 2)
-        Column and row of the same points in two pictures, K at least `LEAST`.
+        Column and row of the same points in two pictures, K at least `MIN_FIELD_POINTS`.
     stderr_px : float
         Standard error of a displacement along each axis, above 0.
 
@@ -153,13 +153,15 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
         raise LandmarkFieldError(
             f"landmarks: got shapes {first.shape} and {second.shape}, expected (K, 2) twice"
         )
-    if len(first) < LEAST:
-        raise LandmarkFieldError(f"landmarks: got {len(first)}, expected at least {LEAST}")
+    if len(first) < MIN_FIELD_POINTS:
+        raise LandmarkFieldError(
+            f"landmarks: got {len(first)}, expected at least {MIN_FIELD_POINTS}"
+        )
     if not (np.isfinite(first).all() and np.isfinite(second).all()):
         raise LandmarkFieldError("landmarks: got a place that is not finite")
     if not (math.isfinite(stderr_px) and stderr_px > 0):
         raise LandmarkFieldError(f"stderr_px: got {stderr_px}, expected above 0")
-    noise = max(stderr_px, ROUNDING_PX)
+    noise = max(stderr_px, MIN_LANDMARK_STDERR_PX)
     middle = first.mean(axis=0)
     scale = float(np.sqrt(((first - middle) ** 2).sum(axis=1).mean()))
     known = (first - middle) / max(scale, 1e-12)
@@ -169,7 +171,7 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
     kernel = _kernel(np.linalg.norm(known[:, None] - known, axis=-1))
     displacement = second - first
     strength = _likeliest_strength(kernel, affine, displacement, noise)
-    smoothing = noise**2 / max(strength, noise**2 / _STRONGEST)
+    smoothing = noise**2 / max(strength, noise**2 / _MAX_STRENGTH)
     system = np.zeros((len(first) + 3,) * 2)
     system[: len(first), : len(first)] = kernel + smoothing * np.eye(len(first))
     system[: len(first), len(first) :] = affine
@@ -206,7 +208,7 @@ def _likeliest_strength(
         )
 
     unit = noise**2
-    low, high = math.log(unit / _STRONGEST), math.log(_STRONGEST * unit)
+    low, high = math.log(unit / _MAX_STRENGTH), math.log(_MAX_STRENGTH * unit)
     # the likelihood may have more than one hill: begin at the best of a coarse row
     tried = np.linspace(low, high, 2 * count if count < 40 else 80)
     best = int(np.argmin([cost(x) for x in tried]))

@@ -6,7 +6,7 @@ import csv
 import math
 from pathlib import Path
 
-COLUMNS = ("name", "x", "y")
+LANDMARK_COLUMNS = ("name", "x", "y")
 
 
 class LandmarkError(ValueError):
@@ -44,13 +44,13 @@ def read(path: str | Path) -> dict[str, tuple[float, float]]:
             continue
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:
-            if cells != list(COLUMNS):
+            if cells != list(LANDMARK_COLUMNS):
                 raise LandmarkError(
                     f"{path}, line {number}: got columns {cells}, expected name, x, y"
                 )
             header = True
             continue
-        if len(cells) != len(COLUMNS):
+        if len(cells) != len(LANDMARK_COLUMNS):
             raise LandmarkError(
                 f"{path}, line {number}: got {len(cells)} cells, expected 3: name, x, y"
             )
@@ -64,7 +64,7 @@ def read(path: str | Path) -> dict[str, tuple[float, float]]:
             )
         x, y = (
             _number(cell, f"{path}, line {number}, column {column}")
-            for column, cell in zip(COLUMNS[1:], cells[1:], strict=True)
+            for column, cell in zip(LANDMARK_COLUMNS[1:], cells[1:], strict=True)
         )
         found[name], lines[name] = (x, y), number
     if not header:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import dipole
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from reconstruction.diffuse_albedo.kernels import LEAST_COSINE, fit_envelope
+from reconstruction.diffuse_albedo.kernels import MIN_FACTOR_COSINE, fit_envelope
 from reconstruction.lumitexels import boundary_kernels
 
 Method = Literal["envelope", "stable_minimum", "minimum"]
@@ -29,7 +29,7 @@ Method = Literal["envelope", "stable_minimum", "minimum"]
 NORMAL_STDERR_RAD = np.deg2rad(1.0)
 GRAZING_COSINE = 0.3
 """The stable minimum penalizes samples nearer to the horizon than this (73 degrees)."""
-DISCARD_SHARE = 0.01
+DISCARD_FRACTION = 0.01
 """What the stable minimum drops where `discard` is None and nothing is known of the noise."""
 
 
@@ -264,7 +264,7 @@ def _ratios(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
     cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
-    above = (cosines[0] >= LEAST_COSINE) & (cosines[1] >= LEAST_COSINE)
+    above = (cosines[0] >= MIN_FACTOR_COSINE) & (cosines[1] >= MIN_FACTOR_COSINE)
     above &= np.isfinite(cosines[0]) & np.isfinite(cosines[1])
     cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
     through = boundary_kernels.transmitted(cos_light, cos_view, eta)
@@ -299,11 +299,13 @@ def _minimum(
     """Return eq. (6) as it stands, or with grazing samples raised and the smallest dropped."""
     drop = np.zeros(len(ratio), dtype=np.intp)
     if method == "stable_minimum":
-        grazing = np.clip(np.minimum(cos_l, cos_v) / GRAZING_COSINE, LEAST_COSINE, 1.0)
+        grazing = np.clip(np.minimum(cos_l, cos_v) / GRAZING_COSINE, MIN_FACTOR_COSINE, 1.0)
         with np.errstate(invalid="ignore"):  # unusable ratios are infinite; NaN sorts last too
             ratio = ratio + np.abs(ratio) * (1.0 / grazing - 1.0)[..., None]
         count = usable.sum(axis=1).min(axis=-1)
-        drop = np.ceil(DISCARD_SHARE * count).astype(np.intp) if discard is None else drop + discard
+        drop = (
+            np.ceil(DISCARD_FRACTION * count).astype(np.intp) if discard is None else drop + discard
+        )
         drop = np.minimum(drop, np.maximum(count - 1, 0))
     ordered = np.sort(ratio, axis=1)
     least = np.take_along_axis(ordered, drop[:, None, None], axis=1)[:, 0]

@@ -7,25 +7,25 @@ import math
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
 
-GAUSSIAN = (0.13, 0.2, 0.3, 0.45)
+BECKMANN_ROUGHNESS = (0.13, 0.2, 0.3, 0.45)
 """Beckmann roughness of the lobes that may lie over the diffuse part; no tails."""
-TAILED = (0.2, 0.35)
+GGX_ROUGHNESS = (0.2, 0.35)
 """GGX roughness of those with tails. Wider ones of either look like the diffuse part."""
-STEPS = 8
-LOBE_DOUBT = 0.3
+N_FIT_STEPS = 8
+LOBE_SHAPE_ERROR = 0.3
 """How far a lobe may be off its shape, as a fraction: what it covers says less of R_d."""
-ENTER = 1.5
+LOBE_ENTRY_SIGMAS = 1.5
 """Standard errors from which on a lobe is taken to be there."""
-CUT = 4.0
+TUKEY_SIGMAS = 4.0
 """Standard deviations beyond which a residual has no say (Tukey's biweight)."""
-CLIP = 1.5
+CLIP_SIGMAS = 1.5
 CLIPPED_MEAN = 0.7784655
 """Mean of min(z^2, 1.5^2) over normal z: turns a clipped mean square into a variance."""
-LEAST_COSINE = 0.05
+MIN_FACTOR_COSINE = 0.05
 
-_K = len(GAUSSIAN) + len(TAILED)
-_GAUSSIANS = len(GAUSSIAN)
-_ALPHA2 = np.array(GAUSSIAN + TAILED) ** 2
+_N_LOBES = len(BECKMANN_ROUGHNESS) + len(GGX_ROUGHNESS)
+_N_BECKMANN = len(BECKMANN_ROUGHNESS)
+_ALPHA2 = np.array(BECKMANN_ROUGHNESS + GGX_ROUGHNESS) ** 2
 
 
 @njit(inline="always")
@@ -47,7 +47,7 @@ def _shapes(light, view, normal, eta, through, slope, lobe):  # type: ignore[no-
         mu_l += float64(light[a]) * normal[a]
         mu_v += float64(view[a]) * normal[a]
         between += float64(light[a]) * view[a]
-    if not (mu_l >= LEAST_COSINE and mu_v >= LEAST_COSINE):
+    if not (mu_l >= MIN_FACTOR_COSINE and mu_v >= MIN_FACTOR_COSINE):
         return False
     mu_l, mu_v = min(mu_l, 1.0), min(mu_v, 1.0)
     between = max(min(between, 1.0), -1.0)
@@ -56,14 +56,14 @@ def _shapes(light, view, normal, eta, through, slope, lobe):  # type: ignore[no-
     cos_d = math.sqrt(0.5 * (1.0 + between))
     cos_h = min((mu_l + mu_v) / max(2.0 * cos_d, 1e-9), 1.0)
     f_r = _fresnel(cos_d, eta)
-    for k in range(_K):
+    for k in range(_N_LOBES):
         a2 = _ALPHA2[k]
         tail = cos_h * cos_h * (a2 - 1.0) + 1.0
         hidden = mu_v * math.sqrt(a2 + (1.0 - a2) * mu_l * mu_l) + mu_l * math.sqrt(
             a2 + (1.0 - a2) * mu_v * mu_v
         )
         density = a2 / (math.pi * tail * tail)
-        if k < _GAUSSIANS:
+        if k < _N_BECKMANN:
             c2 = max(cos_h * cos_h, 1e-4)
             density = math.exp(max((c2 - 1.0) / (c2 * a2), -80.0)) / (math.pi * a2 * c2 * c2)
         lobe[k] = density * f_r / (2.0 * hidden)
@@ -105,8 +105,8 @@ def _bounded(h, rhs, channels, free, low, b, x):  # type: ignore[no-untyped-def]
     size = channels
     for c in range(channels):
         free[c] = c
-    barred = np.zeros(_K, dtype=np.bool_)
-    for _ in range(3 * _K + 1):
+    barred = np.zeros(_N_LOBES, dtype=np.bool_)
+    for _ in range(3 * _N_LOBES + 1):
         solved = _factor(h, free, size, low)
         worst = -1
         if solved:
@@ -129,8 +129,8 @@ def _bounded(h, rhs, channels, free, low, b, x):  # type: ignore[no-untyped-def]
         x[:] = 0.0
         for i in range(size):
             x[free[i]] = b[i]
-        best, entering = ENTER, -1
-        for k in range(_K):
+        best, entering = LOBE_ENTRY_SIGMAS, -1
+        for k in range(_N_LOBES):
             p = channels + k
             if x[p] == 0.0 and not barred[k] and h[p, p] > 0.0:
                 pull = rhs[p]
@@ -181,10 +181,10 @@ def fit_envelope(  # type: ignore[no-untyped-def]
     """
     points, samples, channels = f.shape
     for point in prange(points):
-        n = channels + _K
+        n = channels + _N_LOBES
         through = np.empty(samples)  # unit diffuse BRDF, F_t F_t / pi
         slope = np.empty(samples)  # relative error of it a rad of the normal
-        lobe = np.empty((samples, _K))
+        lobe = np.empty((samples, _N_LOBES))
         good = np.zeros(samples, dtype=np.bool_)
         h = np.empty((n, n))
         rhs = np.empty(n)
@@ -192,7 +192,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
         b = np.empty(n)
         low = np.empty((n, n))
         free = np.empty(n, dtype=np.int64)
-        wide = np.empty(_K)
+        wide = np.empty(_N_LOBES)
         scale2 = np.ones(channels)  # of the given variances
         seen = np.zeros(channels, dtype=np.int64)
         for i in range(samples):
@@ -222,7 +222,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
         if not enough:
             continue
         size = 0
-        for step in range(STEPS):
+        for step in range(N_FIT_STEPS):
             h[:] = 0.0
             rhs[:] = 0.0
             used = 0
@@ -232,18 +232,18 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                 if not good[i]:
                     continue
                 shine = 0.0
-                for k in range(_K):
+                for k in range(_N_LOBES):
                     shine += x[channels + k] * lobe[i, k]
                 for c in range(channels):
                     if not valid[point, i, c]:
                         continue
                     dull = x[c] * through[i]
-                    extra = (tilt_rad * slope[i] * dull) ** 2 + (LOBE_DOUBT * shine) ** 2
+                    extra = (tilt_rad * slope[i] * dull) ** 2 + (LOBE_SHAPE_ERROR * shine) ** 2
                     spread = float64(variance[point, i, c]) * scale2[c] + extra
                     z2 = (f[point, i, c] - dull - shine) ** 2 / spread
-                    clipped[c] += min(z2, CLIP * CLIP)
+                    clipped[c] += min(z2, CLIP_SIGMAS * CLIP_SIGMAS)
                     # The first steps only start: they forgive more.
-                    cut = CUT if step > 3 else CUT * (2.0 ** (4 - step))
+                    cut = TUKEY_SIGMAS if step > 3 else TUKEY_SIGMAS * (2.0 ** (4 - step))
                     share = max(1.0 - z2 / (cut * cut), 0.0)
                     if share == 0.0:
                         dropped += 1
@@ -253,7 +253,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                     t = through[i]
                     h[c, c] += w * t * t
                     rhs[c] += w * t * f[point, i, c]
-                    for k in range(_K):
+                    for k in range(_N_LOBES):
                         wide[k] = w * lobe[i, k]
                         h[channels + k, c] += wide[k] * t
                         rhs[channels + k] += wide[k] * f[point, i, c]
@@ -263,7 +263,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                 for j in range(i):
                     h[j, i] = h[i, j]
             if seen.min() < 3:  # nothing to tell lobes from
-                for k in range(_K):
+                for k in range(_N_LOBES):
                     h[channels + k, channels + k] = 0.0
             size = _bounded(h, rhs, channels, free, low, b, x)
             if size == 0:

@@ -9,12 +9,12 @@ from scipy.ndimage import gaussian_filter
 
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
-LEAST_CHANGE = 0.002
+MIN_LIGHT_CHANGE = 0.002
 """Least relative change of light from state to state that is allowed for in each pixel: what a
 flash's energy differs by from pop to pop."""
-CLEARLY = 3.0
+OUTLIER_SIGMAS = 3.0
 """Standard errors from which on a pixel's light is said not to follow its neighbors'."""
-FREE_CHANGE = 1.0
+MAX_LIGHT_CHANGE = 1.0
 """Most that matters: with more, the brightness tells nothing."""
 
 
@@ -75,6 +75,10 @@ def smooth(
     )
     # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
     apart = np.square(change - smooth)
-    alone = np.where(apart > CLEARLY**2 * scatter, apart, 0.0)
-    loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + LEAST_CHANGE**2
-    return smooth.astype(np.float32), (1.0 / np.minimum(loose, FREE_CHANGE**2)).astype(np.float32)
+    alone = np.where(apart > OUTLIER_SIGMAS**2 * scatter, apart, 0.0)
+    loose = (
+        np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + MIN_LIGHT_CHANGE**2
+    )
+    return smooth.astype(np.float32), (1.0 / np.minimum(loose, MAX_LIGHT_CHANGE**2)).astype(
+        np.float32
+    )

@@ -22,13 +22,13 @@ from scipy import stats
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
-PLACES = ("forehead", "cheek", "nose", "chin", "temple")
+FACE_PLACES = ("forehead", "cheek", "nose", "chin", "temple")
 """Places that are followed."""
-FALSE_ALARM = 0.05
+TRANSITION_FALSE_ALARM_RATE = 0.05
 """Rate at which a cycle without transition is said to have one."""
-SAME_PHASE = 0.25
+MAX_PHASE_FRACTION = 0.25
 """Shots belong to one phase when they lie closer than this part of the sampling interval."""
-_FACE: Mapping[str, tuple[float, float]] = {
+_FACE_POSITIONS: Mapping[str, tuple[float, float]] = {
     "forehead": (0.50, 0.14),
     "cheek": (0.27, 0.57),
     "nose": (0.50, 0.57),
@@ -162,7 +162,7 @@ def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     Returns
     -------
     dict
-        (x, y) of :data:`PLACES`; by the middle 96 % of the skin in each direction.
+        (x, y) of :data:`FACE_PLACES`; by the middle 96 % of the skin in each direction.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     top, bottom = np.percentile(rows, (2, 98))
     return {
         name: (float(left + u * (right - left)), float(top + v * (bottom - top)))
-        for name, (u, v) in _FACE.items()
+        for name, (u, v) in _FACE_POSITIONS.items()
     }
 
 
@@ -236,7 +236,7 @@ def same_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
     order = np.argsort(phase, kind="stable")
     gaps = np.diff(phase[order], append=phase[order[0]] + cycle_s)
     usual = cycle_s / max(1, int((gaps > 0.05 * gaps.max()).sum()))
-    wide = gaps > SAME_PHASE * usual
+    wide = gaps > MAX_PHASE_FRACTION * usual
     groups = np.empty(phase.size, np.int64)
     groups[order] = np.concatenate([[0], np.cumsum(wide)[:-1]])
     if not wide[-1]:  # the last and the first are one phase, across the cycle's end
@@ -278,7 +278,7 @@ def transition(
     cycle_s: float,
     change_s: float | None = None,
     stderr: ArrayLike | None = None,
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = TRANSITION_FALSE_ALARM_RATE,
 ) -> Transition:
     """Test whether there is a shot between the two levels of a cycle.
 

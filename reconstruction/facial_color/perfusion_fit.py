@@ -21,7 +21,7 @@ from scipy import stats
 
 from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
-from reconstruction.facial_color.perfusion_likelihood import Landscape, Shape
+from reconstruction.facial_color.perfusion_likelihood import ProfileLikelihood, Shape
 from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
 
 Known = Literal["estimated", "only below", "only above", "unknown"]
@@ -30,13 +30,13 @@ BOUND_LEVEL = 0.95
 """Confidence of bounds."""
 ONE_SIGMA_LEVEL = 0.6827
 """Confidence of the interval whose half a standard error is."""
-GAUSSIAN_95 = 1.959964
+COVERAGE_FACTOR_95 = 1.959964
 """Half width of a 95 % interval in standard errors."""
-LEVEL_TEST = 0.001
+LEVEL_TEST_P_VALUE = 0.001
 """Two levels differ when chance would make them differ as much at most so often."""
-_GRID = 97
-_DELAYS = 81
-_DELAYS_OF_POSE = 41
+_GRID_NODES = 97
+_DELAY_NODES = 81
+_POSE_DELAY_NODES = 41
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,12 +166,12 @@ def fit_cycle(
         return np.where(into < on, rising, falling)
 
     spacing = cycle_s / phase.size
-    constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID)
+    constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID_NODES)
     longest = 0.5 * min(middle, cycle_s - middle)
-    delays = np.linspace(0.0, longest, _DELAYS)
+    delays = np.linspace(0.0, longest, _DELAY_NODES)
     if data.stepped:
         between = data.moves_between(phase % cycle_s, middle, longest)
-        delays = np.linspace(*between, _DELAYS_OF_POSE)
+        delays = np.linspace(*between, _POSE_DELAY_NODES)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
     plain, *bent = (
         _fit(data, _bent(straight, amount), delays, constants, changes)
@@ -222,7 +222,7 @@ def fit_course(
 
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
-    constants = np.geomspace(spacing / 50, 50 * span, _GRID)
+    constants = np.geomspace(spacing / 50, 50 * span, _GRID_NODES)
     straight, *bent = (
         _fit(data, _bent(course, amount), np.zeros(1), constants, np.zeros(0))
         for amount in ((0.0, -bend, bend) if bend else (0.0,))
@@ -268,7 +268,7 @@ def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> Relax
     half = 0.5 * (max(constants) - min(constants))
     return replace(
         straight,
-        interval_s=widened(straight.interval_s, GAUSSIAN_95),
+        interval_s=widened(straight.interval_s, COVERAGE_FACTOR_95),
         interval_68_s=widened(straight.interval_68_s, 1.0),
         stderr_time_constant_s=float(np.hypot(straight.stderr_time_constant_s, half)),
     )
@@ -325,7 +325,7 @@ def _fit(
 def _fit_once(
     data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
 ) -> RelaxationFit:
-    landscape = Landscape.of(data, curve, delays, constants, at)
+    landscape = ProfileLikelihood.of(data, curve, delays, constants, at)
     delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
     interval, inner = (
         (low if low is not None else 0.0, high if high is not None else np.inf)
@@ -343,7 +343,7 @@ def _fit_once(
     level, gap = (part[0] for part in data.levels(found_shape))
     flat = (data.residual(np.zeros_like(found_shape))[0] / noise2).sum()
     differ = (flat - landscape.least) / curves / max(landscape.least / landscape.freedom, 1e-300)
-    changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST
+    changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST_P_VALUE
     known: Known = "estimated"
     if not changes:
         known, interval, inner = "unknown", (0.0, float("inf")), (0.0, float("inf"))

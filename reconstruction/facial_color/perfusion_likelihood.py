@@ -23,14 +23,14 @@ Ends = tuple[float | None, float | None]
 Shape = Callable[[Float64Array, Float64Array], Float64Array]
 """Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
-_SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
+_SLOPE_NODES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
 """Time constants since the beginning of a change at which samples are tried."""
-_COARSE = 3.0
+_MIN_DELAY_STEPS = 3.0
 """Constants below so many steps of the delay need delays between them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landscape:
+class ProfileLikelihood:
     """Square sums of curves over their noise, at delays and time constants."""
 
     data: Samples
@@ -58,7 +58,7 @@ class Landscape:
     @staticmethod
     def of(
         data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
-    ) -> Landscape:
+    ) -> ProfileLikelihood:
         """Look at all delays and constants, and refine the best.
 
         Parameters
@@ -80,7 +80,9 @@ class Landscape:
         # by constant: the common delays, and where those are too coarse some that put a sample on a
         # slope
         quick = (
-            constants < _COARSE * (delays[1] - delays[0]) if delays.size > 1 else constants < 0.0
+            constants < _MIN_DELAY_STEPS * (delays[1] - delays[0])
+            if delays.size > 1
+            else constants < 0.0
         )
         near = np.array([_near(at, constant, delays) for constant in constants[quick]])
         by_curve = np.full(
@@ -120,7 +122,7 @@ class Landscape:
         chi2 = (
             float((by_curve[best] / usual).sum() / nu) if np.isfinite(usual).all() else float("nan")
         )
-        return Landscape(
+        return ProfileLikelihood(
             data=data,
             curve=curve,
             delays=delays,
@@ -249,7 +251,7 @@ def _near(since: Float64Array, constant: float, delays: Float64Array) -> Float64
     Their number is the same for each constant; those beyond the range are put into it.
     """
     late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
-    return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
+    return np.clip((late[:, None] - constant * _SLOPE_NODES).ravel(), delays[0], delays[-1])
 
 
 def _refined(

@@ -21,19 +21,19 @@ from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error
 from reconstruction.correspondence.expression_alignment import Alignment
 
-AROUND_PX: Final = 1.0
+SLOPE_WINDOW_PX: Final = 1.0
 """Standard deviation of the window that squares of slopes are averaged in, px: over single pixels
 noise would count as slope."""
-SCALE: Final = 3.3
+MOTION_VARIANCE_SCALE: Final = 3.3
 """Variance of what moved faces' colors differ by from still ones' over what place and slope give:
 so that, with noise, 68 % lie in the 68 % ellipse. Sites of the color filter array stand elsewhere
 on the skin's texture, and pixels are interpolated. Of 13 moved subjects of seeds 0 to 16, maps 192
 px across, each alone holds 64 to 72 %."""
-WITHOUT_BRIGHTNESS: Final = np.eye(3) - 1.0 / 3.0
+BRIGHTNESS_REMOVAL: Final = np.eye(3) - 1.0 / 3.0
 """Takes the mean of the channels away."""
 
 
-def own_error(
+def registration_covariance(
     rgb: FloatArray,
     variance: FloatArray,
     valid: BoolArray,
@@ -65,7 +65,7 @@ def own_error(
     Notes
     -----
     A pixel that is off by d, of variance `error_px`^2 / 2 along each axis, errs by the slope of
-    log color times d; `SCALE` is what it is short of.
+    log color times d; `MOTION_VARIANCE_SCALE` is what it is short of.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def own_error(
     ...     np.zeros((40, 40), np.float32), np.zeros((40, 40), np.float32),
     ...     np.ones((40, 40), bool), 0.0, {}, 0.0, "landmarks", (40, 40),
     ... )
-    >>> float(own_error(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
+    >>> float(registration_covariance(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
     0.0
     """
     if light_window_px is not None and not 0.0 < light_window_px < np.inf:
@@ -87,7 +87,9 @@ def own_error(
     noise = np.where(good[..., None], variance / safe**2, 0.0)
     place = np.square(alignment.error_px.astype(np.float64))
     covariance = 0.5 * place[..., None, None] * _slopes(np.log(safe), noise, good, light_window_px)
-    covariance += (SCALE - 1.0) * (WITHOUT_BRIGHTNESS @ covariance @ WITHOUT_BRIGHTNESS)
+    covariance += (MOTION_VARIANCE_SCALE - 1.0) * (
+        BRIGHTNESS_REMOVAL @ covariance @ BRIGHTNESS_REMOVAL
+    )
     return np.where(good[..., None, None], covariance, 0.0)
 
 
@@ -113,10 +115,10 @@ def _slopes(
         for side in (here, after):
             outer[side] += products
             count[side] += whole
-    known = np.maximum(gaussian_filter(count, AROUND_PX, mode="constant"), 1e-6)
+    known = np.maximum(gaussian_filter(count, SLOPE_WINDOW_PX, mode="constant"), 1e-6)
     for i in range(3):
         for j in range(i, 3):
-            smooth = gaussian_filter(outer[..., i, j], AROUND_PX, mode="constant")
+            smooth = gaussian_filter(outer[..., i, j], SLOPE_WINDOW_PX, mode="constant")
             outer[..., i, j] = outer[..., j, i] = 2.0 * smooth / known
     # slopes that noise hides are 0, in each direction of color
     values, vectors = np.linalg.eigh(outer)

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
-_ENOUGH = 200_000
+_MAX_MEDIAN_PIXELS = 200_000
 """Pixels that tell a median to a quarter of a percent."""
 
 
@@ -36,7 +36,7 @@ def average(
     mean : ndarray of float32, shape (H, W, 3)
         0 where no repeat is valid.
     variance : ndarray of float32, shape (H, W, 3)
-        That of noise, larger by `excess` where repeats differ by more than that.
+        That of noise, larger by `overdispersion` where repeats differ by more than that.
     valid : ndarray of bool, shape (H, W)
         Any repeat is.
 
@@ -66,11 +66,11 @@ def average(
     many = np.maximum(count, 1)[..., None]
     mean = np.where(kept, rgb, 0.0).sum(axis=0, dtype=np.float64) / many
     noise = np.where(kept, variance, 0.0).sum(axis=0, dtype=np.float64) / np.square(many)
-    noise *= excess(rgb, variance, valid)
+    noise *= overdispersion(rgb, variance, valid)
     return mean.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
 
 
-def excess(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
+def overdispersion(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
     """Return the variance of what colors of repeats differ by over that of noise, at least 1.
 
     Of the whole picture: what one pixel's few repeats scatter by is known poorly. It is the median
@@ -87,7 +87,7 @@ def excess(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
     >>> noise = 0.01 * np.random.default_rng(0).standard_normal((3, 40, 40, 3))
     >>> everywhere = np.ones((3, 40, 40), bool)
     >>> flashes = np.array([1.0, 1.02, 0.98])[:, None, None, None]
-    >>> [round(excess(flashes * (0.5 + k * noise), np.full_like(noise, 1e-4), everywhere))
+    >>> [round(overdispersion(flashes * (0.5 + k * noise), np.full_like(noise, 1e-4), everywhere))
     ...  for k in (1.0, 3.0)]
     [1, 9]
     """
@@ -97,7 +97,7 @@ def excess(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
     some = np.flatnonzero(whole)
     if repeats < 2 or not some.size:
         return 1.0
-    some = some[:: -(-some.size // _ENOUGH)]
+    some = some[:: -(-some.size // _MAX_MEDIAN_PIXELS)]
     seen = rgb.reshape(repeats, -1, 3)[:, some].astype(np.float64)  # (R, n, 3)
     off = seen / seen.mean(axis=0) - 1.0
     weight = np.square(seen) / variance.reshape(repeats, -1, 3)[:, some]

@@ -25,10 +25,10 @@ from scipy import stats
 
 from reconstruction.arrays import BoolArray, Float64Array
 
-FALSE_ALARM = 0.01
+SCATTER_FALSE_ALARM_RATE = 0.01
 """Chance that any of the regions is said to scatter, or to drift, when none does."""
-FEWEST_PIXELS = 16
-WHOLE = "whole face"
+MIN_REGION_PIXELS = 16
+WHOLE_REGION = "whole face"
 """Name of the region of all valid pixels."""
 
 
@@ -156,7 +156,7 @@ def compare(
     regions: Mapping[str, ArrayLike] | None = None,
     reference: str = "neutral",
     correlated_px: float = 1.0,
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = SCATTER_FALSE_ALARM_RATE,
 ) -> Repeatability:
     """Compare repeats of states with each other, and states with repeats.
 
@@ -224,7 +224,7 @@ def drift(
     valid: ArrayLike | None = None,
     regions: Mapping[str, ArrayLike] | None = None,
     correlated_px: float = 1.0,
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = SCATTER_FALSE_ALARM_RATE,
 ) -> tuple[Drift, ...]:
     """Fit how a map, such as melanin, drifts over the time of capture.
 
@@ -423,14 +423,14 @@ def _regions(
         _grid(known) if regions is None else {k: np.asarray(v, bool) for k, v in regions.items()}
     )
     chosen, left_out = {}, []
-    for name, mask in {**wanted, WHOLE: np.ones_like(known)}.items():
+    for name, mask in {**wanted, WHOLE_REGION: np.ones_like(known)}.items():
         if mask.shape != known.shape:
             raise RepeatabilityError(
                 f"regions: {name!r} has shape {mask.shape}, expected {known.shape}"
             )
         seen = mask & known
         pixels = int(seen.sum())
-        if pixels < FEWEST_PIXELS:
+        if pixels < MIN_REGION_PIXELS:
             left_out.append((name, f"{pixels} pixels are valid in all captures"))
         else:
             chosen[name] = seen

@@ -18,17 +18,17 @@ from reconstruction.correspondence import landmark_field
 
 Points = Mapping[str, tuple[float, float]]
 
-LANDMARK_STDERR_PX = 2.0
+TRANSFER_LANDMARK_STDERR_PX = 2.0
 """Of landmarks on two different people, along each axis: what corresponds is not sharp."""
-FEWEST = 4
-_PARTS = ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
+MIN_TRANSFER_LANDMARKS = 4
+_MAP_NAMES = ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
 
 
 class RigTransferError(ValueError):
     """Landmarks that tell nothing of where one face lies on another."""
 
 
-def carried(
+def transfer_rig(
     rig: HemoglobinRig, shape: tuple[int, int], *, landmarks_rig: Points, landmarks_onto: Points
 ) -> HemoglobinRig:
     """Return a rig as it lies on another face's picture, to be applied to that face's blood.
@@ -53,17 +53,18 @@ def carried(
     Raises
     ------
     RigTransferError
-        For fewer than `FEWEST` common names, or points on one line.
+        For fewer than `MIN_TRANSFER_LANDMARKS` common names, or points on one line.
     """
     names = sorted(set(landmarks_rig) & set(landmarks_onto))
-    if len(names) < FEWEST:
+    if len(names) < MIN_TRANSFER_LANDMARKS:
         raise RigTransferError(
-            f"landmarks: {len(names)} names are in both tables, expected at least {FEWEST}"
+            f"landmarks: {len(names)} names are in both tables, expected at least "
+            f"{MIN_TRANSFER_LANDMARKS}"
         )
     onto = np.array([landmarks_onto[name] for name in names], np.float64)
     own = np.array([landmarks_rig[name] for name in names], np.float64)
     try:
-        field = landmark_field.fit(onto, own, stderr_px=LANDMARK_STDERR_PX)
+        field = landmark_field.fit(onto, own, stderr_px=TRANSFER_LANDMARK_STDERR_PX)
     except landmark_field.LandmarkFieldError as error:
         raise RigTransferError(f"landmarks: {error}") from error
     stored = (min(rig.neutral_mean.shape[0], shape[0]), min(rig.neutral_mean.shape[1], shape[1]))
@@ -81,7 +82,7 @@ def carried(
     here = seen & told
     states: dict[str, StateMaps] = {}
     for name, state in rig.states.items():
-        sampled = {part: _sampled(getattr(state, part), state.valid, cell) for part in _PARTS}
+        sampled = {part: _sampled(getattr(state, part), state.valid, cell) for part in _MAP_NAMES}
         good = np.logical_and.reduce([here, *(seen for _, seen in sampled.values())])
         maps = {part: np.where(good, values, 0.0) for part, (values, _) in sampled.items()}
         states[name] = StateMaps(

@@ -38,19 +38,19 @@ from reconstruction.chromophores import (
 )
 from reconstruction.chromophores import face as face_chromophores
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.inversion import RELATIVE_NOISE
-from reconstruction.chromophores.posterior import FINEST, WeighedChromophores
+from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
+from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.facial_color import light_change
 
-OWN_SHARE = 0.01
+OWN_VARIANCE_FRACTION = 0.01
 """Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
 pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
 SHADING_WINDOW_PX = 3.0
 """Window for the light's changes on moving faces: wider ones blur the shadows that move with them,
 narrower ones average less."""
-MISFIT = 4.0
+MISFIT_SIGMAS = 4.0
 """Standard errors from which on a state's color does not belong to the pixel's melanin."""
 _TASK_PIXELS = 2048
 
@@ -91,10 +91,10 @@ class SharedMelanin:
     def misfits(self) -> BoolArray:
         """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.valid_states & (self.residual > MISFIT))
+            return np.asarray(self.valid_states & (self.residual > MISFIT_SIGMAS))
 
 
-def weigh(
+def estimate_shared_melanin(
     rgb: ArrayLike,
     table: ColorTable,
     *,
@@ -104,7 +104,7 @@ def weigh(
     valid: ArrayLike | None = None,
     reference: int = 0,
     shading_window_px: float | None = None,
-    own_share: float = OWN_SHARE,
+    own_share: float = OWN_VARIANCE_FRACTION,
     own_error: ArrayLike | None = None,
     one_face: bool = False,
 ) -> SharedMelanin:
@@ -158,7 +158,8 @@ def weigh(
     >>> from reconstruction.chromophores.shading_prior import lognormal
     >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
     >>> color = 0.8 * table.lookup([[0.02], [0.02]], [[0.03], [0.05]])
-    >>> found = weigh(color, table, prior=lognormal(0.7, 0.6), variance=(2e-3 * color) ** 2)
+    >>> given = {"prior": lognormal(0.7, 0.6), "variance": (2e-3 * color) ** 2}
+    >>> found = estimate_shared_melanin(color, table, **given)
     >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
     ('0.020', '0.020')
     """
@@ -188,7 +189,9 @@ def weigh(
 
     each_error, usual = _model_errors(model_error, shape, usable)
     common = each_error * (1.0 - own_share)
-    owns = _own_errors(own_error, own_share * usual + FINEST**2, (states, *shape), usable)
+    owns = _own_errors(
+        own_error, own_share * usual + MIN_RELATIVE_NOISE**2, (states, *shape), usable
+    )
     cells = np.ascontiguousarray(table.cells, np.float64)
     mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, owns)
     mean_rgb = np.exp(mean)
@@ -199,7 +202,9 @@ def weigh(
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
     # dm = 3 end a^2 da
-    stderr = found.stderr_melanin / (3.0 * ends[0] * np.maximum(begin[:, 0], LOWEST) ** 2)
+    stderr = found.stderr_melanin / (
+        3.0 * ends[0] * np.maximum(begin[:, 0], MIN_AXIS_FRACTION) ** 2
+    )
     good: BoolArray = np.asarray(usable & np.isfinite(found.melanin))
     fixed = (
         np.ascontiguousarray(begin, np.float32),
@@ -236,7 +241,11 @@ def weigh(
     pixel_maps, state_maps = fit(free, free)
     if shading_window_px is not None and states > 1:
         log_change, stiffness = light_change.smooth(
-            state_maps[6], state_maps[7], good & (state_maps[5] < MISFIT), shape, shading_window_px
+            state_maps[6],
+            state_maps[7],
+            good & (state_maps[5] < MISFIT_SIGMAS),
+            shape,
+            shading_window_px,
         )
         pixel_maps, state_maps = fit(log_change, np.where(good, stiffness, 0.0).astype(np.float32))
     named = {
@@ -264,10 +273,10 @@ def _weighed(
     variance: Float32Array,
     model_error: Float64Array,
     face_shape: tuple[int, ...] | None,
-) -> WeighedChromophores:
+) -> ChromophorePosterior:
     """Weigh all solutions of colors (n, 3); those of one face, of such a shape, by it."""
     known = partial(
-        chromophore_posterior.weigh,
+        chromophore_posterior.estimate,
         rgb,
         table,
         prior=prior,
@@ -276,20 +285,20 @@ def _weighed(
     )
     face = None
     if face_shape is not None:
-        face = face_chromophores.in_known_light(
+        face = face_chromophores.fit_with_white_reference(
             rgb, table, variance=variance, model_error=model_error
         )
     by_face = known(face=face)
     if face is None or face_shape is None:
         return by_face
     alone = known()
-    spots = dark_spots.lighter_by_itself(by_face, alone)
+    spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
     if len(face_shape) == 2:
-        dark = dark_spots.darker_than_around(
+        dark = dark_spots.is_locally_dark(
             rgb.reshape(*face_shape, 3), variance=variance.reshape(*face_shape, 3)
         )
         spots |= dark.reshape(-1)
-    return dark_spots.either(by_face, alone, spots)
+    return dark_spots.average_hypotheses(by_face, alone, spots)
 
 
 def _model_errors(
@@ -393,7 +402,7 @@ def _mean_color(
 def _fractions(values: Float32Array, ends: Float64Array) -> Float64Array:
     """Return volume fractions as fractions of the table's axes; NaN as a tenth of the ends."""
     known = np.where(np.isfinite(values), values, 0.001 * ends)
-    return np.asarray(np.clip(np.cbrt(known / ends), LOWEST, 1.0), np.float64)
+    return np.asarray(np.clip(np.cbrt(known / ends), MIN_AXIS_FRACTION, 1.0), np.float64)
 
 
 def _usable(colors: Float32Array, valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
@@ -414,7 +423,7 @@ def _relative_variance(
     colors: Float32Array, variance: ArrayLike | None, shape: tuple[int, ...], usable: BoolArray
 ) -> Float32Array:
     if variance is None:
-        return np.full(colors.shape, RELATIVE_NOISE**2, np.float32)
+        return np.full(colors.shape, DEFAULT_RELATIVE_NOISE**2, np.float32)
     values = np.asarray(variance, np.float32)
     try:
         values = np.broadcast_to(values, shape).reshape(colors.shape)

@@ -11,12 +11,12 @@ import math
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
 
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
-MOST_STEPS = 12
-REACH = 0.15
+MAX_SHARED_STEPS = 12
+MAX_BLOOD_STEP = 0.15
 """Longest step in blood, as a fraction of its axis."""
-DONE = 1e-5
+SHARED_STEP_TOL = 1e-5
 PIXEL_MAPS = ("noise_stderr_melanin",)
 STATE_MAPS = (
     "hemoglobin",
@@ -29,11 +29,11 @@ STATE_MAPS = (
     "log_shading_variance",
 )
 
-_FAST = {"contract"}
-_LOW = float(LOWEST)
+_FAST_MATH = {"contract"}
+_LOW = float(MIN_AXIS_FRACTION)
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
     """Write log color and its derivatives by the axes' fractions: out (3 of value, a, b; 3)."""
     last = cells.shape[0]
@@ -53,7 +53,7 @@ def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
         out[2, c] = v_y * last / v
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     """Write the inverse of each + model + brightness / stiffness, (3, 3), to `w`.
 
@@ -81,7 +81,7 @@ def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     return t0 / total, t1 / total, t2 / total
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _times(w, g):  # type: ignore[no-untyped-def]
     """Return W g."""
     return (
@@ -91,7 +91,7 @@ def _times(w, g):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     """Return p' (each + common brightness) q; `each` is symmetric, (3, 3)."""
     return (
@@ -105,7 +105,7 @@ def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
     """Write a state's own covariance to `each`, (3, 3): noise and the triangle of its own error."""
     each[0, 0] = variance[0] + own[0]
@@ -116,12 +116,12 @@ def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
     each[1, 2] = each[2, 1] = own[4]
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _dot(p, q):  # type: ignore[no-untyped-def]
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@njit(fastmath=_FAST)
+@njit(fastmath=_FAST_MATH)
 def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
     """Return the blood, as a fraction of its axis, that fits a log color under a melanin.
 
@@ -130,7 +130,7 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
     rest = np.empty(3)
     before, cost_before = b, np.inf
     step = 0.0
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_SHARED_STEPS):
         _color(cells, a, b, color)
         for c in range(3):
             rest[c] = log_rgb[c] - color[0, c]
@@ -139,7 +139,7 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
         if cost > cost_before * (1.0 + 1e-9):
             # overshot: half of the way back
             b = 0.5 * (b + before)
-            if abs(b - before) < DONE:
+            if abs(b - before) < SHARED_STEP_TOL:
                 b = before
                 _color(cells, a, b, color)
                 break
@@ -147,9 +147,9 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
         before, cost_before = b, cost
         curvature = _dot(weighted, color[2])
         step = _dot(weighted, rest) / (curvature + 1e-12)
-        step = min(max(step, -REACH), REACH)
+        step = min(max(step, -MAX_BLOOD_STEP), MAX_BLOOD_STEP)
         b = min(max(b + step, _LOW), 1.0)
-        if abs(b - before) < DONE:
+        if abs(b - before) < SHARED_STEP_TOL:
             _color(cells, a, b, color)
             break
     return b
@@ -173,7 +173,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         int64,  # pixels a task
     ),
     parallel=True,
-    fastmath=_FAST,
+    fastmath=_FAST_MATH,
     cache=True,
     nogil=True,
     boundscheck=False,
@@ -247,7 +247,7 @@ def mean_color(  # type: ignore[no-untyped-def]
         int64,  # pixels a task
     ),
     parallel=True,
-    fastmath=_FAST,
+    fastmath=_FAST_MATH,
     cache=True,
     nogil=True,
     boundscheck=False,

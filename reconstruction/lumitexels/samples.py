@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
 
-MIN_COSINE: Final = 0.1
+MIN_VISIBLE_COSINE: Final = 0.1
 """A point seen or lit at a flatter angle gives no sample: 84 degrees."""
-OFFSET_MM: Final = 0.1
+SHADOW_RAY_OFFSET_MM: Final = 0.1
 """Shadow rays start so far above the surface."""
 
 __all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "visibility"]
@@ -126,8 +126,8 @@ def visibility(
     cameras_mm: ArrayLike,
     lights_mm: ArrayLike,
     light_radius_mm: float = 0.0,
-    offset_mm: float = OFFSET_MM,
-    min_cosine: float = MIN_COSINE,
+    offset_mm: float = SHADOW_RAY_OFFSET_MM,
+    min_cosine: float = MIN_VISIBLE_COSINE,
 ) -> Visibility:
     """Find by rays which points see which cameras and lights.
 

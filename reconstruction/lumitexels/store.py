@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
-    MIN_COSINE,
-    OFFSET_MM,
+    MIN_VISIBLE_COSINE,
+    SHADOW_RAY_OFFSET_MM,
     Camera,
     Lights,
     Lumitexels,
@@ -29,9 +29,9 @@ from reconstruction.lumitexels.samples import (
     visibility,
 )
 
-SAMPLE_BYTES: Final = 57
+BYTES_PER_SAMPLE: Final = 57
 """Of one sample of `Lumitexels`."""
-KEPT_BYTES: Final = 2**28
+MAX_CACHED_BYTES: Final = 2**28
 """Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
 Image = tuple[FloatArray, FloatArray, BoolArray | None]
 """Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
@@ -73,7 +73,7 @@ class LumitexelStore:
         poses: ArrayLike | None = None,
         binning: int = 1,
         light_radius_mm: float = 0.0,
-        offset_mm: float = OFFSET_MM,
+        offset_mm: float = SHADOW_RAY_OFFSET_MM,
         folder: Path | None = None,
         dtype: DTypeLike = np.float16,
     ) -> None:
@@ -94,7 +94,7 @@ class LumitexelStore:
         self._lit = np.packbits(seen.light, axis=0, bitorder="little")  # (L / 8, P)
         self._rows = [np.flatnonzero(row).astype(np.int32) for row in seen.view]
         self._scale = np.zeros((len(cameras), self.light_count, 2), np.float32)
-        self._kept_bytes = KEPT_BYTES if folder is None else 0
+        self._kept_bytes = MAX_CACHED_BYTES if folder is None else 0
         self._kept: dict[tuple[int, int], Lumitexels] = {}
         self._tables = [
             _table(folder, view, (self.light_count, 2, len(rows), 3), np.dtype(dtype))
@@ -179,7 +179,7 @@ class LumitexelStore:
             return self._kept[part]
         found = self._chunk(start, stop)
         samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
-        if SAMPLE_BYTES * samples <= self._kept_bytes:
+        if BYTES_PER_SAMPLE * samples <= self._kept_bytes:
             self._kept[part] = found
         return found
 
@@ -352,7 +352,7 @@ def _assemble(  # type: ignore[no-untyped-def]
             k = slot[p]
             if k < 0 or not lit[m, p] or scale[m, 0] == 0.0:
                 continue
-            if cl <= MIN_COSINE or cv <= MIN_COSINE:
+            if cl <= MIN_VISIBLE_COSINE or cv <= MIN_VISIBLE_COSINE:
                 continue
             fine = True
             for c in range(3):
@@ -379,7 +379,7 @@ def gather(
     poses: ArrayLike | None = None,
     binning: int = 1,
     light_radius_mm: float = 0.0,
-    offset_mm: float = OFFSET_MM,
+    offset_mm: float = SHADOW_RAY_OFFSET_MM,
 ) -> Lumitexels:
     """Gather the lumitexels of a surface that fit into memory (about 60 bytes a sample).
 

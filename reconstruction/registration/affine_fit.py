@@ -16,11 +16,11 @@ from scipy.linalg import solve_triangular
 
 from reconstruction.arrays import Float64Array
 
-REACHES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+CORRELATION_LENGTHS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Lengths over which deviations are alike, in windows. What is finer a window averages; what is
 longer moves a picture of a few windows as a whole and is no scatter in it. On simulated skin (seeds
 0 to 8) windows' displacements are alike over 0.8 to 1.2 windows of 150 um."""
-SHARES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
+SHARED_FRACTIONS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 """Of the deviations' variance, what neighbors have in common."""
 
 
@@ -36,7 +36,7 @@ def fit_affine(
     found : ndarray, shape (N, 2)
         Where they are in the second, px.
     window_px : float
-        Side of the windows that were followed: the unit of `REACHES`.
+        Side of the windows that were followed: the unit of `CORRELATION_LENGTHS`.
 
     Returns
     -------
@@ -66,15 +66,15 @@ def fit_affine(
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1) / window_px
     free = count - 3
     kept: list[tuple[float, Float64Array, Float64Array, Float64Array]] = []
-    for reach in REACHES:
+    for reach in CORRELATION_LENGTHS:
         alike = _correlation(apart / reach)
-        for share in SHARES:
-            if share == 0.0 and reach != REACHES[0]:
+        for share in SHARED_FRACTIONS:
+            if share == 0.0 and reach != CORRELATION_LENGTHS[0]:
                 continue  # without a field its reach does not matter
             kept.append(_given(design, found, share * alike + (1.0 - share) * np.eye(count)))
     log = np.array([each[0] for each in kept])
     # the case without a field stands for all reaches
-    log[0] += np.log(len(REACHES))
+    log[0] += np.log(len(CORRELATION_LENGTHS))
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     solution = np.einsum("k,kij->ij", weight, np.array([each[1] for each in kept]))

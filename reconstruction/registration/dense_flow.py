@@ -23,24 +23,24 @@ import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 
-ROUNDS = 2
+N_WARP_ROUNDS = 2
 """How often the second picture is warped and the rest followed."""
-MOST_GAP_PX = 1.0
+MAX_GAP_PX = 1.0
 """Farther from where it began after the way back, a pixel has followed something else."""
-WINDOW_PX = 5.0
+TEXTURE_WINDOW_PX = 5.0
 """Gaussian window whose texture stands for that of the flow's patches, px."""
-NEIGHBORS_PX = 8.0
+GAP_WINDOW_PX = 8.0
 """Gaussian window over which gaps are averaged, and unknown flow is filled."""
-BEND_PX = 3.0
+DERIVATIVE_WINDOW_PX = 3.0
 """Gaussian window that derivatives of the displacement are taken at, px."""
-_CUBIC = -0.75
+_CUBIC_SLOPE = -0.75
 """Slope of OpenCV's cubic kernel at a pixel's distance."""
 ERROR_FACTORS = (1.2, 0.3, 1.1, 12.0, 0.04)
 """Squared error along an axis, by parts: the variance by noise, the squares of gap and last step
 (px^2), of the Laplacian (1/px^2 times px^4) and of the gradient of the displacement (times px^2).
 Least squares on simulated faces of another seed, moved by smooth fields of 3 to 12 px that bend
 over 15 to 60 px, in other states of blood."""
-LEAST_ERROR_PX = 0.01
+MIN_FLOW_ERROR_PX = 0.01
 """Interpolation and rounding to 8 bits, px."""
 
 
@@ -74,14 +74,14 @@ def refine(
     *,
     valid: BoolArray,
     valid_second: BoolArray,
-    rounds: int = ROUNDS,
+    rounds: int = N_WARP_ROUNDS,
 ) -> DenseFlow:
     """Refine a guess of where the pixels of one picture are in another.
 
     Parameters
     ----------
     first, second : ndarray of uint8, shapes (H, W) and (h, w)
-        Local contrast, as of `reconstruction.registration.evened`.
+        Local contrast, as of `reconstruction.registration.normalize_local_contrast`.
     source_px : ndarray, shape (H, W, 2)
         The guess: column and row in the second picture.
     stderr_px : ndarray, shape (H, W)
@@ -96,7 +96,7 @@ def refine(
     DenseFlow
     """
     at = source_px.astype(np.float32)
-    error = np.maximum(stderr_px.astype(np.float32), np.float32(LEAST_ERROR_PX))
+    error = np.maximum(stderr_px.astype(np.float32), np.float32(MIN_FLOW_ERROR_PX))
     here = grid(valid.shape)
     gap = np.zeros(valid.shape, np.float32)
     known = np.zeros(valid.shape, bool)
@@ -109,7 +109,7 @@ def refine(
         back = _follow(two, one)
         gap = np.linalg.norm(there + bilinear(back, here + there), axis=-1)
         moved = here + there
-        known = both & (gap <= MOST_GAP_PX) & _inside(moved, valid.shape)
+        known = both & (gap <= MAX_GAP_PX) & _inside(moved, valid.shape)
         known &= bilinear(both.astype(np.float32), moved) > 0.999
         noise = _noise_variance(one, bilinear(two, moved))
         weight = known.astype(np.float32)
@@ -120,7 +120,7 @@ def refine(
         went = _blurred(weight * (there**2).sum(axis=-1)) / share
         bent, strained = _deformation(moved)
         parts: tuple[Any, ...] = (noise, wide, went, bent, strained)
-        variance = np.full(valid.shape, LEAST_ERROR_PX**2, np.float32)
+        variance = np.full(valid.shape, MIN_FLOW_ERROR_PX**2, np.float32)
         for factor, part in zip(ERROR_FACTORS, parts, strict=True):
             variance += np.float32(factor) * part
         trust = np.where(known, error**2 / (error**2 + variance), 0.0).astype(np.float32)
@@ -157,8 +157,8 @@ def noise_left(at_px: Float32Array) -> Float32Array:
     for axis in (0, 1):
         along = at_px[..., axis] - np.floor(at_px[..., axis])
         t = np.stack([along + 1.0, along, 1.0 - along, 2.0 - along])
-        near = ((_CUBIC + 2.0) * t - (_CUBIC + 3.0)) * t * t + 1.0
-        far = ((t - 5.0) * t + 8.0) * t * _CUBIC - 4.0 * _CUBIC
+        near = ((_CUBIC_SLOPE + 2.0) * t - (_CUBIC_SLOPE + 3.0)) * t * t + 1.0
+        far = ((t - 5.0) * t + 8.0) * t * _CUBIC_SLOPE - 4.0 * _CUBIC_SLOPE
         left *= np.square(np.where(t <= 1.0, near, far)).sum(axis=0)
     return left
 
@@ -176,7 +176,7 @@ def _noise_variance(one: UInt8Array, two: UInt8Array) -> Float32Array:
     dx, dy = (cv2.Scharr(mean, cv2.CV_32F, *order) / 32.0 for order in ((1, 0), (0, 1)))
     xx, xy, yy = (_windowed(part) for part in (dx * dx, dx * dy, dy * dy))
     rest = _windowed((a - b) ** 2) + 1.0 / 6.0  # two roundings to integers
-    area = 4.0 * np.pi * WINDOW_PX**2
+    area = 4.0 * np.pi * TEXTURE_WINDOW_PX**2
     determinant = np.maximum(xx * yy - xy * xy, 1e-6)
     return np.asarray(rest / area * 0.5 * (xx + yy) / determinant, np.float32)
 
@@ -184,7 +184,7 @@ def _noise_variance(one: UInt8Array, two: UInt8Array) -> Float32Array:
 def _deformation(at_px: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Return the squares of the Laplacian and of the gradient of a map's displacement."""
     away = at_px - grid(at_px.shape)
-    displacement = np.asarray(cv2.GaussianBlur(away, (0, 0), BEND_PX))
+    displacement = np.asarray(cv2.GaussianBlur(away, (0, 0), DERIVATIVE_WINDOW_PX))
     parts = [np.ascontiguousarray(displacement[..., k]) for k in (0, 1)]
     bent = np.sum([cv2.Laplacian(part, cv2.CV_32F) ** 2 for part in parts], axis=0)
     strained = np.sum([slope**2 for part in parts for slope in np.gradient(part)], axis=0)
@@ -192,11 +192,11 @@ def _deformation(at_px: Float32Array) -> tuple[Float32Array, Float32Array]:
 
 
 def _windowed(image: Float32Array) -> Float32Array:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), WINDOW_PX))
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), TEXTURE_WINDOW_PX))
 
 
 def _blurred(image: Float32Array) -> Float32Array:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), NEIGHBORS_PX))
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), GAP_WINDOW_PX))
 
 
 def _inside(at_px: Float32Array, shape: tuple[int, ...]) -> BoolArray:

@@ -21,19 +21,19 @@ from numpy.typing import NDArray
 from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.registration.tracking import RegistrationError
 
-MOST_FEATURES = 3000
-RATIO = 0.85
+MAX_FEATURES = 3000
+MAX_LOWE_RATIO = 0.85
 """A match whose second best is not clearly worse is left out (Lowe's ratio)."""
-ROUGH = 0.06
+MAX_AFFINE_DEVIATION = 0.06
 """How far a match may be off the common affine motion, as a part of the picture's diagonal."""
-NEIGHBORS = 8
-MOST_APART = 0.25
+N_NEIGHBORS = 8
+MAX_NEIGHBOR_DEVIATION = 0.25
 """How much a match may differ from its neighbors' motion, as a part of their distance ..."""
-LEAST_APART_PX = 1.5
+MIN_NEIGHBOR_DEVIATION_PX = 1.5
 """... and this much at any distance."""
-CELL = 24
+CELLS_PER_SIDE = 24
 """At most one match is kept in each cell of so many by so many over the picture."""
-LEAST_MATCHES = 12
+MIN_MATCHES = 12
 """Fewer that agree may agree by chance."""
 
 
@@ -49,37 +49,37 @@ def match(
     Parameters
     ----------
     first, second : ndarray of uint8, (H, W)
-        Local contrast, as of `reconstruction.registration.evened`.
+        Local contrast, as of `reconstruction.registration.normalize_local_contrast`.
     valid, valid_second : ndarray of bool
         Where features may lie.
 
     Returns
     -------
     points_px, moved_px : ndarray of float64, shape (K, 2)
-        Column and row in the first and in the second picture, K at least `LEAST_MATCHES`.
+        Column and row in the first and in the second picture, K at least `MIN_MATCHES`.
 
     Raises
     ------
     FeatureError
         When too few features agree on a motion.
     """
-    finder = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=0.02)
+    finder = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=0.02)
     places, words = [], []
     for image, mask in ((first, valid), (second, valid_second)):
         keys, descriptors = finder.detectAndCompute(image, mask.astype(np.uint8) * 255)
         places.append(np.array([key.pt for key in keys], np.float64).reshape(-1, 2))
         words.append(descriptors)
-    if min(len(place) for place in places) < LEAST_MATCHES:
+    if min(len(place) for place in places) < MIN_MATCHES:
         raise FeatureError(
             f"features: found {len(places[0])} and {len(places[1])}, "
-            f"expected at least {LEAST_MATCHES} in both pictures; give landmarks"
+            f"expected at least {MIN_MATCHES} in both pictures; give landmarks"
         )
     pairs = _mutual(words[0], words[1])
     one, two = places[0][pairs[:, 0]], places[1][pairs[:, 1]]
     one, two = _smooth(one, two, float(np.hypot(*first.shape)))
-    if len(one) < LEAST_MATCHES:
+    if len(one) < MIN_MATCHES:
         raise FeatureError(
-            f"features: {len(one)} agree on a smooth motion, expected at least {LEAST_MATCHES}; "
+            f"features: {len(one)} agree on a smooth motion, expected at least {MIN_MATCHES}; "
             "give landmarks"
         )
     return one, two
@@ -94,7 +94,7 @@ def _mutual(words: Any, others: Any) -> NDArray[np.intp]:
         (m[0].queryIdx, m[0].trainIdx)
         for m in there
         if len(m) == 2
-        and m[0].distance < RATIO * m[1].distance
+        and m[0].distance < MAX_LOWE_RATIO * m[1].distance
         and back[m[0].trainIdx] == m[0].queryIdx
     ]
     return np.array(pairs, np.intp).reshape(-1, 2)
@@ -104,27 +104,31 @@ def _smooth(
     one: Float64Array, two: Float64Array, diagonal: float
 ) -> tuple[Float64Array, Float64Array]:
     """Keep matches that move with the whole, and about as their neighbors do."""
-    if len(one) < LEAST_MATCHES:
+    if len(one) < MIN_MATCHES:
         return one[:0], two[:0]
     cv2.setRNGSeed(0)  # sampling is repeatable
     _, inlier = cv2.estimateAffine2D(
-        one, two, method=cv2.RANSAC, ransacReprojThreshold=ROUGH * diagonal, maxIters=5000
+        one,
+        two,
+        method=cv2.RANSAC,
+        ransacReprojThreshold=MAX_AFFINE_DEVIATION * diagonal,
+        maxIters=5000,
     )
     kept = np.flatnonzero(np.asarray(inlier).reshape(-1) == 1)
     one, two = one[kept], two[kept]
     for _ in range(3):
-        if len(one) <= NEIGHBORS:
+        if len(one) <= N_NEIGHBORS:
             return one[:0], two[:0]
         apart = np.linalg.norm(one[:, None] - one, axis=-1)
-        near = np.argsort(apart, axis=1, kind="stable")[:, 1 : NEIGHBORS + 1]
+        near = np.argsort(apart, axis=1, kind="stable")[:, 1 : N_NEIGHBORS + 1]
         motion = two - one
         middle = np.median(motion[near], axis=1)
         far = np.median(np.take_along_axis(apart, near, axis=1), axis=1)
         off = np.linalg.norm(motion - middle, axis=1)
-        good = off <= MOST_APART * far + LEAST_APART_PX
+        good = off <= MAX_NEIGHBOR_DEVIATION * far + MIN_NEIGHBOR_DEVIATION_PX
         one, two = one[good], two[good]
         if good.all():
             break
-    cell = np.floor(one / (diagonal / np.sqrt(2.0) / CELL)).astype(int)
+    cell = np.floor(one / (diagonal / np.sqrt(2.0) / CELLS_PER_SIDE)).astype(int)
     _, first = np.unique(cell, axis=0, return_index=True)
     return one[np.sort(first)], two[np.sort(first)]

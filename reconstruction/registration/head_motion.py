@@ -17,27 +17,29 @@ from numpy.typing import ArrayLike, NDArray
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
 
-LEAST_COSINE = 0.4
+MIN_TRACK_COSINE = 0.4
 """Cosine between normal and view below which a point is not tracked."""
-LEAST_TRACKS = 12
+MIN_TRACKS = 12
 """Tracks below which a frame tells no motion."""
-TUKEY = 4.685
-OUTLIER_SIGMAS, OUTLIER_PX = 4.0, 0.3
+TRACK_TUKEY_SIGMAS = 4.685
+TRACK_OUTLIER_SIGMAS, TRACK_OUTLIER_PX = 4.0, 0.3
 """Residual, in the capture's usual scale and in px, from which a track moves on its own."""
-NONRIGID_SHARE = 0.05
+MAX_EXCESS_NONRIGID_FRACTION = 0.05
 """Share of such tracks, beyond the capture's usual one, from which a frame is not usable."""
-NONRIGID_AT_ALL = 0.3
-OFTEN = 1 / 3
+MAX_NONRIGID_FRACTION = 0.3
+MAX_NONRIGID_FRAME_FRACTION = 1 / 3
 """Part of the frames from which on a track that moves on its own is not one of the skin."""
-PART_MM = 15.0
-PART_TIMES = 2.5
+FACE_PART_MM = 15.0
+MAX_PART_RESIDUAL_RATIO = 2.5
 """Residual of the worst part of a face over the capture's usual one, and over what is usual beside
 the frame's own residuals: from either on it is an expression."""
 BLOCK_PX = 32
 """Side of the parts of an image whose tracks err alike."""
-_STEP_MM = 0.01
-_FINEST_PX = 1e-6
-_MAD = 1.1774100225154747  # median of the length of a unit normal vector in two dimensions
+_DIFFERENCE_MM = 0.01
+_MIN_RESIDUAL_PX = 1e-6
+_RAYLEIGH_MEDIAN = (
+    1.1774100225154747  # median of the length of a unit normal vector in two dimensions
+)
 
 
 class HeadMotionError(ValueError):
@@ -206,17 +208,17 @@ def estimate(
     points, outward, times = _checked(frames, cameras, points_mm, normals, times_s, reference)
     chosen, evened = [], []
     for number, camera in enumerate(cameras):
-        even = registration.evened(np.asarray(frames[reference][number]))
+        even = registration.normalize_local_contrast(np.asarray(frames[reference][number]))
         seen = _facing(points, outward, np.asarray(camera.center_mm, np.float64))
         places = np.full((len(points), 2), np.nan)
         places[seen] = camera.project(points[seen])
         chosen.append(registration.textured(even, places, count=tracks_per_camera))
         evened.append(even)
     total = sum(len(rows) for rows in chosen)
-    if total < LEAST_TRACKS:
+    if total < MIN_TRACKS:
         raise HeadMotionError(
             f"points_mm: {total} points have texture in the reference frame, expected at least "
-            f"{LEAST_TRACKS}; light the tracking frames better or check the cameras' poses"
+            f"{MIN_TRACKS}; light the tracking frames better or check the cameras' poses"
         )
     found = []
     for time, pictures in enumerate(frames):
@@ -268,7 +270,7 @@ def _facing(points: Float64Array, normals: Float64Array, center: Float64Array) -
     towards = center - points
     length = np.linalg.norm(towards, axis=1) * np.linalg.norm(normals, axis=1)
     cosine = np.sum(towards * normals, axis=1) / np.where(length > 0, length, 1.0)
-    return np.asarray(cosine > LEAST_COSINE)
+    return np.asarray(cosine > MIN_TRACK_COSINE)
 
 
 def _pose(
@@ -283,20 +285,22 @@ def _pose(
     kept = []
     for picture, camera, rows, even in zip(pictures, cameras, chosen, evened, strict=True):
         start = np.asarray(camera.project(points[rows])) if len(rows) else np.zeros((0, 2))
-        tracks = registration.track(even, registration.evened(np.asarray(picture)), start)
+        tracks = registration.track(
+            even, registration.normalize_local_contrast(np.asarray(picture)), start
+        )
         kept.append(tracks.valid)
         if tracks.valid.any():
             seen.append((camera, points[rows][tracks.valid], tracks.points_px[tracks.valid]))
     found = np.concatenate(kept)
     left = np.full(found.size, np.inf)
-    if np.count_nonzero(found) < LEAST_TRACKS:
+    if np.count_nonzero(found) < MIN_TRACKS:
         return _Pose(np.zeros(6), np.full(6, np.inf), left)
     motion = np.zeros(6)
     for _ in range(iterations):
         r, J = _residuals(seen, motion)
         length = np.linalg.norm(r, axis=1)
-        scale = max(float(np.median(length)) / _MAD, 1e-6)
-        w = np.maximum(1.0 - (length / (TUKEY * scale)) ** 2, 0.0) ** 2
+        scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
+        w = np.maximum(1.0 - (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2, 0.0) ** 2
         A = np.einsum("n,nki,nkj->ij", w, J, J)
         size = np.sqrt(np.maximum(np.diag(A), 1e-300))
         A = A / np.outer(size, size) + 1e-9 * np.eye(6)
@@ -306,8 +310,8 @@ def _pose(
             break
     r, J = _residuals(seen, motion)
     length = np.linalg.norm(r, axis=1)
-    scale = max(float(np.median(length)) / _MAD, 1e-6)
-    u2 = (length / (TUKEY * scale)) ** 2
+    scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
+    u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
     stderr = _stderr(r, J, u2, _blocks(seen))
     if not np.isfinite(stderr).all():
         motion = np.zeros(6)
@@ -322,7 +326,7 @@ def _worst_part(points: Float64Array, length: Float64Array) -> float:
     """
     worst = 0.0
     for shift in (0.0, 0.5):
-        cell = np.floor(points / PART_MM + shift).astype(np.intp)
+        cell = np.floor(points / FACE_PART_MM + shift).astype(np.intp)
         _, part, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
         part = part.reshape(-1)
         for number in np.flatnonzero(count >= 3):
@@ -385,9 +389,9 @@ def _residuals(
         by_place = np.empty((len(points), 2, 3))
         for axis in range(3):
             step = np.zeros(3)
-            step[axis] = _STEP_MM
+            step[axis] = _DIFFERENCE_MM
             ahead, behind = camera.project(moved + step), camera.project(moved - step)
-            by_place[:, :, axis] = (ahead - behind) / (2 * _STEP_MM)
+            by_place[:, :, axis] = (ahead - behind) / (2 * _DIFFERENCE_MM)
         # a small further turn w moves R x by w x (R x): columns e_k x (R x)
         cross = np.cross(np.eye(3)[None], turned[:, None, :])
         slopes.append(
@@ -405,23 +409,25 @@ def _judged(
     """Compare the frames with each other: what is usual is noise, what is not an expression."""
     left = np.array([f.residual_px for f in found])
     known = np.isfinite(left)
-    scales = np.array([_middle(row) / _MAD for row in left])
+    scales = np.array([_middle(row) / _RAYLEIGH_MEDIAN for row in left])
     told = np.array([np.isfinite(f.stderr).all() for f in found])
     others = told & (np.arange(len(found)) != reference)
-    far = left > max(OUTLIER_SIGMAS * _middle(scales[others]), OUTLIER_PX)
+    far = left > max(TRACK_OUTLIER_SIGMAS * _middle(scales[others]), TRACK_OUTLIER_PX)
     # what leaves the head in many frames is no expression but an edge that hides points
     steady = np.ones(len(points), bool)
     if np.count_nonzero(others) >= 4:
-        steady = np.mean(far[others], axis=0) <= OFTEN
+        steady = np.mean(far[others], axis=0) <= MAX_NONRIGID_FRAME_FRACTION
     share = np.mean(far[:, steady], axis=1) if steady.any() else np.ones(len(found))
     worst = np.array(
         [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
     )
-    usable = told & (share <= min(_middle(share[others]) + NONRIGID_SHARE, NONRIGID_AT_ALL))
+    usable = told & (
+        share <= min(_middle(share[others]) + MAX_EXCESS_NONRIGID_FRACTION, MAX_NONRIGID_FRACTION)
+    )
     # residuals grow as the head turns in its light, and the worst part's with them
-    own = worst / np.maximum(scales, _FINEST_PX)
+    own = worst / np.maximum(scales, _MIN_RESIDUAL_PX)
     usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
-    usable &= worst <= np.fmax(PART_TIMES * usual, OUTLIER_PX)
+    usable &= worst <= np.fmax(MAX_PART_RESIDUAL_RATIO * usual, TRACK_OUTLIER_PX)
     usable[reference] = True
     motion = np.array([f.motion for f in found])
     return HeadMotion(

@@ -19,21 +19,26 @@ import numpy as np
 
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration.affine_fit import fit_affine
-from reconstruction.registration.tracking import RegistrationError, evened, textured, track
+from reconstruction.registration.tracking import (
+    RegistrationError,
+    normalize_local_contrast,
+    textured,
+    track,
+)
 
-LEAST_SIDE_PX = 64
-COARSEST_PX = 48
+MIN_STRAIN_SIDE_PX = 64
+MIN_TOP_SIDE_PX = 48
 """Shortest side of the pyramid's top."""
-WINDOW_PX = 25
-LEAST_WINDOWS = 12
+STRAIN_WINDOW_PX = 25
+MIN_WINDOWS = 12
 """Fewer windows tell nothing of their own scatter: six numbers are fitted to them."""
-OUTLIER = 4.0
+WINDOW_OUTLIER_SIGMAS = 4.0
 """Windows farther off the fit than this many robust standard deviations are left out."""
-MISMATCH_PX = 2.0
+MAX_WINDOW_RESIDUAL_PX = 2.0
 """Windows farther off the fit than this have followed something else."""
-ROUNDS = 3
+N_STRAIN_ROUNDS = 3
 
-_FLIP = np.diag([1.0, -1.0])
+_FLIP_Y = np.diag([1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +122,7 @@ class Strain:
         return _to_pixels(self.gradient, self.shift_px, shape)
 
 
-GUESSES = tuple(
+STRAIN_GUESSES = tuple(
     np.diag([across, up])
     for across in (1.0, 0.88, 1.14, 0.76, 1.28)
     for up in (1.0, 0.88, 1.14, 0.76, 1.28)
@@ -168,16 +173,17 @@ def measure_strain(
             f"second: got shape {np.shape(second)}, expected that of first, {np.shape(first)}"
         )
     height, width = np.shape(first)
-    if min(height, width) < LEAST_SIDE_PX:
+    if min(height, width) < MIN_STRAIN_SIDE_PX:
         raise RegistrationError(
-            f"first: got {width} x {height} px, expected {LEAST_SIDE_PX} x {LEAST_SIDE_PX} or more"
+            f"first: got {width} x {height} px, expected "
+            f"{MIN_STRAIN_SIDE_PX} x {MIN_STRAIN_SIDE_PX} or more"
         )
     shape = (height, width)
-    one = evened(_filled(first, valid))
-    two = evened(_filled(second, valid_second))
+    one = normalize_local_contrast(_filled(first, valid))
+    two = normalize_local_contrast(_filled(second, valid_second))
     mask = np.ones(shape, bool) if valid is None else valid
     other = np.ones(shape, bool) if valid_second is None else valid_second
-    guesses = [np.eye(2), *GUESSES] if start is None else [np.asarray(start, np.float64)]
+    guesses = [np.eye(2), *STRAIN_GUESSES] if start is None else [np.asarray(start, np.float64)]
     for gradient in guesses:
         affine = _to_pixels(gradient, np.zeros(2), shape)
         if start_shift_px is not None:
@@ -204,14 +210,14 @@ def _to_pixels(
     gradient: Float64Array, shift_px: Float64Array, shape: tuple[int, int]
 ) -> Float64Array:
     middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
-    turned = _FLIP @ gradient @ _FLIP
-    return np.column_stack([turned, middle + _FLIP @ shift_px - turned @ middle])
+    turned = _FLIP_Y @ gradient @ _FLIP_Y
+    return np.column_stack([turned, middle + _FLIP_Y @ shift_px - turned @ middle])
 
 
 def _from_pixels(affine: Float64Array, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
     middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     shift = affine[:, :2] @ middle + affine[:, 2] - middle
-    return _FLIP @ affine[:, :2] @ _FLIP, _FLIP @ shift
+    return _FLIP_Y @ affine[:, :2] @ _FLIP_Y, _FLIP_Y @ shift
 
 
 def _phase_shift(
@@ -236,7 +242,7 @@ def _pyramid(
 ) -> Float64Array:
     """Improve an affine map from coarse to fine; a level that does not converge changes nothing."""
     levels = [(one.astype(np.float32), two.astype(np.float32), mask.astype(np.uint8))]
-    while min(levels[-1][0].shape) >= 2 * COARSEST_PX and len(levels) < 6:
+    while min(levels[-1][0].shape) >= 2 * MIN_TOP_SIDE_PX and len(levels) < 6:
         a, b, m = levels[-1]
         levels.append(
             (
@@ -277,11 +283,15 @@ def _by_windows(
     size = shape[1], shape[0]
     grid = np.stack(np.meshgrid(np.arange(0, shape[1], 3), np.arange(0, shape[0], 3)), axis=-1)
     candidates = grid.reshape(-1, 2).astype(np.float64)
-    eroded = cv2.erode(mask.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
+    eroded = cv2.erode(
+        mask.astype(np.uint8), np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8)
+    )
     candidates = candidates[eroded[candidates[:, 1].astype(int), candidates[:, 0].astype(int)] > 0]
-    chosen = textured(one, candidates, count=count, cell_px=WINDOW_PX, margin_px=WINDOW_PX // 2 + 1)
+    chosen = textured(
+        one, candidates, count=count, cell_px=STRAIN_WINDOW_PX, margin_px=STRAIN_WINDOW_PX // 2 + 1
+    )
     start = candidates[chosen]
-    for number in range(ROUNDS):
+    for number in range(N_STRAIN_ROUNDS):
         back = cv2.warpAffine(
             two, affine, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderValue=128
         )
@@ -292,11 +302,13 @@ def _by_windows(
             flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
             borderValue=0,
         )
-        seen = cv2.erode(seen, np.ones((WINDOW_PX, WINDOW_PX), np.uint8), borderValue=0)
-        tracks = track(one, back, start, window_px=WINDOW_PX, levels=2 if number == 0 else 0)
+        seen = cv2.erode(
+            seen, np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8), borderValue=0
+        )
+        tracks = track(one, back, start, window_px=STRAIN_WINDOW_PX, levels=2 if number == 0 else 0)
         inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
         good = tracks.valid & inside
-        fit = _fit(start[good], tracks.points_px[good], shape, last=number == ROUNDS - 1)
+        fit = _fit(start[good], tracks.points_px[good], shape, last=number == N_STRAIN_ROUNDS - 1)
         if fit is None:
             gradient, shift = _from_pixels(affine, shape)
             return Strain(
@@ -326,7 +338,7 @@ def _fit(
     middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     keep = np.ones(len(start), bool)
     for _ in range(5):
-        if keep.sum() < LEAST_WINDOWS:
+        if keep.sum() < MIN_WINDOWS:
             return None
         design = np.column_stack([start[keep] - middle, np.ones(keep.sum())])
         solution, _, rank, _ = np.linalg.lstsq(design, found[keep] - middle)
@@ -335,17 +347,17 @@ def _fit(
         everywhere = np.column_stack([start - middle, np.ones(len(start))]) @ solution
         distance = np.linalg.norm(found - middle - everywhere, axis=1)
         spread = 1.4826 * float(np.median(distance[keep])) / 1.177  # of one coordinate
-        now = distance <= min(max(OUTLIER * spread, 0.02), MISMATCH_PX)
+        now = distance <= min(max(WINDOW_OUTLIER_SIGMAS * spread, 0.02), MAX_WINDOW_RESIDUAL_PX)
         if (now == keep).all():
             break
         keep = now
-    if keep.sum() < LEAST_WINDOWS:
+    if keep.sum() < MIN_WINDOWS:
         return None
     design = np.column_stack([start[keep] - middle, np.ones(keep.sum())])
     covariance = np.full((6, 6), np.inf)
     if last:
         solution, covariance = fit_affine(
-            start[keep] - middle, found[keep] - middle, window_px=WINDOW_PX
+            start[keep] - middle, found[keep] - middle, window_px=STRAIN_WINDOW_PX
         )
     linear, offset = solution[:2].T, solution[2]
     rest = found[keep] - middle - design @ solution
@@ -357,12 +369,12 @@ def _fit(
 def _carry(covariance: Float64Array, linear: Float64Array) -> Float64Array:
     """Carry the covariance of a small map through the large one before it, into axes with y up."""
     jacobian = np.zeros((6, 6))
-    outer = _FLIP @ linear
+    outer = _FLIP_Y @ linear
     for i in range(2):
         for j in range(2):
             # F = flip (linear small) flip: entry (i, j) of F from row k, column j of small
             for k in range(2):
-                jacobian[2 * i + j, 2 * k + j] = outer[i, k] * _FLIP[j, j]
+                jacobian[2 * i + j, 2 * k + j] = outer[i, k] * _FLIP_Y[j, j]
         jacobian[4 + i, 4:6] = outer[i]
     return jacobian @ covariance @ jacobian.T
 

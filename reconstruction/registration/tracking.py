@@ -16,7 +16,7 @@ class RegistrationError(ValueError):
     """Images or points that cannot be registered."""
 
 
-LEAST_TOP = 1e-12
+MIN_PEAK = 1e-12
 """Brightest value below which, or above one over which, a picture's unit is not kept: local spreads
 would fall below the floor that stands for no texture at all, or overflow."""
 
@@ -37,7 +37,7 @@ class Tracks:
     valid: BoolArray
 
 
-def evened(image: FloatArray, *, sigma_px: float = 8.0) -> UInt8Array:
+def normalize_local_contrast(image: FloatArray, *, sigma_px: float = 8.0) -> UInt8Array:
     """Return the local contrast of an image as 8-bit values: mean and brightness of light are gone.
 
     Parameters
@@ -64,7 +64,7 @@ def evened(image: FloatArray, *, sigma_px: float = 8.0) -> UInt8Array:
     known = np.isfinite(image)
     values = np.maximum(np.where(known, image, 0.0), 0.0)
     top = float(values.max())
-    if top > 0.0 and not LEAST_TOP < top < 1.0 / LEAST_TOP:
+    if top > 0.0 and not MIN_PEAK < top < 1.0 / MIN_PEAK:
         values = values / top  # squares in single precision hold no more
     values = np.sqrt(values).astype(np.float32)
     mean = cv2.GaussianBlur(values, (0, 0), sigma_px)
@@ -82,7 +82,7 @@ def textured(
     Parameters
     ----------
     even : ndarray of uint8, shape (H, W)
-        As from `evened`.
+        As from `normalize_local_contrast`.
     points_px : ndarray, shape (P, 2)
         Candidates; those that are not finite or too near the border are left out.
     count : int
@@ -129,7 +129,7 @@ def track(
     Parameters
     ----------
     first, second : ndarray of uint8, shape (H, W)
-        As from `evened`.
+        As from `normalize_local_contrast`.
     points_px : ndarray, shape (K, 2)
         Column and row in `first`.
     window_px : int

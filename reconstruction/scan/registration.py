@@ -25,15 +25,15 @@ from reconstruction.scan.repair import TriangleMesh
 
 COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
 """Half vectors closer to the normal than 45 degrees may be those of a highlight."""
-LEAST_LIGHTS: Final = 9
+MIN_SCAN_LIGHTS: Final = 9
 """So many lights take part at a pixel even where some are nearer to the highlight."""
 MIN_COS_LIGHT: Final = 0.3
 MIN_COS_VIEW: Final = 0.2
-WIDEST_PX: Final = 320
+MAX_IMAGE_WIDTH_PX: Final = 320
 """Larger images are binned 2 x 2 until they are no wider."""
-MIN_COSINE: Final = 0.35
+MIN_SCAN_COSINE: Final = 0.35
 """Points seen at a flatter angle say nothing: 70 degrees."""
-CELL_MM: Final = 20.0
+ERROR_CELL_MM: Final = 20.0
 """Errors within such a cube are taken for one when standard errors are computed."""
 
 
@@ -86,7 +86,7 @@ class RigidFit:
         return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
 
 
-def photometric_normals(
+def _photometric_normals(
     stack: FloatArray,
     camera: RayCamera,
     lights: Lights,
@@ -146,7 +146,7 @@ def photometric_normals(
         facing_light = cos_light > MIN_COS_LIGHT
         # of few lights those farthest from the highlight stay
         ordered = np.sort(np.where(facing_light, cos_half, np.inf), axis=0)
-        edge = np.maximum(ordered[min(LEAST_LIGHTS, count) - 1], COS_HIGHLIGHT)
+        edge = np.maximum(ordered[min(MIN_SCAN_LIGHTS, count) - 1], COS_HIGHLIGHT)
         diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
         passed = _passed(cos_light) * _passed(cos_view)
         found, share = _robust_normals(
@@ -332,7 +332,7 @@ def align(
         moved = mesh.vertices_mm if fit is None else fit.move(mesh.vertices_mm)
         caster = RayCaster(moved, mesh.faces)
         evidence = [
-            photometric_normals(
+            _photometric_normals(
                 image,
                 camera,
                 lights,
@@ -349,7 +349,7 @@ def align(
             caster,
             cameras_mm=np.array([camera.center_mm for camera in cameras]),
             lights_mm=np.zeros((0, 3)),
-            min_cosine=MIN_COSINE,
+            min_cosine=MIN_SCAN_COSINE,
         ).view
         fit = register(
             p,
@@ -365,9 +365,9 @@ def align(
 
 
 def _binned(stack: FloatArray) -> tuple[Float32Array, int]:
-    """Return images no wider than `WIDEST_PX`, and the side of their pixels; NaN spreads."""
+    """Return images up to `MAX_IMAGE_WIDTH_PX` wide, and the side of their pixels; NaN spreads."""
     image, side = np.asarray(stack, np.float32), 1
-    while max(image.shape[1:]) > WIDEST_PX:
+    while max(image.shape[1:]) > MAX_IMAGE_WIDTH_PX:
         height, width = (n - n % 2 for n in image.shape[1:])
         blocks = image[:, :height, :width].reshape(len(image), height // 2, 2, width // 2, 2)
         image, side = blocks.mean(axis=(2, 4)), 2 * side
@@ -426,7 +426,7 @@ def _gauss_newton(
         to_camera = view.camera.center_mm - points
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
         cosine = np.einsum("pk,pk->p", to_camera, model)
-        row = np.flatnonzero(seen & (cosine > MIN_COSINE))
+        row = np.flatnonzero(seen & (cosine > MIN_SCAN_COSINE))
         at = _pixels(view, points[row])
         here = _sampled(layers, at)
         good = here[:, 3] > 0
@@ -460,7 +460,7 @@ def _gauss_newton(
 
 def _clustered(system: _System, p: Float64Array) -> Float64Array:
     """Return standard errors from the scatter of the gradient between cells of the surface."""
-    _, cell = np.unique(np.floor(p / CELL_MM).astype(int), axis=0, return_inverse=True)
+    _, cell = np.unique(np.floor(p / ERROR_CELL_MM).astype(int), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     sums = np.stack([np.bincount(cell, system.by_point[:, j]) for j in range(6)], axis=-1)
     used = np.count_nonzero(np.abs(sums).sum(axis=1))

@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import connected_components
 
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
-WELD_MM: Final = 1e-3
+WELD_DISTANCE_MM: Final = 1e-3
 """Vertices closer than about this are one."""
-FLAT_MM: Final = 1e-3
+MIN_TRIANGLE_HEIGHT_MM: Final = 1e-3
 """Triangles of less height are degenerate."""
 
 
@@ -124,7 +124,7 @@ def repair(mesh: TriangleMesh, *, max_hole_mm: float = 40.0) -> tuple[TriangleMe
 
 def weld(mesh: TriangleMesh) -> TriangleMesh:
     """Join vertices at the same place."""
-    grid = np.round(mesh.vertices_mm / WELD_MM).astype(np.int64)
+    grid = np.round(mesh.vertices_mm / WELD_DISTANCE_MM).astype(np.int64)
     _, first, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     return TriangleMesh(mesh.vertices_mm[first], place.reshape(-1)[mesh.faces], mesh.corner_uv)
 
@@ -212,7 +212,7 @@ def _sound(mesh: TriangleMesh) -> BoolArray:
     corners = mesh.vertices_mm[faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     twice_area = np.linalg.norm(mesh.face_vectors(), axis=1)
-    return np.asarray(differ & (twice_area > FLAT_MM * sides.max(axis=1)))
+    return np.asarray(differ & (twice_area > MIN_TRIANGLE_HEIGHT_MM * sides.max(axis=1)))
 
 
 def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:

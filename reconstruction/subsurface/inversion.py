@@ -47,7 +47,13 @@ from numpy.typing import ArrayLike, NDArray
 from model.fresnel import ETA_SKIN
 from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.subsurface import kernels, nearest
-from reconstruction.subsurface.models import METHODS, Method, Optics, ProfileModel, profile_model
+from reconstruction.subsurface.models import (
+    FIT_METHODS,
+    Method,
+    Optics,
+    ProfileModel,
+    profile_model,
+)
 from reconstruction.subsurface.outcome import SubsurfaceFit, evaluate_fits
 from reconstruction.subsurface.profile_batch import Fits, LeftOut, ProfileBatch
 from reconstruction.subsurface.profile_fit import fit_profiles
@@ -314,8 +320,8 @@ def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArra
 
 
 def _check_settings(method: str, optics: Optics, **not_negative: float) -> None:
-    if method not in METHODS:
-        raise SubsurfaceError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
+    if method not in FIT_METHODS:
+        raise SubsurfaceError(f"method: got {method!r}, expected one of {', '.join(FIT_METHODS)}")
     if optics.collection not in ("all", "fibre"):
         raise SubsurfaceError(f'collection: got {optics.collection!r}, expected "all" or "fibre"')
     if not 1.0 <= optics.eta < math.inf:

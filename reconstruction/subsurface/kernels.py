@@ -21,7 +21,7 @@ from numba import njit
 N_PARAMETERS = 4
 TABLE_MODEL = 1
 """The model is a table; anything else is a closed form."""
-_FAST = {"contract", "reassoc", "nsz"}
+_FAST_MATH = {"contract", "reassoc", "nsz"}
 _FOUR_PI = 4.0 * math.pi
 
 
@@ -43,7 +43,7 @@ def decay(x):  # type: ignore[no-untyped-def]
     return p
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _closed(theta, radius, constants, m, jac):  # type: ignore[no-untyped-def]
     """Fill reflectance and its derivatives by log sigma_a and log sigma_s'.
 
@@ -100,7 +100,7 @@ def _cubic(x, count, w, d):  # type: ignore[no-untyped-def]
     return i
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
     """Fill reflectance and derivatives by all parameters from a grid (sigma_s', root, g, fibre).
 

@@ -20,9 +20,9 @@ from reconstruction.subsurface.kernels import decay, evaluate_one
 
 MAX_LOG_STEP = 1.5
 """Largest change of a logarithm in one step."""
-STEP_TOL = 1e-5
+LOG_STEP_TOL = 1e-5
 """A step of the logarithms after which the next would change nothing that matters."""
-_FAST = {"contract", "reassoc", "nsz"}
+_FAST_MATH = {"contract", "reassoc", "nsz"}
 _MIN_REFLECTANCE = 1e-290
 
 
@@ -57,7 +57,7 @@ def _solve(h, g, chosen, count, damping, low, x):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
     total = 0.0
     if logarithmic:
@@ -71,7 +71,7 @@ def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignore[no-untyped-def]
     """Fill J'WJ and J'W residual of the active parameters; scales `jac` to logs where wanted."""
     if logarithmic:
@@ -145,7 +145,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
             model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
         )
         for round_ in range(rounds):
-            close = max(STEP_TOL, 1e-2 * 0.01**round_) if changing else STEP_TOL
+            close = max(LOG_STEP_TOL, 1e-2 * 0.01**round_) if changing else LOG_STEP_TOL
             extinction = math.exp(now[0]) + math.exp(now[1])
             base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
             for f in range(fibres):
@@ -230,7 +230,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                     if damping > 1e10:
                         settled = longest < 1e-6
                         break
-            if not changing or (first and close <= STEP_TOL):
+            if not changing or (first and close <= LOG_STEP_TOL):
                 break
         steps[n] = done if settled else -done
         chi2[n] = best

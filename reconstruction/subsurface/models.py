@@ -21,7 +21,7 @@ from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.subsurface import kernels
 
 Method = Literal["photon_table", "diffusion", "dipole"]
-METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
+FIT_METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
 Collection = Literal["all", "fibre"]
 G_SKIN, G_SKIN_SIGMA = 0.825, 0.072
 """Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""

@@ -27,7 +27,7 @@ MAX_CORRELATION = 0.9
 """Of residuals of neighbouring fibres."""
 MAX_SYMMETRIC_LOG_STDERR = 0.2
 """Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
-INTERVAL_PROBABILITY = 0.6827
+ONE_SIGMA_LEVEL = 0.6827
 """Of the interval."""
 CHANCE_SIGMAS = 2.0
 """Standard deviations of the correlation of independent neighbours up to which it says nothing."""
@@ -226,7 +226,7 @@ def evaluate_fits(
     log_stderr[nothing] = math.inf
     reach = np.full(a.shape, 1.0)
     if batch.logarithmic:  # the noise itself is known from few residuals
-        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * INTERVAL_PROBABILITY)
+        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * ONE_SIGMA_LEVEL)
     arrays = {
         "sigma_a_per_mm": a,
         "sigma_s_prime_per_mm": s,

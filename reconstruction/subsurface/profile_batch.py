@@ -19,7 +19,7 @@ SIGNAL_SIGMAS = 3.0
 """Standard deviations by which a reading exceeds 0 where it counts as observed."""
 INITIAL_DEVIATION = 0.05
 """Relative deviation of a reading for the first of the fits without a variance."""
-MAX_ROUNDS, MAX_STEPS = 4, 60
+MAX_WEIGHT_ROUNDS, MAX_ROUND_STEPS = 4, 60
 """Times the model's error is computed again, and steps of a round."""
 MIN_REFLECTANCE = 1e-290
 """Smallest prediction that has a logarithm."""
@@ -192,8 +192,8 @@ def fit_from(
         batch.prior,
         model.bounds,
         theta,
-        MAX_ROUNDS,
-        MAX_STEPS,
+        MAX_WEIGHT_ROUNDS,
+        MAX_ROUND_STEPS,
         min(get_num_threads(), max(1, n // 64)),
         covariance,
         chi2,

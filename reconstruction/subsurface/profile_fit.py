@@ -23,8 +23,8 @@ START_DEVIATION = 0.1
 """Relative error added for the comparison with starts."""
 MISFIT_P_VALUE = 1e-3
 """A chi2 that chance exceeds so rarely is a misfit."""
-OUTLIER_SIGMAS = 6.0
-MAX_OUTLIER_FRACTION = 0.1
+FIBER_OUTLIER_SIGMAS = 6.0
+MAX_FIBER_OUTLIER_FRACTION = 0.1
 """Standard deviations that make a fiber an outlier, and the fraction of fibers that may be such."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over the median of absolute deviations."""
@@ -81,14 +81,14 @@ def _with_model_error(model: ProfileModel, batch: ProfileBatch, start: Float64Ar
     y, variance, used = batch.y, batch.variance, batch.used
     wide = variance + (START_DEVIATION * np.abs(y)) ** 2
     fits = fit_from(model, batch, start, variance=wide)
-    most = np.floor(MAX_OUTLIER_FRACTION * used.sum(axis=1))
+    most = np.floor(MAX_FIBER_OUTLIER_FRACTION * used.sum(axis=1))
     for _ in range(2):
         m = np.maximum(fits.predicted, MIN_REFLECTANCE)
         off = np.abs(y - m)
         relative = np.nanmedian(np.where(batch.observed, off / m, math.nan), axis=1)
         deviation = MAD_TO_SIGMA * relative[:, None] * m
         stated = variance + model.relative_variance(fits.theta) * m**2
-        outlier = used & (off > OUTLIER_SIGMAS * np.sqrt(stated + deviation**2))
+        outlier = used & (off > FIBER_OUTLIER_SIGMAS * np.sqrt(stated + deviation**2))
         outlier &= (outlier.sum(axis=1) <= most)[:, None]
         wide = np.where(outlier, math.inf, variance + deviation**2)
         fits = fit_from(model, batch, fits.theta, variance=wide)

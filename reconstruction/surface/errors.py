@@ -18,9 +18,9 @@ from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface.estimates import PointValues
 
-MISPLACED_PX: Final = 0.27
+POSITION_SIGMA_PX: Final = 0.27
 """Standard deviation of where a sample is on the surface, over the size of a pixel."""
-UNRESOLVED_RAD: Final = np.radians(0.27)
+UNRESOLVED_RELIEF_RAD: Final = np.radians(0.27)
 """Standard deviation, in each direction, of relief that is too fine for the points.
 
 This and the one above bring intervals to their nominal coverage on simulated faces of seeds 0 to 2,
@@ -28,21 +28,21 @@ seen at 2.1 mm a pixel; see docs/decisions."""
 UNRESOLVED_R_D_PX: Final = 1.55
 """Standard error of the albedo over what it changes by in a pixel: misplaced samples, and albedo
 that is too fine for the pixels and the more of it, the more there is that is just not."""
-SHARED_DETAIL: Final = 0.8
+SHARED_DETAIL_FRACTION: Final = 0.8
 """Share of the face's typical mean square change in that of a point, the rest is its neighbors'.
 
 A few edges tell little of how much is finer than they are: where neighbors happen to look alike,
 the albedo within a pixel goes on changing as elsewhere on the face."""
-SHARED_R_D: Final = 0.007
+SHARED_R_D_ERROR: Final = 0.007
 """Relative error of the albedo that all points of a face share, of calibration and of relief within
 pixels. Faces of seeds 1 to 3 lay 0.4 to 0.6 % below the truth blurred as by their pixels.
 
 This and the two above were set on these faces (types V, I and II, 2.1 mm a pixel)."""
-R_D_BY_NORMAL: Final = 0.5
+R_D_ERROR_PER_RAD: Final = 0.5
 """Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much."""
-RINGS: Final = 2
+N_NEIGHBOR_RINGS: Final = 2
 """Rings of neighbors that the albedo's change is averaged over: one point's edges are few."""
-LEAST_SPACING_PX: Final = 0.25
+MIN_SPACING_PX: Final = 0.25
 """Points closer than this count as so far apart: noise is no slope."""
 
 
@@ -98,7 +98,7 @@ def change_per_mm(
     if noise is not None:
         square = square - np.square(noise[a]) - np.square(noise[b])
     apart = np.linalg.norm(points_mm[a] - points_mm[b], axis=1).astype(np.float64)
-    square /= np.square(np.maximum(apart, LEAST_SPACING_PX * pixel_mm))[:, None]
+    square /= np.square(np.maximum(apart, MIN_SPACING_PX * pixel_mm))[:, None]
     count = np.zeros(len(valid))
     mean = np.zeros(values.shape)
     for side in (a, b):
@@ -125,13 +125,13 @@ def of_normals(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> P
         With its triangles: they say how fast the normals turn.
     pixel_mm
         Size of an image's pixel on the subject: scan, registration and cameras together place a
-        sample within about `MISPLACED_PX` of it, and within it normals are averaged.
+        sample within about `POSITION_SIGMA_PX` of it, and within it normals are averaged.
     """
     change = change_per_mm(
         normals.values, surface.points_mm, surface.faces, normals.valid, pixel_mm=pixel_mm
     )
     bend = np.linalg.norm(change, axis=1)  # rad/mm
-    spread = np.hypot(MISPLACED_PX * pixel_mm * bend, UNRESOLVED_RAD)
+    spread = np.hypot(POSITION_SIGMA_PX * pixel_mm * bend, UNRESOLVED_RELIEF_RAD)
     stderr = np.hypot(normals.stderr, spread[:, None])
     return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)
 
@@ -156,7 +156,8 @@ def of_albedo(
     -----
     A pixel averages what is finer. The albedo of skin goes on to finer scales as it comes down to
     the pixel's, so what is lost is in proportion to what still shows between neighbors: between a
-    point's own by a part, and by `SHARED_DETAIL` between those of the whole face (their median).
+    point's own by a part, and by `SHARED_DETAIL_FRACTION` between those of the whole face (their
+    median).
     """
     change = change_per_mm(
         r_d.values,
@@ -165,12 +166,14 @@ def of_albedo(
         r_d.valid,
         pixel_mm=pixel_mm,
         noise=r_d.stderr,
-        rings=RINGS,
+        rings=N_NEIGHBOR_RINGS,
     )
     known = change[r_d.valid]
     typical = np.median(known, axis=0) if len(known) else np.zeros(change.shape[1])
-    change = np.hypot(np.sqrt(1.0 - SHARED_DETAIL) * change, np.sqrt(SHARED_DETAIL) * typical)
+    change = np.hypot(
+        np.sqrt(1.0 - SHARED_DETAIL_FRACTION) * change, np.sqrt(SHARED_DETAIL_FRACTION) * typical
+    )
     stderr = np.hypot(r_d.stderr, UNRESOLVED_R_D_PX * pixel_mm * change)
-    relative = np.hypot(SHARED_R_D, R_D_BY_NORMAL * normals.stderr[:, :1])
+    relative = np.hypot(SHARED_R_D_ERROR, R_D_ERROR_PER_RAD * normals.stderr[:, :1])
     stderr = np.hypot(stderr, relative * np.abs(r_d.values))
     return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)

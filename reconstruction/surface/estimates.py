@@ -22,24 +22,24 @@ from reconstruction.surface import model_normals
 
 CHUNK_SAMPLES: Final = 3_000_000
 """Samples of a chunk; about 60 bytes each."""
-LEAST_LIGHTS: Final = 10
-LEAST_VIEWS: Final = 2
+MIN_LIGHTS: Final = 10
+MIN_VIEWS: Final = 2
 """A point lit or seen by fewer has no estimate."""
-LEAST_COS_LIGHT: Final = 0.15
-LEAST_COS_VIEW: Final = 0.2
+MIN_NORMAL_COS_LIGHT: Final = 0.15
+MIN_NORMAL_COS_VIEW: Final = 0.2
 """Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
 GRAZING_COS: Final = 0.05
 """Light lower than this over the estimated surface is as good as none."""
-LEAST_COS_STRIP: Final = 0.05
+MIN_STRIP_COSINE: Final = 0.05
 """Flatter views count as if they were so flat; the albedo's fit leaves them out."""
-HIGHLIGHT_RAD: Final = np.radians(35.0)
+HIGHLIGHT_HALF_ANGLE_RAD: Final = np.radians(35.0)
 """Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
-PEAK_RAD: Final = np.radians(25.0)
+PEAK_HALF_ANGLE_RAD: Final = np.radians(25.0)
 """The same where the lobes are known and taken off: only their peaks are left out."""
-LOBE_ERROR: Final = 0.1
+LOBE_RELATIVE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
-LOBES_ALIKE: Final = 3.8
+LOBE_SCALE_ERROR_RATIO: Final = 3.8
 """Standard error of lobes' scale over what it were if every sample erred by itself. Samples of a
 point err alike: by the lobes' shape, the normal and the light from inside that was taken off. On
 simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
@@ -85,7 +85,7 @@ def seen_enough(samples: Lumitexels) -> BoolArray:
             hit[:, k] = samples.valid[:, index == k].any(axis=1)
         return np.count_nonzero(hit, axis=1)
 
-    return np.asarray((kinds(samples.light) >= LEAST_LIGHTS) & (kinds(samples.view) >= LEAST_VIEWS))
+    return np.asarray((kinds(samples.light) >= MIN_LIGHTS) & (kinds(samples.view) >= MIN_VIEWS))
 
 
 def collect(
@@ -136,7 +136,7 @@ def normals_from_shading(
     normals: FloatArray,
     *,
     rounds: int = 3,
-    highlight_rad: float = HIGHLIGHT_RAD,
+    highlight_rad: float = HIGHLIGHT_HALF_ANGLE_RAD,
 ) -> PointValues:
     """Return normals by robust photometric stereo of the light from inside the skin.
 
@@ -171,8 +171,8 @@ def normals_from_shading(
         cos_view = np.einsum("pmk,pk->pm", samples.view_dir, start)
         use = (
             samples.valid
-            & (cos_light > LEAST_COS_LIGHT)
-            & (cos_view > LEAST_COS_VIEW)
+            & (cos_light > MIN_NORMAL_COS_LIGHT)
+            & (cos_view > MIN_NORMAL_COS_VIEW)
             & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
         )
         # the cosine that made f from the radiance is the scan's, not that of this round
@@ -249,7 +249,7 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
     proportion to that length.
     """
     samples = at_normals(samples, normals)
-    strip = 1.0 / np.maximum(samples.cos_view, LEAST_COS_STRIP)[..., None]
+    strip = 1.0 / np.maximum(samples.cos_view, MIN_STRIP_COSINE)[..., None]
     found = diffuse_albedo.estimate(
         samples.f,
         samples.light_dir,
@@ -293,7 +293,7 @@ def lobe_weights(
     found = brdf_basis.fit_weights(surface_samples(samples, normals, r_d), basis)
     good = found.valid & normals.valid & r_d.valid
     keep = good[:, None]
-    scale = np.where(np.isfinite(found.stderr), LOBES_ALIKE * found.stderr, 1.0)
+    scale = np.where(np.isfinite(found.stderr), LOBE_SCALE_ERROR_RATIO * found.stderr, 1.0)
     residual = np.where(good, found.residual, 0.0)
     return PointValues(
         np.concatenate([np.where(keep, found.weights, 0.0), residual[:, None]], axis=1),
@@ -335,14 +335,14 @@ def normals_from_remainder(
     bare = dataclasses.replace(
         samples,
         f=samples.f - lobes[..., None],
-        variance=samples.variance + np.square(LOBE_ERROR * lobes)[..., None],
+        variance=samples.variance + np.square(LOBE_RELATIVE_ERROR * lobes)[..., None],
     )
     good = normals.valid & r_d.valid
     found = normals_from_shading(
         bare,
         np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)),
         rounds=1,
-        highlight_rad=PEAK_RAD,
+        highlight_rad=PEAK_HALF_ANGLE_RAD,
     )
     good = good & found.valid
     return _of_normals(found.values, found.stderr[:, 0], good)
@@ -382,9 +382,9 @@ def normals_from_all_light(
         r_d.values[rows].mean(axis=-1),
         weights[rows],
         basis,
-        lobe_error=LOBE_ERROR,
-        least_cos_light=LEAST_COS_LIGHT,
-        least_cos_view=LEAST_COS_VIEW,
+        lobe_error=LOBE_RELATIVE_ERROR,
+        least_cos_light=MIN_NORMAL_COS_LIGHT,
+        least_cos_view=MIN_NORMAL_COS_VIEW,
     )
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])

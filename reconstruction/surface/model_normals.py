@@ -19,15 +19,15 @@ from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
 
-STEPS: Final = 2
+N_GAUSS_NEWTON_STEPS: Final = 2
 """Of Gauss and Newton; R_d and the lobes are fitted anew in between calls."""
-HALVINGS: Final = 3
-PROBE_RAD: Final = np.radians(0.5)
+MAX_HALVINGS: Final = 3
+DIFFERENCE_RAD: Final = np.radians(0.5)
 """Tilt of the differences: about what a node of the tables spans at a highlight's flank."""
-LONGEST_RAD: Final = np.radians(3.0)
+MAX_STEP_RAD: Final = np.radians(3.0)
 """Longest step: lobes turn faster than their slope says."""
-HUBER: Final = 3.0
-SAMPLE_ERROR: Final = 0.02
+HUBER_SIGMAS: Final = 3.0
+SAMPLE_RELATIVE_ERROR: Final = 0.02
 """Relative error that every sample of the model has, for its weight."""
 
 
@@ -64,7 +64,7 @@ def estimate(
     lobe_error: float,
     least_cos_light: float,
     least_cos_view: float,
-    steps: int = STEPS,
+    steps: int = N_GAUSS_NEWTON_STEPS,
 ) -> ModelNormals:
     """Move normals to where the model's samples fit the measured ones best.
 
@@ -97,7 +97,9 @@ def estimate(
         first, second = _tangents(n)
         slope = np.stack([fit.slope(n, axis) for axis in (first, second)], axis=-1)
         pull = np.where(
-            state.misfit2 < HUBER**2, 1.0, HUBER / np.sqrt(np.maximum(state.misfit2, 1))
+            state.misfit2 < HUBER_SIGMAS**2,
+            1.0,
+            HUBER_SIGMAS / np.sqrt(np.maximum(state.misfit2, 1)),
         )
         weight = np.where(state.use, pull / state.variance, 0.0)
         normal_matrix = np.einsum("pm,pmi,pmj->pij", weight, slope, slope)
@@ -109,8 +111,8 @@ def estimate(
         safe = np.where(told[:, None, None], normal_matrix, np.eye(2))
         step = np.where(told[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
         length = np.linalg.norm(step, axis=-1, keepdims=True)
-        step *= np.minimum(1.0, LONGEST_RAD / np.maximum(length, 1e-300))
-        for _ in range(HALVINGS):
+        step *= np.minimum(1.0, MAX_STEP_RAD / np.maximum(length, 1e-300))
+        for _ in range(MAX_HALVINGS):
             tried = _unit(n + step[:, [0]] * first + step[:, [1]] * second)
             there = fit.at(tried)
             better = there.cost < state.cost
@@ -120,7 +122,7 @@ def estimate(
         valid = valid & told
     count = np.count_nonzero(state.use, axis=1)
     valid = valid & (count > 3)
-    size = np.sum(np.where(state.use, np.minimum(state.misfit2, HUBER**2), 0.0), axis=1)
+    size = np.sum(np.where(state.use, np.minimum(state.misfit2, HUBER_SIGMAS**2), 0.0), axis=1)
     inflation = np.maximum(size / np.maximum(count - 3, 1), 1.0)
     safe = np.where(valid[:, None, None], normal_matrix, np.eye(2))
     variance = 0.5 * np.trace(np.linalg.inv(safe), axis1=1, axis2=2) * inflation
@@ -168,18 +170,27 @@ class _Fit:
     def at(self, normals: Float64Array) -> _State:
         value, lobes, cos_light, cos_view = self._predicted(normals)
         use = self.samples.valid & (cos_light > self.least[0]) & (cos_view > self.least[1])
-        variance = self.noise + np.square(self.lobe_error * lobes) + np.square(SAMPLE_ERROR * value)
+        variance = (
+            self.noise
+            + np.square(self.lobe_error * lobes)
+            + np.square(SAMPLE_RELATIVE_ERROR * value)
+        )
         misfit2 = np.square(self.gray - value) / variance
-        huber = np.where(misfit2 < HUBER**2, misfit2, 2 * HUBER * np.sqrt(misfit2) - HUBER**2)
+        huber = np.where(
+            misfit2 < HUBER_SIGMAS**2,
+            misfit2,
+            2 * HUBER_SIGMAS * np.sqrt(misfit2) - HUBER_SIGMAS**2,
+        )
         # the weights move with the model: without their logarithm brighter lobes would cost less
         cost = np.where(use, huber + np.log(variance), 0.0).sum(axis=1)
         return _State(value, variance, misfit2, use, cost / np.maximum(use.sum(axis=1), 1))
 
     def slope(self, normals: Float64Array, axis: Float64Array) -> Float64Array:
         ahead, behind = (
-            self._predicted(_unit(normals + sign * PROBE_RAD * axis))[0] for sign in (1.0, -1.0)
+            self._predicted(_unit(normals + sign * DIFFERENCE_RAD * axis))[0]
+            for sign in (1.0, -1.0)
         )
-        return (ahead - behind) / (2.0 * PROBE_RAD)
+        return (ahead - behind) / (2.0 * DIFFERENCE_RAD)
 
     def _predicted(
         self, normals: Float64Array

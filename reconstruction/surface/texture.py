@@ -15,7 +15,7 @@ from reconstruction.surface import texture_fill
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture_fill import TexelMap
 
-MEASURED: Final = 0.99
+MIN_MEASURED_WEIGHT: Final = 0.99
 """A texel counts as measured where its triangle's corners are, all of them."""
 
 
@@ -78,7 +78,7 @@ class SurfaceTexture:
             filled.values.reshape(shape),
             unit,
             None if spread is None else spread.reshape(shape),
-            weight >= MEASURED,
+            weight >= MIN_MEASURED_WEIGHT,
             description,
         )
 

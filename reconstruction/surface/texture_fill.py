@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array, Int32Array
 
-SIZE_RANGE: Final = (8, 8192)
-SWEEPS: Final = 5
+FILL_SIZE_RANGE_PX: Final = (8, 8192)
+N_RELAXATION_SWEEPS: Final = 5
 """Of relaxation on each level, which bend the filled texels into a membrane (no kinks)."""
-_HASTE: Final = np.float32(1.5)
+_OVERRELAXATION: Final = np.float32(1.5)
 """Over-relaxation; below 2 it converges."""
 
 
@@ -72,8 +72,10 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
     uv = np.ascontiguousarray(corner_uv, np.float64)
     if uv.ndim != 3 or uv.shape[1:] != (3, 2) or not np.isfinite(uv).all():
         raise ValueError(f"corner_uv: got shape {uv.shape}, expected (F, 3, 2) finite numbers")
-    if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
-        raise ValueError(f"size: got {size}, expected {SIZE_RANGE[0]} to {SIZE_RANGE[1]} texels")
+    if not FILL_SIZE_RANGE_PX[0] <= size <= FILL_SIZE_RANGE_PX[1]:
+        raise ValueError(
+            f"size: got {size}, expected {FILL_SIZE_RANGE_PX[0]} to {FILL_SIZE_RANGE_PX[1]} texels"
+        )
     face, weight = _rasterize(uv, size)
     return TexelMap(face, weight)
 
@@ -191,7 +193,7 @@ def push_pull(
     filled, known = levels[-1]
     for fine, fine_weight in reversed(levels[:-1]):
         filled, known = _push(fine, fine_weight, filled, known)
-        _relax(filled, fine, fine_weight, known, SWEEPS)
+        _relax(filled, fine, fine_weight, known, N_RELAXATION_SWEEPS)
     valid = wanted & (known > 0)
     return FilledTexture(
         np.where(valid[..., None], filled, np.float32(0.0)),
@@ -377,4 +379,4 @@ def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
                     if count > 0.0:
                         mean = total / count
                         goal = w * fine[i, j, c] + (np.float32(1.0) - w) * mean
-                        filled[i, j, c] += _HASTE * (goal - filled[i, j, c])
+                        filled[i, j, c] += _OVERRELAXATION * (goal - filled[i, j, c])

@@ -78,7 +78,7 @@ class Analysis:
             "noise": _numbers([self.data.noise])[0],
             "plateau": found.plateau(),
             "plateau_by_share": {
-                f"{share:g}": found.plateau(share=share) for share in brdf_space.SHARES
+                f"{share:g}": found.plateau(share=share) for share in brdf_space.PLATEAU_FRACTIONS
             },
             "plateau_by_largest_rank": {str(most): found.plateau(most=most) for most in tops},
             "rank_at_noise": self.above_noise,
@@ -93,7 +93,7 @@ def analyse(
     *,
     by_label: bool,
     groups: Mapping[str, BoolArray] | None = None,
-    ranks: Sequence[int] = brdf_space.RANKS,
+    ranks: Sequence[int] = brdf_space.CURVE_RANKS,
     method: brdf_space.Method = "shares",
     rng: np.random.Generator,
 ) -> Analysis:
@@ -261,7 +261,7 @@ def analyse_measured(
                 by_label=False,
                 method=method,
                 rng=rng,
-                ranks=[rank for rank in brdf_space.RANKS if rank <= kept],
+                ranks=[rank for rank in brdf_space.CURVE_RANKS if rank <= kept],
             ),
             kept,
         )
@@ -285,7 +285,7 @@ def analyse_measured(
 def _up_to(one: Analysis, lobes: int) -> Analysis:
     """Say of a face's own curve why it ends where the lobes that it was reconstructed with do."""
     why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
-    beyond = tuple((rank, why) for rank in brdf_space.RANKS if rank > lobes)
+    beyond = tuple((rank, why) for rank in brdf_space.CURVE_RANKS if rank > lobes)
     curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))
     return dataclasses.replace(one, curve=curve)
 

@@ -328,9 +328,11 @@ def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinR
         )
     shape = (blood.values.shape[0], blood.values.shape[1])
     if other.landmarks is not None and other.landmarks_rig is not None:
-        from reconstruction.facial_color.rig_transfer import carried
+        from reconstruction.facial_color.rig_transfer import transfer_rig
 
-        rig = carried(rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks)
+        rig = transfer_rig(
+            rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks
+        )
     else:
         done.left_out.append(("landmarks", "none: both faces are taken to be framed alike"))
     return rig.applied_to(blood.values, valid=blood.valid, stderr=blood.stderr)

@@ -55,7 +55,7 @@ class EditRequest:
     traits
         Name to amount.
     region
-        One of `common_regions.REGIONS` that the library has: "face", "beard" or "no-beard".
+        One of `common_regions.REGION_NAMES` that the library has: "face", "beard" or "no-beard".
     parts
         Of `EDITABLE_PARTS`; None: where the library tells a trait from chance.
     mask

@@ -256,7 +256,7 @@ def _require_landmarks(faces: Sequence[Face]) -> None:
             f"landmarks: {', '.join(bare[:5])}{', ...' if len(bare) > 5 else ''} have none; mark "
             f"about 20 points of each face in a table name,x,y (texels of its maps) or name,x,y,z "
             f"(mm of its mesh), called {bare[0]}.csv, and name their folder: --landmarks DIR. "
-            f"Usual points: {', '.join(list(common_regions.STANDARD_MM)[:6])}, ..."
+            f"Usual points: {', '.join(list(common_regions.STANDARD_LANDMARKS_MM)[:6])}, ..."
         )
 
 

@@ -65,11 +65,11 @@ def choose(
     most_lights
         Largest number of lights.
     """
-    least = surface_estimates.LEAST_LIGHTS
-    if len(rig.lights) < least or len(rig.views) < surface_estimates.LEAST_VIEWS:
+    least = surface_estimates.MIN_LIGHTS
+    if len(rig.lights) < least or len(rig.views) < surface_estimates.MIN_VIEWS:
         raise PlanningError(
             f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
-            f"{least} and {surface_estimates.LEAST_VIEWS}"
+            f"{least} and {surface_estimates.MIN_VIEWS}"
         )
     look = sight(rig, subject, seed=seed)
     every_view = range(len(rig.views))
@@ -132,14 +132,14 @@ def foresee(
     seen = {name for step in plan.steps if step.kind == "olat" for name in step.cameras}
     lights = [k for k, light in enumerate(rig.lights) if light.name in lit]
     views = [k for k, view in enumerate(rig.views) if view.name in seen]
-    if len(lights) < surface_estimates.LEAST_LIGHTS or len(views) < surface_estimates.LEAST_VIEWS:
+    if len(lights) < surface_estimates.MIN_LIGHTS or len(views) < surface_estimates.MIN_VIEWS:
         raise PlanningError(
             f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
-            f"least {surface_estimates.LEAST_LIGHTS} and {surface_estimates.LEAST_VIEWS}"
+            f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
     look = sight(rig, subject, seed=seed)
     prediction = light_selection.predict(
-        look.information(views), lights, least=surface_estimates.LEAST_LIGHTS
+        look.information(views), lights, least=surface_estimates.MIN_LIGHTS
     )
     kept = rig.subset(
         lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
@@ -266,7 +266,7 @@ def _r_d_error(prediction: Prediction, look: Sight) -> float:
         return math.inf
     good = prediction.valid
     gloss = GLOSS / LIGHT_ERROR / look.r_d[good]
-    common = CALIBRATION**2 + (surface_errors.R_D_BY_NORMAL * prediction.tilt_rad[good]) ** 2
+    common = CALIBRATION**2 + (surface_errors.R_D_ERROR_PER_RAD * prediction.tilt_rad[good]) ** 2
     sigma = np.sqrt(
         np.square(prediction.log_albedo[good, None]) * (1.0 + np.square(gloss)) + common[:, None]
     )
@@ -298,11 +298,11 @@ def _fewer_views(
 ) -> tuple[list[int], Prediction]:
     """Take off cameras, the one that is missed least first, while what is wanted is reached."""
     views = list(range(look.variance.shape[2]))
-    least = surface_estimates.LEAST_LIGHTS
+    least = surface_estimates.MIN_LIGHTS
     target = math.radians(wants.get("normals", 90.0))
     if prediction.median_rad > target or prediction.valid_share < valid_share:
         return views, prediction
-    while len(views) > surface_estimates.LEAST_VIEWS:
+    while len(views) > surface_estimates.MIN_VIEWS:
         tried = []
         for view in views:
             rest = [other for other in views if other != view]

@@ -60,7 +60,7 @@ class Sight:
         seen = self.variance[..., list(views)]
         with np.errstate(divide="ignore"):
             noise = 1.0 / np.sum(1.0 / seen, axis=-1)
-        enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.LEAST_VIEWS
+        enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.MIN_VIEWS
         noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
         return light_selection.information(
             self.normals,
@@ -114,11 +114,13 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     to_view, _, seen = _toward(caster, start, normal, views)
     cos_light = np.einsum("plk,pk->pl", to_light, normal)
     cos_view = np.einsum("pvk,pk->pv", to_view, normal)
-    steep = cos_light > surface_estimates.LEAST_COS_LIGHT
-    facing = cos_view > surface_estimates.LEAST_COS_VIEW
+    steep = cos_light > surface_estimates.MIN_NORMAL_COS_LIGHT
+    facing = cos_view > surface_estimates.MIN_NORMAL_COS_VIEW
     half = to_light[:, :, None] + to_view[:, None]
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    matte = np.einsum("plvk,pk->plv", half, normal) < math.cos(surface_estimates.HIGHLIGHT_RAD)
+    matte = np.einsum("plvk,pk->plv", half, normal) < math.cos(
+        surface_estimates.HIGHLIGHT_HALF_ANGLE_RAD
+    )
 
     white = np.array([white_intensity(light, view).mean() for light in rig.lights])
     rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
@@ -136,8 +138,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
         seen,
         np.ones(len(place)),
         np.hypot(
-            surface_errors.MISPLACED_PX * pixel * _bend(face, drawn, pixel),
-            surface_errors.UNRESOLVED_RAD,
+            surface_errors.POSITION_SIGMA_PX * pixel * _bend(face, drawn, pixel),
+            surface_errors.UNRESOLVED_RELIEF_RAD,
         ),
         _averaged(surface.r_d, face.atlas, BLUR_PX * pixel)[drawn] / rgb - 1.0,
         rgb,

@@ -106,7 +106,7 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
         )
     )
     albedo = {}
-    for region in common_regions.REGIONS:
+    for region in common_regions.REGION_NAMES:
         if space_name(region) in library.spaces:
             albedo[region] = AlbedoTraits(
                 kind, _texture(library), library.spaces[space_name(region)]

@@ -177,7 +177,7 @@ def test_chromophores_of_any_pixels_are_numbers_or_masked(table, pixels, free):
     for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin", "residual"):
         assert np.isfinite(getattr(found, name)[found.valid]).all(), name
     assert not found.valid[~np.isfinite(rgb).all(axis=-1)].any()
-    weighed = chromophore_posterior.weigh(rgb, table, prior=shading_prior.of_faces())
+    weighed = chromophore_posterior.estimate(rgb, table, prior=shading_prior.of_faces())
     assert not weighed.valid[~np.isfinite(rgb).all(axis=-1)].any()
     for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin"):
         assert np.isfinite(getattr(weighed, name)[weighed.valid]).all(), name

@@ -125,7 +125,7 @@ def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_ligh
             "landmarks",
             (24, 24),
         )
-        return misplacement.own_error(times * skin, np.zeros_like(skin), valid, laid)
+        return misplacement.registration_covariance(times * skin, np.zeros_like(skin), valid, laid)
 
     one, told = error(1.0, 1.0), error(off, light)
     assert np.isfinite(told).all()
@@ -153,8 +153,8 @@ def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, 
         light.astype(np.float32), variance.astype(np.float32), good, (side, side), 6.0
     )
     assert np.isfinite(change).all()
-    assert np.all(stiffness >= 1.0 / light_change.FREE_CHANGE**2 * (1.0 - 1e-6))
-    assert np.all(stiffness <= 1.0 / light_change.LEAST_CHANGE**2 * (1.0 + 1e-6))
+    assert np.all(stiffness >= 1.0 / light_change.MAX_LIGHT_CHANGE**2 * (1.0 - 1e-6))
+    assert np.all(stiffness <= 1.0 / light_change.MIN_LIGHT_CHANGE**2 * (1.0 + 1e-6))
     middle = (change[1] - change[0]).reshape(side, side)[8:-8, 8:-8]
     # about 200 pixels within a window, less those that lack a state
     assert np.abs(middle - step).max() < 1.0 * noise + 1e-5
@@ -182,4 +182,4 @@ def test_means_of_repeats_follow_their_unit_whatever_is_masked(seed, count, unit
     np.testing.assert_allclose(told_scaled, unit**2 * told, rtol=1e-4)
     assert not mean[~known].any()
     assert (told[known] > 0.0).all()
-    assert repeat_average.excess(rgb, variance, valid) >= 1.0
+    assert repeat_average.overdispersion(rgb, variance, valid) >= 1.0

@@ -87,8 +87,8 @@ NOT_DRIVEN = {
                 "reconstruction.lumitexels.store": "gather",
                 "reconstruction.surface.model_normals": "estimate",
                 "reconstruction.photometric_stereo.refinement": "refine",
-                "reconstruction.facial_color.rig_transfer": "carried",
-                "reconstruction.scan.registration": "align photometric_normals register",
+                "reconstruction.facial_color.rig_transfer": "transfer_rig",
+                "reconstruction.scan.registration": "align register",
                 "reconstruction.registration.strain": "measure_strain",
                 "reconstruction.surface.errors": "of_albedo of_normals",
                 "reconstruction.surface.estimates": (
@@ -107,17 +107,19 @@ NOT_DRIVEN = {
                 "model.displacement_synthesis.growth": "grow lay_out",
                 "model.brdf.rgl": "of_brdf",
                 "reconstruction.brdf_basis.space": "curve",
-                "reconstruction.chromophores.reference": "fit weigh",
+                "reconstruction.chromophores.reference": "estimate fit",
                 "reconstruction.kernel_fit.errors": (
                     "nearly_as_good of_grid of_kernel widths_of_best widths_of_pair"
                 ),
-                "reconstruction.chromophores.face": "in_known_light of_colors",
+                "reconstruction.chromophores.face": (
+                    "fit_face_distribution fit_with_white_reference"
+                ),
                 "reconstruction.chromophores.face_distribution": "fit",
                 "reconstruction.kernel_fit.fit": "convolved_histogram fit_kernel",
                 "reconstruction.kernel_fit.outcome": "described",
                 "reconstruction.kernel_fit.search": "exhaustive gentlest hierarchical",
                 "reconstruction.kernel_fit.neutral_relief": "convolved",
-                "reconstruction.facial_color.shared_melanin": "weigh",
+                "reconstruction.facial_color.shared_melanin": "estimate_shared_melanin",
                 "reconstruction.kernel_fit.two_axes": "fit_two_axes",
                 "reconstruction.wrinkles.fit": "differences fit fit_weights wrinkle_map",
                 "reconstruction.wrinkles.weights": "equations_of zone_equations zone_weights",

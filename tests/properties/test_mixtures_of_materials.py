@@ -258,8 +258,8 @@ def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(see
 def test_errors_that_all_pixels_share_add_in_squares_in_either_sense(steps):
     def face(melanin, blood):
         return face_distribution.FaceDistribution(
-            face_distribution.Bell(melanin, 0.3, 0.01, -9.0, 0.0),
-            face_distribution.Bell(blood, 0.1, 0.01, 0.0, 1.0),
+            face_distribution.ContaminatedNormal(melanin, 0.3, 0.01, -9.0, 0.0),
+            face_distribution.ContaminatedNormal(blood, 0.1, 0.01, 0.0, 1.0),
         )
 
     usual = face(-3.0, 0.4)
@@ -288,15 +288,15 @@ def test_spots_are_those_of_any_unit_and_nothing_else_than_skin(seed, size, unit
     light[dropped] = bad
     kept = light.copy()
     valid = rng.random(size) < 0.9
-    found = dark_spots.darker_than_around(light, valid=valid)
+    found = dark_spots.is_locally_dark(light, valid=valid)
     np.testing.assert_array_equal(light, kept)
     assert found.shape == size
     assert not found[~valid].any()
     if bad != 5e-324:
         assert not found[dropped].any()
-        again = dark_spots.darker_than_around(light / 10.0**unit, valid=valid)
+        again = dark_spots.is_locally_dark(light / 10.0**unit, valid=valid)
         assert np.sum(again != found) <= 2  # ties that rounding decides
-    assert not dark_spots.darker_than_around(light, variance=np.inf, valid=valid).any()
+    assert not dark_spots.is_locally_dark(light, variance=np.inf, valid=valid).any()
 
 
 @CHEAP
@@ -309,18 +309,18 @@ def test_a_mixture_lies_halfway_and_holds_both(pair, errors, where):
     def weighed(value, error):
         each = np.full(1, value, np.float32), np.full(1, error, np.float32)
         one, yes = np.ones(1, np.float32), np.ones(1, bool)
-        return chromophore_posterior.WeighedChromophores(
+        return chromophore_posterior.ChromophorePosterior(
             each[0], each[0], one, each[1], each[1], one, one, ~yes, yes
         )
 
     face, alone = (weighed(*each) for each in zip(pair, errors, strict=True))
-    lighter = dark_spots.lighter_by_itself(face, alone)
-    assert not (lighter & dark_spots.lighter_by_itself(alone, face)).any()
+    lighter = dark_spots.is_lighter_than_face_prior(face, alone)
+    assert not (lighter & dark_spots.is_lighter_than_face_prior(alone, face)).any()
     assert not lighter.any() or pair[1] < pair[0]
     unknown = weighed(np.nan, np.nan)
-    assert not dark_spots.lighter_by_itself(face, unknown).any()
-    assert not dark_spots.lighter_by_itself(unknown, alone).any()
-    found = dark_spots.either(face, alone, [where])
+    assert not dark_spots.is_lighter_than_face_prior(face, unknown).any()
+    assert not dark_spots.is_lighter_than_face_prior(unknown, alone).any()
+    found = dark_spots.average_hypotheses(face, alone, [where])
     if not where:
         assert (found.melanin[0], found.stderr_hemoglobin[0]) == (pair[0], errors[0])
         return

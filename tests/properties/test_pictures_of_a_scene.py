@@ -154,21 +154,23 @@ def test_a_list_in_its_order_is_found_to_be_so_in_any_unit(seed, lights, gain, d
 def test_local_contrast_knows_no_unit_and_no_number_that_is_none(seed, sides, unit, bad):
     rng = np.random.default_rng(seed)
     image = rng.random([side + 15 for side in sides])
-    plain = registration.evened(image)
-    scaled = registration.evened(unit * image).astype(int)
+    plain = registration.normalize_local_contrast(image)
+    scaled = registration.normalize_local_contrast(unit * image).astype(int)
     assert np.abs(scaled - plain).max() <= 1
     holed, dark = image.copy(), image.copy()
     holed[3, 4], dark[3, 4] = bad, 0.0
-    np.testing.assert_array_equal(registration.evened(holed), registration.evened(dark))
+    np.testing.assert_array_equal(
+        registration.normalize_local_contrast(holed), registration.normalize_local_contrast(dark)
+    )
     with pytest.raises(registration.RegistrationError):
-        registration.evened(image[:15])
+        registration.normalize_local_contrast(image[:15])
 
 
 @FEW
 @given(seed=SEED, count=st.integers(0, 30), bad=NO_NUMBER)
 def test_points_are_chosen_inside_once_a_cell_and_followed_onto_themselves(seed, count, bad):
     rng = np.random.default_rng(seed)
-    even = registration.evened(rng.random((64, 72)))
+    even = registration.normalize_local_contrast(rng.random((64, 72)))
     points = rng.uniform(-5.0, 80.0, (60, 2))
     points[7, 0] = bad
     chosen = registration.textured(even, points, count=count)
@@ -185,7 +187,7 @@ def test_points_are_chosen_inside_once_a_cell_and_followed_onto_themselves(seed,
 @given(seed=SEED, error=st.floats(0.0, 5.0))
 def test_a_picture_is_where_it_is(seed, error):
     rng = np.random.default_rng(seed)
-    even = registration.evened(rng.random((40, 48)))
+    even = registration.normalize_local_contrast(rng.random((40, 48)))
     here, there = dense_flow.grid(even.shape), np.ones(even.shape, bool)
     np.testing.assert_array_equal(dense_flow.bilinear(even, here), even)
     valid = rng.random(even.shape) < 0.95

@@ -120,7 +120,7 @@ def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(
     valid = np.stack([smiling.valid, seen])
     truth = smiling.hemoglobin_at_rest - smiling.hemoglobin
     part = (slice(96, 160), slice(80, 176))  # cheeks, to be quick
-    joint = shared_melanin.weigh(
+    joint = shared_melanin.estimate_shared_melanin(
         both[:, *part],
         colors,
         prior=prior,
@@ -129,7 +129,7 @@ def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
     )
     each = [
-        chromophore_posterior.weigh(
+        chromophore_posterior.estimate(
             both[k][part], colors, prior=prior, variance=noise[k][part], valid=valid[k][part]
         )
         for k in (0, 1)

@@ -92,7 +92,7 @@ def test_melanin_that_all_states_share_has_less_noise_than_that_of_one(fitted, f
     )
     one = store.read(tmp_path / "one")
     seen, built = one.maps["diffuse"], one.parameters["color_table"]
-    alone = chromophore_posterior.weigh(
+    alone = chromophore_posterior.estimate(
         np.where(seen.valid[..., None], seen.values, np.nan),
         color_table.build(built["camera"], built["illuminant"], anisotropy=ANISOTROPY_SKIN),
         prior=shading_prior.of_faces(),

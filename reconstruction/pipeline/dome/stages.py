@@ -227,8 +227,8 @@ def _dome(evidence: Evidence) -> Dome:
     evidence.noted["held_out"] = held.record()
     if held:
         for field, there, least in (
-            ("lights", images.lights, estimates.LEAST_LIGHTS),
-            ("views", images.views, estimates.LEAST_VIEWS),
+            ("lights", images.lights, estimates.MIN_LIGHTS),
+            ("views", images.views, estimates.MIN_VIEWS),
         ):
             left = len(there) - len(getattr(held, field))
             if left < least:
@@ -268,13 +268,13 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
 def _require(dome: Dome) -> None:
     """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
-    if views < estimates.LEAST_VIEWS:
+    if views < estimates.MIN_VIEWS:
         raise EvidenceError(
-            f"views: got images of {views}, expected at least {estimates.LEAST_VIEWS}"
+            f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}"
         )
-    if lights < estimates.LEAST_LIGHTS:
+    if lights < estimates.MIN_LIGHTS:
         raise EvidenceError(
-            f"lights: got {lights} that can be used, expected at least {estimates.LEAST_LIGHTS}"
+            f"lights: got {lights} that can be used, expected at least {estimates.MIN_LIGHTS}"
         )
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_spread(place / np.linalg.norm(place, axis=1, keepdims=True))

@@ -173,7 +173,7 @@ def fit(
     prior = shading_prior.of_faces()
     if not subject.has_white:
         prior = prior.broadened(EXPOSURE_SPREAD)
-    shared = shared_melanin.weigh(
+    shared = shared_melanin.estimate_shared_melanin(
         np.stack([average[0] for average in averages]),
         table,
         prior=prior,
@@ -352,7 +352,7 @@ def _own_error(images: list[AlignedImage]) -> Float64Array:
     for one in images:
         count += one.valid
         if one.alignment is not None:
-            total += misplacement.own_error(
+            total += misplacement.registration_covariance(
                 one.rgb,
                 one.variance,
                 one.valid,

@@ -170,14 +170,14 @@ def _places(
         return perfusion_curves.usual_places(skin)
     table = landmark_table.read(evidence.landmarks)
     found = {}
-    for name in perfusion_curves.PLACES:
+    for name in perfusion_curves.FACE_PLACES:
         named = name if name in table else ALIASES.get(name, name)
         if named in table:
             found[name] = table[named]
     if not found:
         raise EvidenceError(
             f"{evidence.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
-            f"{', '.join((*perfusion_curves.PLACES, *ALIASES.values()))}"
+            f"{', '.join((*perfusion_curves.FACE_PLACES, *ALIASES.values()))}"
         )
     return found
 

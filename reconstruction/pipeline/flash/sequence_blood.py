@@ -130,7 +130,7 @@ def _of_place(
     at = {name: (place[0] - left, place[1] - top)}
 
     def weighed(frames: BoolArray, smooth_px: float | None) -> DiscMeans:
-        blood = shared_melanin.weigh(
+        blood = shared_melanin.estimate_shared_melanin(
             np.where(valid[frames][..., None], rgb[frames], np.nan),
             light.table,
             prior=light.prior,

@@ -359,17 +359,21 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     face = (
         None
         if inputs.white is None
-        else face_chromophores.in_known_light(rgb, table, variance=variance, model_error=errors)
+        else face_chromophores.fit_with_white_reference(
+            rgb, table, variance=variance, model_error=errors
+        )
     )
-    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior)
+    known = partial(chromophore_posterior.estimate, rgb, table, prior=prior)
     found = by_face = known(face=face, variance=variance, model_error=errors)
     noise_alone = known(face=face, variance=variance)
     if face is not None:  # moles, lips and lids may be no skin of that face's usual kind
         alone = known(variance=variance, model_error=errors)
-        spots = dark_spots.darker_than_around(rgb, variance=variance)
-        spots |= dark_spots.lighter_by_itself(by_face, alone)
-        found = dark_spots.either(by_face, alone, spots)
-        noise_alone = dark_spots.either(noise_alone, known(variance=variance, valid=spots), spots)
+        spots = dark_spots.is_locally_dark(rgb, variance=variance)
+        spots |= dark_spots.is_lighter_than_face_prior(by_face, alone)
+        found = dark_spots.average_hypotheses(by_face, alone, spots)
+        noise_alone = dark_spots.average_hypotheses(
+            noise_alone, known(variance=variance, valid=spots), spots
+        )
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:

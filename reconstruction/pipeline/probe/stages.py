@@ -20,7 +20,7 @@ from model.fresnel import ETA_SKIN
 from model.skin import SkinMap
 from reconstruction import subsurface
 from reconstruction.anisotropy import estimation as anisotropy
-from reconstruction.anisotropy.direction_harmonics import LEAST_DIRECTIONS
+from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
 from reconstruction.anisotropy.one_direction_bias import one_direction_bias
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 from reconstruction.pipeline import graph as stages
@@ -325,7 +325,7 @@ def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Arra
     """
     found = np.array(unlike)
     for group in _turns(profiles).values():
-        if len({profiles[k].measurement.placement.angle_deg for k in group}) >= LEAST_DIRECTIONS:
+        if len({profiles[k].measurement.placement.angle_deg for k in group}) >= MIN_DIRECTIONS:
             dims = (factor[group] < 1.0).all(axis=0)
             found[group] = dims & (2 * unlike[group].sum(axis=0) > len(group))
     return found
@@ -440,10 +440,10 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
     skipped: list[str] = []
     for (site, repeat), group in _turns([fit.profile for fit in fits]).items():
         own = [fits[number] for number in group]
-        if len(own) < LEAST_DIRECTIONS:
+        if len(own) < MIN_DIRECTIONS:
             skipped.append(
                 f"{site}, repeat {repeat}: {len(own)} directions, expected at least "
-                f"{LEAST_DIRECTIONS}"
+                f"{MIN_DIRECTIONS}"
             )
             continue
         angle = np.radians([fit.profile.measurement.placement.angle_deg for fit in own])

@@ -14,7 +14,7 @@ from capture.plan.phases import phases
 from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.facial_color.perfusion_curves import FALSE_ALARM, transition
+from reconstruction.facial_color.perfusion_curves import TRANSITION_FALSE_ALARM_RATE, transition
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
@@ -217,7 +217,9 @@ def _limits(
     spent_s = time.process_time() - begin
     bound_s = next(train for train in trains if train.captures == 44).bound_s()
     # three binomial standard deviations beyond the stated rates
-    beyond = 3 * float(np.sqrt(FALSE_ALARM * (1 - FALSE_ALARM) / runs))
+    beyond = 3 * float(
+        np.sqrt(TRANSITION_FALSE_ALARM_RATE * (1 - TRANSITION_FALSE_ALARM_RATE) / runs)
+    )
     return (
         Limit("phases met by 22 captures every 5.5 s", half.distinct, 20, ">="),
         Limit("phases met by 44 captures every 10.25 s", quarter.distinct, 40, ">="),
@@ -231,7 +233,7 @@ def _limits(
         Limit(
             "rate of transitions seen where there is none",
             alarms / runs,
-            FALSE_ALARM + beyond,
+            TRANSITION_FALSE_ALARM_RATE + beyond,
             "<=",
         ),
         Limit(

@@ -42,7 +42,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
 
     def alone() -> Float64Array:
         each = [
-            chromophore_posterior.weigh(
+            chromophore_posterior.estimate(
                 rgb[k],
                 colors,
                 prior=prior,
@@ -55,7 +55,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
     def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
-        return shared_melanin.weigh(
+        return shared_melanin.estimate_shared_melanin(
             rgb[:count],
             colors,
             prior=prior,
@@ -146,7 +146,7 @@ def _on_skin(
     face, mask = face_of(preset, side, seed=3), oval(side)
     blood = np.stack([face.hemoglobin(state) for state in STATES[:3]]).astype(np.float64)
     rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
-    found = shared_melanin.weigh(
+    found = shared_melanin.estimate_shared_melanin(
         rgb,
         colors,
         prior=prior,
@@ -180,7 +180,9 @@ def _melanin_limits(colors: ColorTable, prior: ShadingPrior) -> tuple[Limit, ...
     for count in (1, 7):
         clean = 0.6 * np.broadcast_to(colors.lookup(0.02, 0.025), (count, 4000, 3))
         seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
-        found = shared_melanin.weigh(seen, colors, prior=prior, variance=(2e-3 * clean) ** 2)
+        found = shared_melanin.estimate_shared_melanin(
+            seen, colors, prior=prior, variance=(2e-3 * clean) ** 2
+        )
         variances[count] = float(found.melanin.var())
     return (
         Limit(
@@ -202,7 +204,7 @@ def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Float64Array
     seconds = []
     for _ in range(2):
         begin = time.process_time()
-        shared_melanin.weigh(
+        shared_melanin.estimate_shared_melanin(
             rgb,
             colors,
             prior=prior,

@@ -1,7 +1,8 @@
 """Trials of the flash rig's intervals: chromophores, and how blood changes with a state.
 
 Stated errors are of people who do not stand exactly where the white tile stood
-(`reconstruction.chromophores.shading_prior.SOFTNESS`), and so each subject is drawn a place off it.
+(`reconstruction.chromophores.shading_prior.LOG_SHADING_SOFTNESS`), and so each subject is drawn a
+place off it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ FACTOR_95: Final = 2.4
 """Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
 subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
 
-STANCE_SHARE: Final = 0.5 * shading_prior.SOFTNESS
+STANCE_SHARE: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
 """Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
 what the stated errors take it for. Light goes with the square of the distance."""
 _STANCE: Final = 1

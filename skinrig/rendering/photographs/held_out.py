@@ -17,7 +17,7 @@ from reconstruction.pipeline.dome.registration import register
 from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.hold_out import HoldOut
 from reconstruction.scan.repair import TriangleMesh
-from reconstruction.surface.estimates import LEAST_LIGHTS
+from reconstruction.surface.estimates import MIN_LIGHTS
 from skinrig.rendering.camera import Camera, binned
 from skinrig.rendering.geometry import own_mesh
 from skinrig.rendering.lights import Light
@@ -166,10 +166,10 @@ def _where_the_head_is(dome: Dome, appearance: SkinAppearance) -> tuple[Dome, st
     mesh = own_mesh(appearance)
     welded, index = np.unique(mesh.vertices_mm.round(4), axis=0, return_inverse=True)
     lights = int(np.count_nonzero(dome.lights.valid))
-    if lights < LEAST_LIGHTS:
+    if lights < MIN_LIGHTS:
         return dome, (
             "the head sits where it sat in the session that was fitted: "
-            f"{lights} lights are too few to find it, {LEAST_LIGHTS} would do"
+            f"{lights} lights are too few to find it, {MIN_LIGHTS} would do"
         )
     fit = register(dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces]))
     turn_deg = np.degrees(np.arccos(np.clip((np.trace(fit.rotation) - 1) / 2, -1, 1)))

@@ -118,9 +118,9 @@ def test_a_pixel_whose_noise_is_no_number_spoils_no_others_misplacement(skin, no
     variance = np.full(skin.shape, 1e-5)
     without = there.copy()
     without[20, 20] = False
-    wanted = misplacement.own_error(skin, variance, without, laid)
+    wanted = misplacement.registration_covariance(skin, variance, without, laid)
     variance[20, 20, 1] = noise
-    found = misplacement.own_error(skin, variance, there, laid)
+    found = misplacement.registration_covariance(skin, variance, there, laid)
     np.testing.assert_array_equal(found, wanted)
     assert (found[20, 20] == 0.0).all()
     assert found[10, 10, 0, 0] > 0.0

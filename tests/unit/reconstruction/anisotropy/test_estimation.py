@@ -73,13 +73,13 @@ def test_isotropic_tissue_is_flagged_at_the_stated_rate(rng, angle, spread, erro
     for rate in (0.05, 0.01, 0.001):
         # an outlier left out by mistake may add its own rate
         alarms = (found.p_value < rate).sum()
-        assert alarms <= most_of(NULL_CASES, rate + direction_harmonics.OUTLIER_RATE)
+        assert alarms <= most_of(NULL_CASES, rate + direction_harmonics.OUTLIER_FALSE_ALARM_RATE)
     assert (found.p_value < 0.05).sum() >= stats.binom.ppf(1e-6, NULL_CASES, 0.05)
 
 
 def test_errors_stated_too_small_raise_no_false_alarm_unless_they_are_taken_at_their_word(rng):
     values, stderr = null(rng, SIXTEEN)
-    limit = most_of(NULL_CASES, 0.01 + direction_harmonics.OUTLIER_RATE)
+    limit = most_of(NULL_CASES, 0.01 + direction_harmonics.OUTLIER_FALSE_ALARM_RATE)
     assert (estimate(SIXTEEN, values, stderr / 3).p_value < 0.01).sum() <= limit
     trusting = estimate(SIXTEEN, values, stderr / 3, errors="absolute")
     assert (trusting.p_value < 0.01).sum() > 5 * limit
@@ -92,20 +92,25 @@ def test_one_bad_direction_is_no_anisotropy(rng, size):
     values, stderr = null(rng, SIXTEEN)
     values[3] += size * stderr[3]
     found = estimate(SIXTEEN, values, stderr)
-    limit = most_of(NULL_CASES, 0.01 + direction_harmonics.OUTLIER_RATE)
+    limit = most_of(NULL_CASES, 0.01 + direction_harmonics.OUTLIER_FALSE_ALARM_RATE)
     assert (found.p_value < 0.01).sum() <= limit
     kept = estimate(SIXTEEN, values, stderr, outliers=False, errors="absolute")
     if size >= 5:
         assert (kept.p_value < 0.01).sum() > limit
     if size == 30:
         assert found.outlier[3].all()
-        assert found.outlier.sum() <= NULL_CASES * (1 + 1.5 * direction_harmonics.OUTLIER_RATE) + 30
+        assert (
+            found.outlier.sum()
+            <= NULL_CASES * (1 + 1.5 * direction_harmonics.OUTLIER_FALSE_ALARM_RATE) + 30
+        )
 
 
 def test_good_directions_are_left_out_at_the_stated_rate(rng):
     values, stderr = null(rng, SIXTEEN, cases=8000)
     found = estimate(SIXTEEN, values, stderr)
-    assert found.outlier.any(axis=0).sum() <= most_of(8000, direction_harmonics.OUTLIER_RATE)
+    assert found.outlier.any(axis=0).sum() <= most_of(
+        8000, direction_harmonics.OUTLIER_FALSE_ALARM_RATE
+    )
 
 
 def test_ratio_and_axis_are_within_their_standard_errors(rng):

@@ -71,7 +71,9 @@ def test_coefficients_that_are_a_tenth_off_hardly_change_the_ratio():
             sigma_a_per_mm=factor_a * SIGMA_A,
             sigma_s_prime_per_mm=factor_s * SIGMA_S_PRIME,
         )
-        assert np.log(found.ratio) == pytest.approx(np.log(1.3), rel=profile_comparison.MODEL_ERROR)
+        assert np.log(found.ratio) == pytest.approx(
+            np.log(1.3), rel=profile_comparison.LOG_RATIO_MODEL_ERROR
+        )
 
 
 def test_profiles_of_isotropic_tissue_are_flagged_at_the_stated_rate(rng):
@@ -90,7 +92,7 @@ def test_profiles_tell_the_ratio_within_its_standard_error(rng):
     seen, variance = read(rng, truth, 500)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, **MEDIUM)
     # the truth is the table's own, so that the model's error has no part in it
-    of_model = profile_comparison.MODEL_ERROR * found.ratio * np.log(found.ratio)
+    of_model = profile_comparison.LOG_RATIO_MODEL_ERROR * found.ratio * np.log(found.ratio)
     stderr = np.sqrt(found.ratio_stderr**2 - of_model**2)
     off = np.abs(np.angle(np.exp(2j * (found.axis_rad - 2.5)))) / 2
     # 68 % of 500, but for a chance of 1e-6
@@ -110,7 +112,9 @@ def test_far_fibres_lost_in_noise_do_not_tilt_the_answer(rng):
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, lost, variance + noise**2, **MEDIUM)
     mean = np.log(found.ratio).mean()
     error = np.log(found.ratio).std() / np.sqrt(200)
-    assert abs(mean - np.log(1.3)) < 4.9 * error + profile_comparison.MODEL_ERROR * np.log(1.3)
+    assert abs(
+        mean - np.log(1.3)
+    ) < 4.9 * error + profile_comparison.LOG_RATIO_MODEL_ERROR * np.log(1.3)
 
 
 def test_readings_that_do_not_count_may_be_anything(rng):

@@ -6,10 +6,14 @@ import pytest
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import shading_prior
-from reconstruction.chromophores.dark_spots import darker_than_around, either, lighter_by_itself
-from reconstruction.chromophores.face import of_colors
+from reconstruction.chromophores.dark_spots import (
+    average_hypotheses,
+    is_lighter_than_face_prior,
+    is_locally_dark,
+)
+from reconstruction.chromophores.face import fit_face_distribution
 from reconstruction.chromophores.inversion import ChromophoreError
-from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.posterior import estimate
 
 NOISE = 0.004
 SIDE = 90
@@ -33,7 +37,7 @@ def smooth(rng, shape, length):
 
 def as_on_faces(field):
     """Return light that is distributed as on faces, in the order of a field."""
-    prior = shading_prior.of_faces(softness=shading_prior.SHARPEST)
+    prior = shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS)
     below = np.concatenate([[0.0], np.cumsum(prior.density)])
     edges = prior.low + prior.step * (np.arange(below.size) - 0.5)
     ranks = (field.ravel().argsort().argsort() + 0.5) / field.size
@@ -72,22 +76,22 @@ def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, exp
     """A face by itself does not hold some of the moles within 2.4 standard errors."""
     truth, moles, shades, rgb = spotted(table, melanin, mole_melanin, rng)
     variance, error = np.square(NOISE * rgb), 5e-5 * np.eye(3)
-    face = of_colors(
+    face = fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
         common_light=0.1,
         variance=variance,
         model_error=error,
     )
     prior = shading_prior.of_faces()
-    by_face = weigh(rgb, table, prior=prior, face=face, variance=variance, model_error=error)
-    spots = darker_than_around(rgb, variance=variance)
-    alone = weigh(rgb, table, prior=prior, variance=variance, model_error=error, valid=spots)
-    found = either(by_face, alone, spots)
+    by_face = estimate(rgb, table, prior=prior, face=face, variance=variance, model_error=error)
+    spots = is_locally_dark(rgb, variance=variance)
+    alone = estimate(rgb, table, prior=prior, variance=variance, model_error=error, valid=spots)
+    found = average_hypotheses(by_face, alone, spots)
 
-    def held(estimate, where):
-        away = np.abs(estimate.melanin - truth) / estimate.stderr_melanin
+    def held(result, where):
+        away = np.abs(result.melanin - truth) / result.stderr_melanin
         return np.mean(away[where & found.valid] < 2.4)
 
     assert (held(by_face, moles) < 0.5) == explained_away
@@ -119,23 +123,23 @@ def test_lips_are_not_explained_away_as_usual_skin_with_less_blood(table, melani
     clean = light[..., None] * table.lookup(c_m, table.c_hd_max * blood**3)
     rgb = clean * (1 + NOISE * rng.standard_normal(clean.shape))
     variance, error, prior = np.square(NOISE * rgb), 5e-5 * np.eye(3), shading_prior.of_faces()
-    face = of_colors(
+    face = fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
         common_light=0.1,
         variance=variance,
         model_error=error,
     )
     by_face, alone = (
-        weigh(rgb, table, prior=prior, face=one, variance=variance, model_error=error)
+        estimate(rgb, table, prior=prior, face=one, variance=variance, model_error=error)
         for one in (face, None)
     )
-    lighter = lighter_by_itself(by_face, alone)
-    found = either(by_face, alone, lighter)
+    lighter = is_lighter_than_face_prior(by_face, alone)
+    found = average_hypotheses(by_face, alone, lighter)
 
-    def held(estimate):
-        return np.mean(np.abs(estimate.melanin - c_m)[lips] < estimate.stderr_melanin[lips])
+    def held(result):
+        return np.mean(np.abs(result.melanin - c_m)[lips] < result.stderr_melanin[lips])
 
     assert held(by_face) < 0.4
     assert held(found) > 0.5
@@ -144,9 +148,11 @@ def test_lips_are_not_explained_away_as_usual_skin_with_less_blood(table, melani
 
 def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
     rgb = 0.7 * table.lookup(np.full((1, 8), 0.05), np.full((1, 8), 0.02))
-    first = weigh(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
-    second = weigh(0.5 * rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
-    found = either(first, second, np.ones((1, 8), bool))
+    first = estimate(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
+    second = estimate(
+        0.5 * rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb)
+    )
+    found = average_hypotheses(first, second, np.ones((1, 8), bool))
     draws = np.concatenate(
         [
             rng.normal(each.melanin[0, 0], each.stderr_melanin[0, 0], 100_000)
@@ -160,10 +166,10 @@ def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
 def test_slopes_of_light_and_noise_are_no_spots(rng):
     """One square holds a slope alike on both sides; 3 deviations leave 1 pixel in 700 by chance."""
     slope = np.exp(np.linspace(0, 1.2, 120))[None, :, None] * np.ones((120, 120, 3))
-    assert not darker_than_around(slope).any()
+    assert not is_locally_dark(slope).any()
     noisy = 1 + 0.15 * rng.standard_normal((120, 120, 3))
-    assert np.mean(darker_than_around(noisy)) > 0.02
-    told = darker_than_around(noisy, variance=np.full(3, 0.15**2))
+    assert np.mean(is_locally_dark(noisy)) > 0.02
+    told = is_locally_dark(noisy, variance=np.full(3, 0.15**2))
     assert np.mean(told) < 0.01
 
 
@@ -174,7 +180,7 @@ def test_blocks_find_what_every_pixel_by_itself_finds(size, rng):
     row, column = np.mgrid[:size, :size]
     mole = np.hypot(row - size / 2, column - size / 3) <= max(size / 100, 1)
     light[mole] *= 0.6
-    found = darker_than_around(light.astype(np.float32))
+    found = is_locally_dark(light.astype(np.float32))
     assert found[mole].all()
     assert found[~mole].mean() < 0.01
 
@@ -186,26 +192,26 @@ def test_what_is_no_skin_is_no_spot_and_takes_no_part():
     valid = np.ones((30, 30), bool)
     light[:, 25:] = 100.0
     valid[:, 25:] = False
-    found = darker_than_around(light, valid=valid)
+    found = is_locally_dark(light, valid=valid)
     assert np.argwhere(found).tolist() == [[10, 10]]
-    assert not darker_than_around(light, valid=np.zeros((30, 30), bool)).any()
-    assert darker_than_around(np.ones((0, 5, 3))).shape == (0, 5)
-    assert not darker_than_around(light, variance=np.nan, valid=valid).any()
+    assert not is_locally_dark(light, valid=np.zeros((30, 30), bool)).any()
+    assert is_locally_dark(np.ones((0, 5, 3))).shape == (0, 5)
+    assert not is_locally_dark(light, variance=np.nan, valid=valid).any()
 
 
 def pixels(count):
     """Weigh some pixels of one color."""
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
-    return weigh(np.full((count, 3), 0.3), table, prior=shading_prior.of_faces())
+    return estimate(np.full((count, 3), 0.3), table, prior=shading_prior.of_faces())
 
 
 @pytest.mark.parametrize(
     ("call", "what"),
     [
-        (lambda: darker_than_around(np.ones((3, 3))), "colors"),
-        (lambda: darker_than_around(np.ones((3, 3, 3)), valid=np.ones(3)), "valid"),
-        (lambda: darker_than_around(np.ones((3, 3, 3)), variance=np.ones(4)), "variance"),
-        (lambda: lighter_by_itself(pixels(2), pixels(3)), "alone"),
+        (lambda: is_locally_dark(np.ones((3, 3))), "colors"),
+        (lambda: is_locally_dark(np.ones((3, 3, 3)), valid=np.ones(3)), "valid"),
+        (lambda: is_locally_dark(np.ones((3, 3, 3)), variance=np.ones(4)), "variance"),
+        (lambda: is_lighter_than_face_prior(pixels(2), pixels(3)), "alone"),
     ],
 )
 def test_shapes_that_do_not_fit_are_named(call, what):
@@ -215,6 +221,6 @@ def test_shapes_that_do_not_fit_are_named(call, what):
 
 def test_estimates_of_other_pixels_are_refused(table):
     rgb = table.lookup(np.full((2, 3), 0.05), np.full((2, 3), 0.02))
-    found = weigh(rgb, table, prior=shading_prior.of_faces())
+    found = estimate(rgb, table, prior=shading_prior.of_faces())
     with pytest.raises(ChromophoreError, match="where"):
-        either(found, found, np.ones((3, 2), bool))
+        average_hypotheses(found, found, np.ones((3, 2), bool))

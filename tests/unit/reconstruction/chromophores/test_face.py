@@ -8,11 +8,11 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import reference as chromophore_reference
 from reconstruction.chromophores import shading_prior
-from reconstruction.chromophores.face import of_colors
-from reconstruction.chromophores.face_distribution import Bell, FaceDistribution
+from reconstruction.chromophores.face import fit_face_distribution
+from reconstruction.chromophores.face_distribution import ContaminatedNormal, FaceDistribution
 from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
-from reconstruction.chromophores.posterior import weigh
-from reconstruction.chromophores.start import LOWEST
+from reconstruction.chromophores.posterior import estimate
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
 NOISE = 0.004
 
@@ -24,7 +24,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def prior():
-    return shading_prior.of_faces(softness=shading_prior.SHARPEST)
+    return shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS)
 
 
 def face(table, prior, melanin, count, rng, spread=0.15):
@@ -39,9 +39,10 @@ def face(table, prior, melanin, count, rng, spread=0.15):
 
 
 def known_face(table, melanin, spread, blood, blood_spread):
-    ends = np.log(table.c_m_max * LOWEST**3), np.log(table.c_m_max)
+    ends = np.log(table.c_m_max * MIN_AXIS_FRACTION**3), np.log(table.c_m_max)
     return FaceDistribution(
-        Bell(np.log(melanin), spread, 0.02, *ends), Bell(blood, blood_spread, 0.04, LOWEST, 1.0)
+        ContaminatedNormal(np.log(melanin), spread, 0.02, *ends),
+        ContaminatedNormal(blood, blood_spread, 0.04, MIN_AXIS_FRACTION, 1.0),
     )
 
 
@@ -52,7 +53,7 @@ def test_the_kernel_sums_what_plain_numpy_sums_under_a_face(table, prior, rng):
     rgb = light[:, None] * table.lookup(melanin, np.tile([0.018, 0.03, 0.025], 5))
     rgb *= 1.0 + NOISE * rng.standard_normal(rgb.shape)
     covariance = without_brightness(1e-12 * np.eye(3)) + NOISE**2 * np.eye(3)
-    covariance += chromophore_posterior.FINEST**2 * np.eye(3)
+    covariance += chromophore_posterior.MIN_RELATIVE_NOISE**2 * np.eye(3)
     for k in range(5):
         here = slice(3 * k, 3 * k + 3)
         true = melanin[3 * k]
@@ -61,12 +62,12 @@ def test_the_kernel_sums_what_plain_numpy_sums_under_a_face(table, prior, rng):
             known_face(table, min(1.3 * true, 0.49), 0.15, 0.4, 0.05),
             known_face(table, true, 0.3, 0.4, 0.12),
         ):
-            found = weigh(
+            found = estimate(
                 rgb[here], table, prior=prior, face=known, variance=(NOISE * rgb[here]) ** 2
             )
             slow = np.array(
                 [
-                    chromophore_reference.weigh(
+                    chromophore_reference.estimate(
                         color, table, covariance, prior, face=known, size=(1200, 300)
                     )
                     for color in rgb[here]
@@ -88,13 +89,13 @@ def test_shade_is_not_taken_for_darker_skin(melanin, table, prior, rng):
     """
     true, _, light, rgb = face(table, prior, melanin, 5000, rng)
     given = {"prior": prior, "variance": (NOISE * rgb) ** 2}
-    known = of_colors(rgb, table, common_light=0.02, **given)
+    known = fit_face_distribution(rgb, table, common_light=0.02, **given)
     # standard errors of 1500 pixels, dark ones with errors of a third: 0.01; of the spread 0.02
     assert abs(known.melanin.mean - np.log(melanin)) < 0.04
     assert abs(known.melanin.spread - 0.15) < 0.05
     assert abs(known.blood.mean - 0.4) < 0.03
     dim = light < np.quantile(light, 0.2)
-    together, alone = (weigh(rgb, table, face=one, **given) for one in (known, None))
+    together, alone = (estimate(rgb, table, face=one, **given) for one in (known, None))
     off = np.abs(together.melanin - true) / together.stderr_melanin
     assert 0.62 < (off < 1.0).mean() < 0.76
     assert 0.60 < (off[dim] < 1.0).mean() < 0.78
@@ -109,8 +110,8 @@ def test_a_mole_in_good_light_keeps_its_melanin(table, prior, rng):
     true[:40] = 0.06
     rgb[:40] = 0.9 * table.lookup(0.06, 0.02) * (1.0 + NOISE * rng.standard_normal((40, 3)))
     given = {"prior": prior, "variance": (NOISE * rgb) ** 2}
-    known = of_colors(rgb, table, common_light=0.1, **given)
-    found = weigh(rgb, table, face=known, **given)
+    known = fit_face_distribution(rgb, table, common_light=0.1, **given)
+    found = estimate(rgb, table, face=known, **given)
     assert np.median(np.abs(found.melanin[:40] / 0.06 - 1.0)) < 0.12
     inside = np.abs(found.melanin - true)[:40] < 2.5 * found.stderr_melanin[:40]
     assert inside.mean() > 0.85
@@ -121,9 +122,11 @@ def test_light_that_all_pixels_have_in_common_makes_the_face_less_sure(table, pr
     _, _, _, rgb = face(table, prior, 0.15, 2000, rng)
     gain, common = 1.2, np.log(1.2)
     given = {"table": table, "prior": prior}
-    sure = of_colors(rgb, common_light=0.01, variance=(NOISE * rgb) ** 2, **given)
-    unsure = of_colors(rgb, common_light=common, variance=(NOISE * rgb) ** 2, **given)
-    brighter = of_colors(gain * rgb, common_light=0.01, variance=(NOISE * gain * rgb) ** 2, **given)
+    sure = fit_face_distribution(rgb, common_light=0.01, variance=(NOISE * rgb) ** 2, **given)
+    unsure = fit_face_distribution(rgb, common_light=common, variance=(NOISE * rgb) ** 2, **given)
+    brighter = fit_face_distribution(
+        gain * rgb, common_light=0.01, variance=(NOISE * gain * rgb) ** 2, **given
+    )
     moved = abs(brighter.melanin.mean - sure.melanin.mean)
     assert moved > 0.03
     assert 0.5 * moved < unsure.melanin.stderr < 2.0 * moved
@@ -133,10 +136,10 @@ def test_light_that_all_pixels_have_in_common_makes_the_face_less_sure(table, pr
 def test_an_error_of_color_in_common_makes_the_face_less_sure(table, prior, rng):
     _, _, _, rgb = face(table, prior, 0.01, 2000, rng)
     given = {"prior": prior, "common_light": 0.01, "variance": (NOISE * rgb) ** 2}
-    plain = of_colors(rgb, table, **given)
+    plain = fit_face_distribution(rgb, table, **given)
     off = 0.003 * np.array([-0.4, -0.4, 0.8])  # towards less melanin
-    common = of_colors(rgb, table, common_color=np.outer(off, off), **given)
-    tinted = of_colors(rgb * np.exp(off), table, **given)
+    common = fit_face_distribution(rgb, table, common_color=np.outer(off, off), **given)
+    tinted = fit_face_distribution(rgb * np.exp(off), table, **given)
     moved = abs(tinted.melanin.mean - plain.melanin.mean)
     assert common.melanin.stderr == pytest.approx(np.hypot(moved, plain.melanin.stderr), rel=0.3)
     assert common.melanin.stderr > 2.0 * plain.melanin.stderr
@@ -144,9 +147,12 @@ def test_an_error_of_color_in_common_makes_the_face_less_sure(table, prior, rng)
 
 def test_a_few_pixels_are_no_face(table, prior, rng):
     _, _, _, rgb = face(table, prior, 0.05, 150, rng)
-    assert of_colors(rgb, table, prior=prior, common_light=0.1) is None
-    assert of_colors(np.full((900, 3), np.nan), table, prior=prior, common_light=0.1) is None
+    assert fit_face_distribution(rgb, table, prior=prior, common_light=0.1) is None
+    assert (
+        fit_face_distribution(np.full((900, 3), np.nan), table, prior=prior, common_light=0.1)
+        is None
+    )
     with pytest.raises(ChromophoreError, match="common_light"):
-        of_colors(rgb, table, prior=prior, common_light=0.0)
+        fit_face_distribution(rgb, table, prior=prior, common_light=0.0)
     with pytest.raises(ChromophoreError, match="rgb"):
-        of_colors(rgb[:, :2], table, prior=prior, common_light=0.1)
+        fit_face_distribution(rgb[:, :2], table, prior=prior, common_light=0.1)

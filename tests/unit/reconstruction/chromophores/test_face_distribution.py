@@ -5,9 +5,9 @@ import pytest
 
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores.face_distribution import (
-    LEAST_SPREAD,
-    UNEXPECTED,
-    Bell,
+    MIN_CONTAMINATION,
+    MIN_SIGMAS,
+    ContaminatedNormal,
     FaceDistribution,
     fit,
     with_common_errors,
@@ -75,14 +75,14 @@ def test_pixels_that_differ_by_their_errors_alone_have_the_least_spreads(rng):
             rng,
         )
     )
-    assert LEAST_SPREAD[0] <= found.melanin.spread < 0.04
-    assert found.blood.spread == pytest.approx(LEAST_SPREAD[1], rel=1e-3)
-    assert found.melanin.unexpected == pytest.approx(UNEXPECTED, abs=0.005)
+    assert MIN_SIGMAS[0] <= found.melanin.spread < 0.04
+    assert found.blood.spread == pytest.approx(MIN_SIGMAS[1], rel=1e-3)
+    assert found.melanin.unexpected == pytest.approx(MIN_CONTAMINATION, abs=0.005)
 
 
 def test_densities_over_any_value_have_the_mean_one_in_cells_wider_than_the_bell_too():
     for mean in (-3.0, -0.75):
-        bell = Bell(mean, 0.02, 0.05, *MELANIN_ENDS, stderr=0.01)
+        bell = ContaminatedNormal(mean, 0.02, 0.05, *MELANIN_ENDS, stderr=0.01)
         edges = np.linspace(*MELANIN_ENDS, 101)
         assert bell.of_cells(edges).mean() == pytest.approx(1.0, rel=1e-6)
         fine = np.linspace(*MELANIN_ENDS, 200_001)
@@ -93,7 +93,8 @@ def test_densities_over_any_value_have_the_mean_one_in_cells_wider_than_the_bell
 def test_common_errors_widen_by_their_root_sum_of_squares():
     def face(melanin, blood):
         return FaceDistribution(
-            Bell(melanin, 0.3, 0.01, *MELANIN_ENDS), Bell(blood, 0.05, 0.01, *BLOOD_ENDS)
+            ContaminatedNormal(melanin, 0.3, 0.01, *MELANIN_ENDS),
+            ContaminatedNormal(blood, 0.05, 0.01, *BLOOD_ENDS),
         )
 
     known = with_common_errors(
@@ -109,8 +110,8 @@ def test_a_mean_at_the_end_is_known_as_badly_as_it_moves_away_from_it():
 
     def face(melanin):
         held = min(melanin, MELANIN_ENDS[1] - 0.01)
-        bell = Bell(held, 0.02, 0.01, *MELANIN_ENDS)
-        return FaceDistribution(bell, Bell(0.4, 0.05, 0.01, *BLOOD_ENDS))
+        bell = ContaminatedNormal(held, 0.02, 0.01, *MELANIN_ENDS)
+        return FaceDistribution(bell, ContaminatedNormal(0.4, 0.05, 0.01, *BLOOD_ENDS))
 
     for mean in (-1.0, -0.75, -0.70):
         known = with_common_errors(face(mean), [(face(mean - 0.08), face(mean + 0.08))])
@@ -120,7 +121,10 @@ def test_a_mean_at_the_end_is_known_as_badly_as_it_moves_away_from_it():
 @pytest.mark.parametrize(("mean", "told"), [(0.055, False), (0.2, True), (0.99, True)])
 def test_blood_that_ends_at_none_may_be_any(mean, told):
     """The darkest skin has one color with any blood: its face's ended at a hundredth of it."""
-    skin = FaceDistribution(Bell(-3.0, 0.3, 0.01, -9.0, -0.7), Bell(mean, 0.05, 0.1, 0.04, 1.0))
+    skin = FaceDistribution(
+        ContaminatedNormal(-3.0, 0.3, 0.01, -9.0, -0.7),
+        ContaminatedNormal(mean, 0.05, 0.1, 0.04, 1.0),
+    )
     known = with_common_errors(skin, [(skin, skin)])
     density = known.blood.relative_density(np.array([mean, 0.5]))
     assert (np.ptp(density) > 0.5) == told
@@ -134,7 +138,7 @@ def test_what_is_no_probability_or_no_bell_is_refused():
     with pytest.raises(ValueError, match="finite positive"):
         fitted(np.zeros((3, MELANIN.size, BLOOD.size)))
     with pytest.raises(ValueError, match="spread"):
-        Bell(0.0, 0.0, 0.1, -1.0, 1.0)
+        ContaminatedNormal(0.0, 0.0, 0.1, -1.0, 1.0)
 
 
 def test_the_plane_kernel_sums_what_plain_numpy_does(rng):

@@ -326,7 +326,7 @@ def test_arguments_that_do_not_fit_are_refused_by_name(arguments, message, table
 
 def test_the_default_noise_is_one_percent(table):
     color = table.lookup([0.02], [0.05])
-    stated = invert(color, table, variance=(chromophores.RELATIVE_NOISE * color) ** 2)
+    stated = invert(color, table, variance=(chromophores.DEFAULT_RELATIVE_NOISE * color) ** 2)
     np.testing.assert_allclose(
         invert(color, table).stderr_melanin, stated.stderr_melanin, rtol=1e-4
     )

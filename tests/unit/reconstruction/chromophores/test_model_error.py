@@ -9,7 +9,7 @@ from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error
 from reconstruction.chromophores.inversion import ChromophoreError
-from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.shading_prior import lognormal
 
 SIZE = 48
@@ -107,9 +107,9 @@ def test_each_pixel_is_weighed_by_its_own_error(table):
     rgb = np.repeat(table.lookup([[0.01]], [[0.03]]), 2, axis=1)
     prior, variance = lognormal(0.7, 0.6), (1e-3 * rgb) ** 2
     errors = np.stack([model_error.load(), 9.0 * model_error.load()])[None]
-    found = weigh(rgb, table, prior=prior, variance=variance, model_error=errors)
+    found = estimate(rgb, table, prior=prior, variance=variance, model_error=errors)
     for k in range(2):
-        alone = weigh(
+        alone = estimate(
             rgb[:, k], table, prior=prior, variance=variance[:, k], model_error=errors[0, k]
         )
         np.testing.assert_allclose(found.melanin[:, k], alone.melanin, rtol=1e-3)
@@ -130,7 +130,7 @@ def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_o
     shares = []
     for factor in (1.0, 2.0):
         seen = rgb * np.exp(factor * error)
-        found = weigh(
+        found = estimate(
             seen,
             table,
             prior=lognormal(1.0, 0.6),
@@ -153,7 +153,7 @@ def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_o
 def test_covariances_that_do_not_fit_the_pixels_are_refused(table, errors):
     rgb = np.repeat(table.lookup([0.01], [0.03]), 4, axis=0)
     with pytest.raises(ChromophoreError, match="model_error"):
-        weigh(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
+        estimate(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
 
 
 @pytest.mark.parametrize("pixels", [1, SIZE, 7 * SIZE])

@@ -6,7 +6,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores import reference as chromophore_reference
 from reconstruction.chromophores.inversion import ChromophoreError, invert, without_brightness
-from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.shading_prior import lognormal
 
 NOISE = 0.004
@@ -43,12 +43,12 @@ def test_the_kernel_sums_what_plain_numpy_sums_over_a_dense_plane(table, prior, 
     c_m[:4], c_hd[:4], shading[:4] = [0.06, 0.09, 0.15, 0.45], [0.01, 0.1, 0.02, 0.06], 1.0
     noise = 0.006
     rgb = seen(table, c_m, c_hd, shading, rng, noise)
-    found = weigh(
+    found = estimate(
         rgb, table, prior=prior, variance=(noise * rgb) ** 2, model_error=model_error.load()
     )
     covariance = without_brightness(model_error.load() + 1e-12 * np.eye(3)) + noise**2 * np.eye(3)
     slow = np.array(
-        [chromophore_reference.weigh(c, table, covariance, prior, size=(900, 300)) for c in rgb]
+        [chromophore_reference.estimate(c, table, covariance, prior, size=(900, 300)) for c in rgb]
     )
     for k, (center, reach) in enumerate(
         ((found.melanin, found.stderr_melanin), (found.hemoglobin, found.stderr_hemoglobin))
@@ -63,7 +63,7 @@ def test_intervals_cover_68_percent_of_skin_that_is_as_expected_beforehand(table
     # bins and for blood that is drawn from a narrower range than the prior has.
     c_m, c_hd, shading = skin(rng, 12_000, prior)
     rgb = seen(table, c_m, c_hd, shading, rng)
-    found = weigh(rgb, table, prior=prior, variance=(NOISE * rgb) ** 2)
+    found = estimate(rgb, table, prior=prior, variance=(NOISE * rgb) ** 2)
     covered = np.abs(found.melanin - c_m) <= found.stderr_melanin
     assert abs(covered.mean() - 0.683) < 0.03
     blood = np.abs(found.hemoglobin - c_hd) <= found.stderr_hemoglobin
@@ -83,7 +83,7 @@ def test_light_skin_gets_the_estimate_and_the_error_of_the_fit(table, prior, rng
     rgb = 0.8 * table.lookup(c_m, c_hd)
     noise = (0.002 * rgb) ** 2
     found, fitted = (
-        weigh(rgb, table, prior=prior, variance=noise),
+        estimate(rgb, table, prior=prior, variance=noise),
         invert(rgb, table, variance=noise),
     )
     np.testing.assert_allclose(found.melanin, c_m, rtol=0.01)
@@ -96,7 +96,7 @@ def test_light_skin_gets_the_estimate_and_the_error_of_the_fit(table, prior, rng
 def test_without_noise_the_estimate_is_the_true_skin_to_a_percent(table, prior):
     c_m, c_hd = np.array([0.01, 0.02, 0.03]), np.array([0.03, 0.05, 0.08])
     rgb = 0.6 * table.lookup(c_m, c_hd)
-    found = weigh(rgb, table, prior=prior, variance=(1e-5 * rgb) ** 2)
+    found = estimate(rgb, table, prior=prior, variance=(1e-5 * rgb) ** 2)
     np.testing.assert_allclose(found.melanin, c_m, rtol=2e-3)
     np.testing.assert_allclose(found.hemoglobin, c_hd, rtol=0.01)
     assert (found.stderr_melanin < 5e-3 * c_m).all()
@@ -106,7 +106,7 @@ def test_brightness_tells_dark_skin_from_light_skin_in_less_light(table):
     c_m, c_hd = np.array([0.2, 0.35]), np.array([0.05, 0.05])
     rgb = table.lookup(c_m, c_hd)
     noise = (0.004 * rgb) ** 2
-    rough = weigh(rgb, table, prior=lognormal(1.0, 0.15), variance=noise)
+    rough = estimate(rgb, table, prior=lognormal(1.0, 0.15), variance=noise)
     np.testing.assert_allclose(rough.melanin, c_m, rtol=0.25)
     free = invert(rgb, table, variance=noise)
     assert (free.melanin < 0.6 * c_m).all()  # what a fit without any knowledge of the light says
@@ -118,7 +118,7 @@ def test_where_two_solutions_are_possible_the_error_is_of_both_and_holds_the_tru
     noise = (0.002 * rgb) ** 2
     lighter = invert(rgb, table, variance=noise)
     assert lighter.melanin[0] + 10.0 * lighter.stderr_melanin[0] < truth  # sure, and wrong
-    both = weigh(rgb, table, prior=lognormal(0.7, 1.0), variance=noise)
+    both = estimate(rgb, table, prior=lognormal(0.7, 1.0), variance=noise)
     assert abs(both.melanin[0] - truth) < both.stderr_melanin[0]
     assert both.stderr_melanin[0] > 10.0 * lighter.stderr_melanin[0]
 
@@ -127,7 +127,7 @@ def test_where_two_solutions_are_possible_the_error_is_of_both_and_holds_the_tru
 def test_color_decides_for_light_skin_whatever_its_light(factor, table, rng):
     c_m, c_hd = np.array([0.01, 0.03]), np.array([0.05, 0.1])
     rgb = factor * table.lookup(c_m, c_hd)
-    found = weigh(rgb, table, prior=lognormal(0.7, 0.6), variance=(0.002 * rgb) ** 2)
+    found = estimate(rgb, table, prior=lognormal(0.7, 0.6), variance=(0.002 * rgb) ** 2)
     assert np.all(np.abs(found.melanin - c_m) < found.stderr_melanin)
     np.testing.assert_allclose(found.shading, factor, rtol=0.05)
 
@@ -135,31 +135,31 @@ def test_color_decides_for_light_skin_whatever_its_light(factor, table, rng):
 def test_a_model_error_widens_the_interval(table, prior):
     rgb = 0.8 * table.lookup([0.02], [0.05])
     noise = (0.002 * rgb) ** 2
-    alone = weigh(rgb, table, prior=prior, variance=noise)
-    both = weigh(rgb, table, prior=prior, variance=noise, model_error=0.004)
+    alone = estimate(rgb, table, prior=prior, variance=noise)
+    both = estimate(rgb, table, prior=prior, variance=noise, model_error=0.004)
     assert 1.8 < both.stderr_melanin[0] / alone.stderr_melanin[0] < 2.8  # sqrt(1 + 2^2) = 2.2
 
 
 def test_unusable_pixels_are_masked_and_their_neighbours_are_not(table, prior):
     good = table.lookup(0.03, 0.05)
     rgb = np.array([[good, [np.nan, 0.2, 0.1], [0.3, -0.01, 0.1]], [good, good, [0.05, 0.1, 0.4]]])
-    found = weigh(
+    found = estimate(
         rgb, table, prior=prior, valid=np.array([[True, True, True], [True, False, True]])
     )
     assert found.valid.tolist() == [[True, False, False], [True, False, False]]
     assert found.outside[1, 2]
     assert np.isnan(found.melanin[0, 1])
     assert np.isfinite(found.stderr_hemoglobin[0, 0])
-    assert weigh(np.empty((0, 3)), table, prior=prior).melanin.shape == (0,)
+    assert estimate(np.empty((0, 3)), table, prior=prior).melanin.shape == (0,)
     with pytest.raises(ChromophoreError, match="model_error"):
-        weigh(rgb, table, prior=prior, model_error=-1.0)
+        estimate(rgb, table, prior=prior, model_error=-1.0)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
 def test_light_far_from_what_is_expected_leaves_finite_numbers(scale, table, prior):
     c_m, c_hd = np.array([6e-5, 0.02, 0.45]), np.array([4e-5, 0.05, 0.3])
     rgb = scale * table.lookup(c_m, c_hd)
-    found = weigh(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2)
+    found = estimate(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2)
     for values in (found.melanin, found.hemoglobin, found.stderr_melanin, found.stderr_hemoglobin):
         assert np.isfinite(values).all()
         assert (values > 0).all()
@@ -175,7 +175,7 @@ def test_what_is_no_skin_by_its_own_errors_is_masked_among_pixels_of_large_error
     fine, rough = 3e-5 * (3.0 * np.eye(3) - 1.0), 0.05 * (3.0 * np.eye(3) - 1.0)
     errors = np.broadcast_to(fine, (*rgb.shape[:-1], 3, 3)).copy()
     errors[1, ::2] = rough
-    found = weigh(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2, model_error=errors)
+    found = estimate(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2, model_error=errors)
     assert found.outside[0].all()
     assert not found.valid[0].any()
     assert found.valid[1].all()

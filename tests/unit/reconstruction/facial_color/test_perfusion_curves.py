@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from reconstruction.facial_color.perfusion_curves import (
-    PLACES,
+    FACE_PLACES,
     CurveError,
     disc_means,
     reproducibility,
@@ -73,7 +73,7 @@ def test_usual_places_lie_on_the_face_in_the_right_order():
     y, x = np.mgrid[0:200, 0:300]
     face = ((x - 150) / 60) ** 2 + ((y - 100) / 90) ** 2 < 1
     places = usual_places(face)
-    assert tuple(places) == PLACES
+    assert tuple(places) == FACE_PLACES
     assert all(face[round(v), round(u)] for u, v in places.values())
     assert places["forehead"][1] < places["temple"][1] < places["nose"][1] < places["chin"][1]
     assert places["temple"][0] < places["cheek"][0] < places["nose"][0]

@@ -42,7 +42,9 @@ def test_brightness_errs_by_the_slope_times_the_error_of_the_place(rng):
     """A ramp of brightness: slope squared times the variance along its axis."""
     columns = np.indices((SIZE, SIZE))[1]
     rgb = np.exp(0.02 * columns)[..., None] * np.array([0.3, 0.2, 0.1])
-    found = misplacement.own_error(rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4))
+    found = misplacement.registration_covariance(
+        rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4)
+    )
     # at borders pixels have fewer neighbors along one axis than along the other
     np.testing.assert_allclose(found[8:-8, 8:-8], 0.02**2 * 0.4**2 / 2, rtol=1e-4)
 
@@ -59,7 +61,7 @@ def test_an_even_slope_of_light_is_no_error_where_changes_of_light_are_followed(
 
     def error(log_light, window_px):
         rgb = np.exp(log_light)[..., None] * np.array([0.3, 0.2, 0.1])
-        found = misplacement.own_error(
+        found = misplacement.registration_covariance(
             rgb, 0.0 * rgb, everywhere, laid_over(0.4), light_window_px=window_px
         )
         return found[inside, inside].mean()
@@ -73,7 +75,7 @@ def test_an_even_slope_of_light_is_no_error_where_changes_of_light_are_followed(
 def test_a_window_that_is_none_is_refused_by_name(window_px):
     rgb = np.ones((SIZE, SIZE, 3))
     with pytest.raises(ValueError, match="light_window_px"):
-        misplacement.own_error(
+        misplacement.registration_covariance(
             rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4), light_window_px=window_px
         )
 
@@ -97,7 +99,7 @@ def test_brightness_of_light_that_is_followed_is_left_over_by_so_much(rng):
         squares.append(np.square(off - gaussian_filter(off, 3.0, mode="wrap")))
     rgb = np.exp(log_light)[..., None] * np.ones(3)
     told, denied = (
-        misplacement.own_error(
+        misplacement.registration_covariance(
             rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(stated), light_window_px=window
         )[12:-12, 12:-12, 0, 0].mean()
         for window in (3.0, None)
@@ -112,7 +114,7 @@ def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
     bend of the texture between pixels and for 200 shifts."""
     rgb, stated = skin(rng), 0.3
     everywhere = np.ones((SIZE, SIZE), bool)
-    covariance = misplacement.own_error(rgb, 0.0 * rgb, everywhere, laid_over(stated))
+    covariance = misplacement.registration_covariance(rgb, 0.0 * rgb, everywhere, laid_over(stated))
     squares = np.zeros((3, 3))
     for _ in range(200):
         by = rng.normal(0.0, stated / np.sqrt(2.0), 2)
@@ -126,7 +128,7 @@ def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
     )
     color = np.array([1.0, 0.0, -1.0])
     assert color @ told @ color == pytest.approx(
-        misplacement.SCALE * color @ squares @ color, rel=0.25
+        misplacement.MOTION_VARIANCE_SCALE * color @ squares @ color, rel=0.25
     )
 
 
@@ -137,8 +139,8 @@ def test_noise_is_no_slope_and_masked_pixels_count_for_nothing(rng):
     valid = np.ones((SIZE, SIZE), bool)
     valid[:, 40:] = False
     wild = np.where(valid[..., None], noisy, np.nan)
-    told = misplacement.own_error(wild, noise**2, valid, laid_over(0.5))
-    denied = misplacement.own_error(wild, 0.0 * noise, valid, laid_over(0.5))
+    told = misplacement.registration_covariance(wild, noise**2, valid, laid_over(0.5))
+    denied = misplacement.registration_covariance(wild, 0.0 * noise, valid, laid_over(0.5))
     assert np.isfinite(told).all()
     assert not told[:, 40:].any()
     # what is left of it by chance is positive: directions below 0 are 0
@@ -162,12 +164,12 @@ def test_changes_of_a_misplaced_face_are_covered_and_are_not_without_its_own_err
     rgb = np.stack([clean, moved])
     rgb *= 1.0 + 5e-4 * rng.standard_normal(rgb.shape)
     variance = (5e-4 * np.stack([clean, moved])) ** 2
-    place = misplacement.own_error(
+    place = misplacement.registration_covariance(
         rgb[1], variance[1], np.ones((SIZE, SIZE), bool), laid_over(0.35 * np.sqrt(2.0))
     )
     shares = []
     for own in (np.stack([0.0 * place, place]), None):
-        found = shared_melanin.weigh(
+        found = shared_melanin.estimate_shared_melanin(
             rgb,
             table,
             prior=shading_prior.of_faces(),

@@ -33,7 +33,7 @@ def test_the_variance_of_the_mean_is_that_of_its_errors(rng, count):
 def test_colors_that_repeat_less_than_their_noise_widen_the_error(rng, count):
     """Tolerance: the median of 3,600 chi-squared numbers is off by 3 % at most."""
     rgb, variance, valid, _ = repeats(rng, count=count, color=3.0)
-    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(9.0, rel=0.09)
+    assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(9.0, rel=0.09)
     told = repeat_average.average(rgb, variance, valid)[1]
     assert np.median(told / variance[0]) == pytest.approx(9.0 / count, rel=0.1)
 
@@ -47,9 +47,9 @@ def test_repeats_of_unequal_noise_are_no_worse_than_said(rng, count, ratio):
     """
     rgb, variance, valid, skin = repeats(rng, count=count, size=100)
     rgb[1] = skin * (1.0 + np.sqrt(ratio) * (rgb[1] / skin - 1.0))
-    assert repeat_average.excess(rgb, variance, valid) > 1.3
+    assert repeat_average.overdispersion(rgb, variance, valid) > 1.3
     variance[1] *= ratio
-    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(1.0, abs=0.06)
+    assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(1.0, abs=0.06)
 
 
 def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
@@ -58,14 +58,14 @@ def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
     rgb, variance, valid, _ = repeats(rng, count=3, brightness=0.02)
     scatter = np.mean(rgb.var(axis=0, ddof=1) / variance[0])
     assert scatter > 5.0
-    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(1.0, abs=0.05)
+    assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_few_pixels_laid_over_others_do_not_count_for_all(rng):
     rgb, variance, valid, _ = repeats(rng)
     rgb[1, :6] = rgb[1, :6, ::-1] * [1.0, 1.3, 0.8]
     assert np.mean(np.square(rgb[1] - rgb[0]) / variance[0]) > 20.0
-    assert repeat_average.excess(rgb, variance, valid) < 1.3
+    assert repeat_average.overdispersion(rgb, variance, valid) < 1.3
 
 
 def test_each_pixel_is_the_mean_of_the_repeats_that_show_it(rng):

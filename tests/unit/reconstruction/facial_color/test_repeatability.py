@@ -92,7 +92,7 @@ def test_melanin_that_drifts_is_told_from_blood_that_changes(rng):
     maps, stderr = captures(rng, slope=2e-4)
     times = 30.0 * np.arange(len(ORDER))
     found = repeatability.drift(maps, ORDER, times, stderr=stderr)[-1]
-    assert found.name == repeatability.WHOLE
+    assert found.name == repeatability.WHOLE_REGION
     assert found.drifts
     assert abs(found.slope_per_minute - 4e-4) < 4 * found.slope_stderr
     still, stderr = captures(rng)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.facial_color.rig import HemoglobinRig
-from reconstruction.facial_color.rig_transfer import RigTransferError, carried
+from reconstruction.facial_color.rig_transfer import RigTransferError, transfer_rig
 
 SHAPE = (96, 80)
 MARKS = {
@@ -36,7 +36,7 @@ def test_the_patch_that_reddens_lies_at_the_same_landmark_of_the_other_face():
     neutral, factor = face()
     rig = HemoglobinRig.from_maps(neutral, {"blush": neutral * factor}, radius_px=5.0)
     shape = (220, 200)
-    there = carried(rig, shape, landmarks_rig=MARKS, landmarks_onto=elsewhere(MARKS))
+    there = transfer_rig(rig, shape, landmarks_rig=MARKS, landmarks_onto=elsewhere(MARKS))
     other = np.full(shape, 0.03) + 0.003 * np.random.default_rng(9).standard_normal(shape)
     found = there.applied_to(other).evaluate({"blush": 1.0})
     ratio = np.where(found.valid, found.hemoglobin / other, np.nan)
@@ -55,7 +55,7 @@ def test_the_patch_that_reddens_lies_at_the_same_landmark_of_the_other_face():
 def test_the_radius_grows_with_the_face():
     neutral, factor = face()
     rig = HemoglobinRig.from_maps(neutral, {"blush": neutral * factor}, radius_px=5.0)
-    there = carried(rig, (220, 200), landmarks_rig=MARKS, landmarks_onto=elsewhere(MARKS))
+    there = transfer_rig(rig, (220, 200), landmarks_rig=MARKS, landmarks_onto=elsewhere(MARKS))
     assert there.radius_px == pytest.approx(10.0, rel=0.05)
 
 
@@ -64,7 +64,7 @@ def test_what_the_rig_never_saw_stays_unknown():
     seen = np.ones(SHAPE, bool)
     seen[:30] = False
     rig = HemoglobinRig.from_maps(neutral, {"blush": neutral * factor}, radius_px=5.0, valid=seen)
-    there = carried(rig, SHAPE, landmarks_rig=MARKS, landmarks_onto=MARKS)
+    there = transfer_rig(rig, SHAPE, landmarks_rig=MARKS, landmarks_onto=MARKS)
     assert not there.states["blush"].valid[:20].any()
     assert there.states["blush"].valid[50:80, 10:70].all()
 
@@ -74,7 +74,7 @@ def test_too_few_common_names_are_refused():
     rig = HemoglobinRig.from_maps(neutral, {"blush": neutral * factor}, radius_px=5.0)
     few = {name: MARKS[name] for name in "abc"}
     with pytest.raises(RigTransferError, match="3 names"):
-        carried(rig, SHAPE, landmarks_rig=MARKS, landmarks_onto=few)
+        transfer_rig(rig, SHAPE, landmarks_rig=MARKS, landmarks_onto=few)
     line = {name: (float(k), float(k)) for k, name in enumerate(MARKS)}
     with pytest.raises(RigTransferError, match="landmarks"):
-        carried(rig, SHAPE, landmarks_rig=line, landmarks_onto=line)
+        transfer_rig(rig, SHAPE, landmarks_rig=line, landmarks_onto=line)

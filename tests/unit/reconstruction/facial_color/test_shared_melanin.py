@@ -65,7 +65,9 @@ def chi_square_band(count, sigmas=4.0):
 def test_without_noise_melanin_blood_and_each_states_light_are_exact(table, prior):
     light = np.array([0.4, 0.7, 0.5, 0.9, 0.6])[:, None, None]
     color = light * table.lookup(np.full((5, 1), MELANIN), BLOOD[:, None])
-    found = shared_melanin.weigh(color, table, prior=prior, variance=(1e-4 * color) ** 2)
+    found = shared_melanin.estimate_shared_melanin(
+        color, table, prior=prior, variance=(1e-4 * color) ** 2
+    )
     np.testing.assert_allclose(found.melanin, MELANIN, rtol=5e-3)
     np.testing.assert_allclose(found.hemoglobin[:, 0], BLOOD, rtol=1e-2)
     np.testing.assert_allclose(found.change[:, 0], BLOOD - BLOOD[0], atol=2e-4)
@@ -82,7 +84,7 @@ def test_errors_are_those_of_the_best_unbiased_estimate(table, prior, rng):
     """
     noise, pixels = 2e-3, 2000
     rgb, variance = pictures(table, rng, noise=noise, pixels=pixels)
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
+    found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
     bound = fisher(table, noise)
     low, high = chi_square_band(pixels)
     for values, stderr, expected in (
@@ -102,7 +104,7 @@ def test_the_variance_of_melanin_goes_down_with_the_number_of_states(table, prio
         rgb, variance = pictures(
             table, rng, noise=2e-3, pixels=pixels, blood=np.full(states, 0.025)
         )
-        found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
+        found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
         spread[states] = found.melanin.var()
     slack = 4 * np.sqrt(2 * 2 / pixels)
     for states in (2, 5):
@@ -115,7 +117,9 @@ def test_an_error_of_the_model_stays_in_melanin_and_leaves_changes(table, prior,
     pixels = 1500
     drawn = rng.multivariate_normal(np.zeros(3), covariance, pixels)
     rgb, variance = pictures(table, rng, noise=3e-4, pixels=pixels, bias=drawn)
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance, model_error=covariance)
+    found = shared_melanin.estimate_shared_melanin(
+        rgb, table, prior=prior, variance=variance, model_error=covariance
+    )
     blood = found.hemoglobin[1] - BLOOD[1]
     change = found.change[1] - (BLOOD[1] - BLOOD[0])
     assert np.sqrt((change**2).mean()) < 0.5 * np.sqrt((blood**2).mean())
@@ -140,7 +144,7 @@ def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
     rough = np.arange(300) % 3 == 0  # the median pixel is a fine one
 
     def maps(error):
-        found = shared_melanin.weigh(
+        found = shared_melanin.estimate_shared_melanin(
             rgb, table, prior=prior, variance=variance, model_error=error, own_share=0.0
         )
         return np.stack(
@@ -163,8 +167,10 @@ def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
 def test_one_state_alone_is_weighed_as_a_single_picture(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=200, blood=BLOOD[:1])
     covariance = model_error.load()
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance, model_error=covariance)
-    single = chromophore_posterior.weigh(
+    found = shared_melanin.estimate_shared_melanin(
+        rgb, table, prior=prior, variance=variance, model_error=covariance
+    )
+    single = chromophore_posterior.estimate(
         rgb[0], table, prior=prior, variance=variance[0], model_error=covariance
     )
     np.testing.assert_allclose(found.melanin, single.melanin, rtol=2e-3)
@@ -181,8 +187,10 @@ def test_a_state_that_is_masked_leaves_out_and_the_others_go_on(table, prior, rn
     valid[:, 1] = False
     valid[0, 2] = False
     rgb[2, 0] = 7.0
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance, valid=valid)
-    without = shared_melanin.weigh(
+    found = shared_melanin.estimate_shared_melanin(
+        rgb, table, prior=prior, variance=variance, valid=valid
+    )
+    without = shared_melanin.estimate_shared_melanin(
         np.delete(rgb[:, :1], 2, 0), table, prior=prior, variance=np.delete(variance[:, :1], 2, 0)
     )
     np.testing.assert_allclose(found.melanin[0], without.melanin[0], rtol=1e-4)
@@ -204,7 +212,7 @@ def test_unusable_colors_are_masked_and_never_unmasked_nan(table, prior):
     rgb[1, 1, 2] = 0.0
     rgb[2, 2] = -1.0
     rgb[:, 3] = np.inf
-    found = shared_melanin.weigh(rgb, table, prior=prior)
+    found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior)
     np.testing.assert_array_equal(found.valid_states[:, 3], False)
     for maps in (found.hemoglobin, found.stderr_hemoglobin, found.shading, found.residual):
         assert np.isfinite(maps[found.valid_states]).all()
@@ -217,10 +225,12 @@ def test_unusable_colors_are_masked_and_never_unmasked_nan(table, prior):
 def test_a_state_with_another_pixels_melanin_is_a_misfit(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=1e-3, pixels=50)
     rgb[3] *= (np.array([1.12, 0.94, 1.0])).astype(np.float32)
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
+    found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
     assert found.misfits[3].mean() > 0.9
     clean, variance = pictures(table, rng, noise=1e-3, pixels=50)
-    assert not shared_melanin.weigh(clean, table, prior=prior, variance=variance).misfits.any()
+    assert not shared_melanin.estimate_shared_melanin(
+        clean, table, prior=prior, variance=variance
+    ).misfits.any()
 
 
 def smooth_light(shape, bend=0.08):
@@ -237,8 +247,8 @@ def faces(table, rng, shape, noise, light):
 def test_light_that_changes_smoothly_makes_brightness_tell_changes_of_blood(table, prior, rng):
     shape = (64, 64)
     rgb, variance = faces(table, rng, shape, 5e-3, smooth_light(shape))
-    free = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
-    smooth = shared_melanin.weigh(
+    free = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
+    smooth = shared_melanin.estimate_shared_melanin(
         rgb, table, prior=prior, variance=variance, shading_window_px=10.0
     )
     truth = BLOOD[1] - BLOOD[0]
@@ -247,7 +257,7 @@ def test_light_that_changes_smoothly_makes_brightness_tell_changes_of_blood(tabl
     assert np.mean(np.abs(error) < 2 * smooth.stderr_change[1]) > 0.95
     # a factor of the whole picture is a change of light, not of blood
     rgb[1] *= 1.5
-    again = shared_melanin.weigh(
+    again = shared_melanin.estimate_shared_melanin(
         rgb, table, prior=prior, variance=variance * 2.25, shading_window_px=10.0
     )
     np.testing.assert_allclose(again.change[1].mean(), truth, rtol=0.1)
@@ -259,10 +269,10 @@ def test_a_wrinkles_shadow_that_is_not_smooth_widens_the_error(table, prior, rng
     light[1, ::3] *= 0.9
     rgb, variance = faces(table, rng, shape, 3e-3, light)
     calm, calm_variance = faces(table, rng, shape, 3e-3, smooth_light(shape))
-    wrinkled = shared_melanin.weigh(
+    wrinkled = shared_melanin.estimate_shared_melanin(
         rgb, table, prior=prior, variance=variance, shading_window_px=10.0
     )
-    still = shared_melanin.weigh(
+    still = shared_melanin.estimate_shared_melanin(
         calm, table, prior=prior, variance=calm_variance, shading_window_px=10.0
     )
     assert np.median(wrinkled.stderr_change[1]) > 1.5 * np.median(still.stderr_change[1])
@@ -273,8 +283,8 @@ def test_a_wrinkles_shadow_that_is_not_smooth_widens_the_error(table, prior, rng
 def test_the_layout_of_pixels_changes_nothing_and_inputs_stay(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=12)
     before = rgb.copy()
-    flat = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
-    shaped = shared_melanin.weigh(
+    flat = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
+    shaped = shared_melanin.estimate_shared_melanin(
         rgb.reshape(5, 3, 4, 3), table, prior=prior, variance=variance.reshape(5, 3, 4, 3)
     )
     np.testing.assert_array_equal(shaped.change, flat.change.reshape(5, 3, 4))
@@ -293,7 +303,9 @@ def test_dark_skin_with_two_solutions_is_covered(table, prior, rng):
     )
     clean = table.lookup(np.broadcast_to(melanin, blood.shape), blood) * light[:, None]
     rgb = clean * (1 + noise * rng.standard_normal(clean.shape))
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=(noise * clean) ** 2)
+    found = shared_melanin.estimate_shared_melanin(
+        rgb, table, prior=prior, variance=(noise * clean) ** 2
+    )
     good = found.valid
     within = np.abs(found.melanin - melanin)[good] <= found.stderr_melanin[good]
     # four standard deviations of a binomial, and the ends of the table where more is covered
@@ -314,9 +326,9 @@ def test_arguments_that_do_not_fit_are_named(table, prior):
     )
     for given, message in cases:
         with pytest.raises(ChromophoreError, match=message):
-            shared_melanin.weigh(rgb, table, prior=prior, **given)
+            shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, **given)
     with pytest.raises(ChromophoreError, match="rgb: expected shape"):
-        shared_melanin.weigh(np.ones(3), table, prior=prior)
+        shared_melanin.estimate_shared_melanin(np.ones(3), table, prior=prior)
 
 
 def test_an_own_error_of_a_state_counts_as_noise_that_goes_together(table, prior, rng):
@@ -331,14 +343,16 @@ def test_an_own_error_of_a_state_counts_as_noise_that_goes_together(table, prior
     rgb[1] *= np.exp(rng.multivariate_normal(np.zeros(3), own, pixels))
     given = np.zeros((2, pixels, 3, 3))
     given[1] = own
-    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance, own_error=given)
+    found = shared_melanin.estimate_shared_melanin(
+        rgb, table, prior=prior, variance=variance, own_error=given
+    )
     low, high = chi_square_band(pixels)
     for error, stderr in (
         (found.melanin - MELANIN, found.stderr_melanin),
         (found.change[1] - (BLOOD[1] - BLOOD[0]), found.stderr_change[1]),
     ):
         assert 0.7 * low < np.mean((error / stderr) ** 2) < 1.3 * high
-    without = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
+    without = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
     assert np.median(without.stderr_change[1]) < 0.3 * np.median(found.stderr_change[1])
 
 
@@ -346,7 +360,9 @@ def test_an_own_error_that_does_not_fit_is_refused(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-4, pixels=4)
     for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
         with pytest.raises(ChromophoreError, match="own_error"):
-            shared_melanin.weigh(rgb, table, prior=prior, variance=variance, own_error=wrong)
+            shared_melanin.estimate_shared_melanin(
+                rgb, table, prior=prior, variance=variance, own_error=wrong
+            )
 
 
 def test_pixels_of_one_face_tell_each_others_melanin_and_moles_stay_moles(table, prior, rng):
@@ -367,7 +383,7 @@ def test_pixels_of_one_face_tell_each_others_melanin_and_moles_stay_moles(table,
     seen = clean * (1.0 + 3e-3 * rng.standard_normal(clean.shape))
     errors = {}
     for one_face in (False, True):
-        found = shared_melanin.weigh(
+        found = shared_melanin.estimate_shared_melanin(
             seen,
             table,
             prior=prior,

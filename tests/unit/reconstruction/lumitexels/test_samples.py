@@ -335,7 +335,7 @@ def test_samples_asked_for_again_are_kept_until_an_image_comes_in(tmp_path, monk
     # what is too large to keep, or on disk, is put together anew, and the same
     on_disk = filled(tmp_path)
     assert on_disk.chunk(0, 77) is not on_disk.chunk(0, 77)
-    monkeypatch.setattr("reconstruction.lumitexels.store.KEPT_BYTES", 0)
+    monkeypatch.setattr("reconstruction.lumitexels.store.MAX_CACHED_BYTES", 0)
     large = filled()
     assert large.chunk(0, 77) is not large.chunk(0, 77)
     np.testing.assert_array_equal(large.chunk(0, 77).f, first[0].f)

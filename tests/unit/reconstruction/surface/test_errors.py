@@ -62,9 +62,9 @@ def plain(surface, stderr=0.0):
 def test_a_planes_normals_get_no_error_from_misplaced_samples_but_the_finest_relief():
     surface = sheet(flat)
     found = surface_errors.of_normals(plain(surface), surface, 3.0)
-    np.testing.assert_allclose(found.stderr, surface_errors.UNRESOLVED_RAD, rtol=1e-6)
+    np.testing.assert_allclose(found.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
     coarse = surface_errors.of_normals(plain(surface), surface, 30.0)
-    np.testing.assert_allclose(coarse.stderr, surface_errors.UNRESOLVED_RAD, rtol=1e-6)
+    np.testing.assert_allclose(coarse.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
 
 
 def test_the_error_of_misplaced_samples_is_curvature_times_misplacement():
@@ -73,8 +73,8 @@ def test_the_error_of_misplaced_samples_is_curvature_times_misplacement():
     for radius in (40.0, 80.0, 160.0):
         surface = sheet(ball(radius), step=1.0)
         found = surface_errors.of_normals(plain(surface, 0.001), surface, pixel)
-        turn = surface_errors.MISPLACED_PX * pixel / radius
-        expected = np.sqrt(0.001**2 + surface_errors.UNRESOLVED_RAD**2 + turn**2)
+        turn = surface_errors.POSITION_SIGMA_PX * pixel / radius
+        expected = np.sqrt(0.001**2 + surface_errors.UNRESOLVED_RELIEF_RAD**2 + turn**2)
         np.testing.assert_allclose(found.stderr, expected, rtol=0.01)
 
 
@@ -109,7 +109,7 @@ def seen_and_true(rng, roughness):
     for axis in (0, 1):
         fine_seen = np.apply_along_axis(np.convolve, axis, fine_seen, blur, "same")
     rows, columns = np.meshgrid(np.arange(side) * 4 + 8, np.arange(side) * 4 + 8, indexing="ij")
-    off = np.rint(rng.normal(scale=4 * surface_errors.MISPLACED_PX, size=(2, side, side)))
+    off = np.rint(rng.normal(scale=4 * surface_errors.POSITION_SIGMA_PX, size=(2, side, side)))
     off = off.astype(int)
     return fine_seen[rows + off[0], columns + off[1]].ravel(), fine[rows, columns].ravel()
 
@@ -190,7 +190,7 @@ def test_even_albedo_keeps_the_error_of_its_noise_and_of_its_scale():
     count = len(surface.points_mm)
     even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))
     found = surface_errors.of_albedo(even, plain(surface), surface, 2.0)
-    scale = 0.3 * surface_errors.SHARED_R_D
+    scale = 0.3 * surface_errors.SHARED_R_D_ERROR
     np.testing.assert_allclose(found.stderr, np.hypot(0.002, scale), rtol=1e-6)
     # normals off by 0.02 rad take 1 % of the albedo along
     tilted = surface_errors.of_albedo(even, plain(surface, 0.02), surface, 2.0)

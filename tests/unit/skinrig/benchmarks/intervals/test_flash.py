@@ -14,7 +14,9 @@ def test_subjects_stand_off_the_tiles_place_by_what_the_stated_error_of_light_is
     nearer = np.array([trials.nearer_mm(seed) for seed in range(400)])
     light = -2.0 * np.log1p(-nearer / distance_mm)
     low, high = stats.chi2.ppf([0.005, 0.995], nearer.size - 1) / (nearer.size - 1)
-    assert low < light.var(ddof=1) / shading_prior.SOFTNESS**2 < high * 1.02  # for its bend
+    assert (
+        low < light.var(ddof=1) / shading_prior.LOG_SHADING_SOFTNESS**2 < high * 1.02
+    )  # for its bend
     assert abs(nearer.mean()) < 2.6 * nearer.std() / np.sqrt(nearer.size)
 
 
