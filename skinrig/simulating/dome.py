@@ -133,16 +133,16 @@ def simulate_dome(order: Order) -> Simulated:
 
 def _state(order: Order) -> str:
     """Return the state of the one face that a session of the dome shows."""
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
     if len(order.states) != 1:
         raise OptionsError(
             f"states: got {', '.join(order.states) or 'none'}, expected one; a session of the dome "
             "shows one face, capture each state into a session of its own"
         )
-    if order.states[0] not in STATES:
+    if order.states[0] not in STATE_NAMES:
         raise SimulationError(
-            f"state: got {order.states[0]!r}, expected one of {', '.join(STATES)}"
+            f"state: got {order.states[0]!r}, expected one of {', '.join(STATE_NAMES)}"
         )
     if order.target is not None and order.states[0] != "neutral":
         raise OptionsError(f"state: got {order.states[0]!r}, but a target has none")
@@ -304,9 +304,9 @@ def _rig(order: Order) -> Rig:
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-    from rigsim.scenes.dome.targets import PLACES, plate_normals
+    from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals
 
-    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
+    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else TARGET_POSES
     return dome_calibration_plan(
         rig,
         cast(DomeTarget, target),
@@ -336,7 +336,7 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
         person = one.face(TEXELS)
         conditions = dict(one.applied) | conditions
     else:
-        subject = subject_file.named(order.subject)
+        subject = subject_file.load_subject(order.subject)
         person = subject.face(seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
@@ -372,12 +372,12 @@ def _light_of_skin(order: Order) -> dict[str, Any]:
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
     from rigsim.scanner.pods import Scanner, scan_face, wrap_template
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
     scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
-        rng = np.random.default_rng([order.seed, 7, STATES.index(order.states[0])])
+        rng = np.random.default_rng([order.seed, 7, STATE_NAMES.index(order.states[0])])
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
         scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)

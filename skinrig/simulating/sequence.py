@@ -51,11 +51,11 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     """Simulate a sequence with the flash rig; see `simulation.simulate_session`."""
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
     from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 
-    if sequence.state not in STATES or sequence.state == "neutral":
-        expected = ", ".join(state for state in STATES if state != "neutral")
+    if sequence.state not in STATE_NAMES or sequence.state == "neutral":
+        expected = ", ".join(state for state in STATE_NAMES if state != "neutral")
         raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")
     order.refuse(
         "flash",
@@ -98,7 +98,7 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     else:
         course = EventCourse(sequence.state, constant_s)
     texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
-    subject = subject_file.named(order.subject)
+    subject = subject_file.load_subject(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
     if order.progress is not None:

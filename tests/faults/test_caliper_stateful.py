@@ -20,7 +20,7 @@ from hypothesis.stateful import run_state_machine_as_test as run_machine
 from capture.devices.port import BoxRebooted, CommandRefused, Port, PortTimeout
 from capture.devices.wire import Code
 from capture.rig import load_rig
-from rigsim.boxes.caliper import CONTROL_S, CaliperUnit
+from rigsim.boxes.caliper import CALIPER_CONTROL_PERIOD_S, CaliperUnit
 from rigsim.boxes.controller import Controller
 from rigsim.world import World
 from rigsim.world.faults import Faults
@@ -78,7 +78,11 @@ class NoisyCaliper(RuleBasedStateMachine):
         if moved and not (unit.homed or unit._move.homing):
             self.faulty.append(f"moved unhomed at {now}")
         over = unit.limit_n is not None and abs(unit.felt_n) >= unit.limit_n
-        if over and self.over_since is not None and now > self.over_since + CONTROL_S + 1e-9:
+        if (
+            over
+            and self.over_since is not None
+            and now > self.over_since + CALIPER_CONTROL_PERIOD_S + 1e-9
+        ):
             self.faulty.append(f"{unit.felt_n} N of {unit.limit_n} N at {now}")
         if not over:
             self.over_since = None

@@ -11,7 +11,7 @@ from skinrig.reporting import page
 from skinrig.simulating.leaving_out import may_be_left_out
 
 ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
-"""In which verdicts are listed, see `rigsim.needs.effects.MEANING`."""
+"""In which verdicts are listed, see `rigsim.needs.effects.VERDICT_MEANINGS`."""
 
 WORDS = {
     "asked": "left out as asked",
