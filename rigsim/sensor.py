@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 
-CHANNEL: Final = {"R": 0, "G": 1, "B": 2}
+CFA_CHANNELS: Final = {"R": 0, "G": 1, "B": 2}
 """Layer of each filter color in camera RGB."""
 
 
@@ -215,7 +215,7 @@ def mosaic(light: ArrayLike, cfa: str) -> Float32Array:
     out = np.empty(image.shape[:2], np.float32)
     for index, color in enumerate(cfa):
         row, column = divmod(index, 2)
-        out[row::2, column::2] = image[row::2, column::2, CHANNEL[color]]
+        out[row::2, column::2] = image[row::2, column::2, CFA_CHANNELS[color]]
     return out
 
 

@@ -146,7 +146,7 @@ def parameters(seed: int, scale: float) -> dict[str, object]:
         "roulette": [ROULETTE_BELOW, ROULETTE_SURVIVAL],
         "epidermis_mm": skin_layers.EPIDERMIS_MM,
         "eta": skin_layers.ETA,
-        "g": skin_layers.ANISOTROPY,
+        "g": skin_layers.SKIN_ANISOTROPY,
         "epidermal_blood_share": skin_layers.EPIDERMAL_BLOOD_SHARE,
         "wavelength_nm": wavelengths,
         "melanin_per_mm": [skin_layers.melanin_per_mm(nm) for nm in wavelengths],

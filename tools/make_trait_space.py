@@ -37,15 +37,15 @@ from model.traits import TraitSpace, cosine
 from model.traits.storage import PACKAGED, TraitLibrary, from_bytes
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
-from rigsim.population.conditions import CONDITIONS
+from rigsim.population.conditions import CONDITION_NAMES
 from rigsim.population.population import Member, shifted, table_1
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces
 
 TAN = 1.5
-WORN = ("normal", *CONDITIONS)
-SEEN_ON_SURFACE = (*CONDITIONS[1:], "female")
+WORN = ("normal", *CONDITION_NAMES)
+SEEN_ON_SURFACE = (*CONDITION_NAMES[1:], "female")
 BORN = ("female", "asian")
 WITHOUT = {"freckles": 0.1, "beard": 0.1}
 PUT_ON = {
@@ -113,7 +113,7 @@ def packaged(space: TraitSpace) -> TraitSpace:
     notes = {}
     if len(space.basis) > DIRECTIONS:
         notes["basis"] = f"the first {DIRECTIONS} of {len(space.basis)}; vectors are of all"
-    names = {trait for trait in (*BORN, *PUT_ON, *CONDITIONS, "age") if trait in space.traits}
+    names = {trait for trait in (*BORN, *PUT_ON, *CONDITION_NAMES, "age") if trait in space.traits}
     traits = {
         name: dataclasses.replace(
             trait,
@@ -135,7 +135,7 @@ def surface_truth(space: TraitSpace, people: Sequence[Member], seed: int) -> dic
     bare = [dataclasses.replace(person, applied=()) for person in some]
     worn = {
         name: [dataclasses.replace(person, applied=((name, 1.0),)) for person in bare]
-        for name in CONDITIONS[1:]
+        for name in CONDITION_NAMES[1:]
     }
     changes = trait_truth.lobe_changes(bare, worn, rng=np.random.default_rng([seed, 5]))
     return {
@@ -260,7 +260,7 @@ def main() -> None:
         "surface_truth",
         lambda: np.array(list(surface_truth(surface, people, given.seed).values())),
     )
-    truth = {"surface": dict(zip(CONDITIONS[1:], found.tolist(), strict=True))}
+    truth = {"surface": dict(zip(CONDITION_NAMES[1:], found.tolist(), strict=True))}
     tell(f"cosines to the truth: {truth['surface']}")
     faces = CommonFaces.of(people, size=given.size, common=given.common)
     noise = trait_truth.ALBEDO_NOISE

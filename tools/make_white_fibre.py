@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from rigsim.fiber.profile import Fibres, fibre_paths
-from rigsim.fiber.white_fiber import APERTURE, ETA, FILE, G, decay, disc_points, distance_axis
+from rigsim.fiber.white_fiber import (
+    ETA,
+    HENYEY_GREENSTEIN_G,
+    NUMERICAL_APERTURE,
+    TABLE_FILE,
+    decay,
+    disc_points,
+    distance_axis,
+)
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 FloatArray = NDArray[np.float64]
@@ -86,10 +94,22 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
             told = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
             radii, widths, values = [], [], []
             for group, (radius, width, photons) in enumerate(groups(base)):
-                stack = LayerStack((Layer(inf, max(base, LEAST), 1.0 / (1.0 - G), G, ETA),))
+                stack = LayerStack(
+                    (
+                        Layer(
+                            inf,
+                            max(base, LEAST),
+                            1.0 / (1.0 - HENYEY_GREENSTEIN_G),
+                            HENYEY_GREENSTEIN_G,
+                            ETA,
+                        ),
+                    )
+                )
                 paths = fibre_paths(
                     stack,
-                    Fibres(tuple(radius.tolist()), width, 0.0, APERTURE, APERTURE),
+                    Fibres(
+                        tuple(radius.tolist()), width, 0.0, NUMERICAL_APERTURE, NUMERICAL_APERTURE
+                    ),
                     photons=round(scale * photons),
                     rng=np.random.default_rng([seed, number, group]),
                     batches=BATCHES,
@@ -241,9 +261,9 @@ def main() -> None:
     runs = trace(asked.work, asked.photons_scale, asked.threads, asked.seed)
     shape, error = combine(runs)
     recipe = {
-        "g": G,
+        "g": HENYEY_GREENSTEIN_G,
         "eta": ETA,
-        "numerical_aperture": APERTURE,
+        "numerical_aperture": NUMERICAL_APERTURE,
         "bases": BASES,
         "batches": BATCHES,
         "photons": [[round(asked.photons_scale * n) for _, _, n in groups(b)] for b in BASES],
@@ -253,7 +273,7 @@ def main() -> None:
         "python": platform.python_version(),
     }
     np.savez_compressed(
-        ROOT / "rigsim" / "data" / FILE,
+        ROOT / "rigsim" / "data" / TABLE_FILE,
         distance=DISTANCE,
         absorption=ABSORPTION,
         shape=shape.astype(np.float32),

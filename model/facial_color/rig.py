@@ -117,7 +117,7 @@ class HemoglobinRig(RigMaps):
         states
             The other states by name, (H, W) each, aligned to the neutral map (a few pixels,
             little against the radius, do not matter). A name is lower case, e.g. one of
-            `rigsim.subject.perfusion.STATES`.
+            `rigsim.subject.perfusion.STATE_NAMES`.
         radius_px
             Radius of the disc of eq. (1), px.
         valid

@@ -19,12 +19,12 @@ READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser's rotator in each state."""
 
 
-class FilmError(ValueError):
+class PolarizerError(ValueError):
     """A film or a state of the polarizers is described wrongly."""
 
 
 @dataclass(frozen=True, slots=True)
-class Films:
+class Polarizers:
     """Truth about the films; calibration has to find it out."""
 
     light_extinction: float
@@ -39,9 +39,11 @@ class Films:
         for name in ("light_extinction", "analyser_extinction"):
             value = getattr(self, name)
             if not value > 1.0:
-                raise FilmError(f"{name}: got {value}, expected > 1 (inf is ideal film)")
+                raise PolarizerError(f"{name}: got {value}, expected > 1 (inf is ideal film)")
         if not -10.0 <= self.analyser_zero_deg <= 10.0:
-            raise FilmError(f"analyser_zero_deg: got {self.analyser_zero_deg}, expected -10 to 10")
+            raise PolarizerError(
+                f"analyser_zero_deg: got {self.analyser_zero_deg}, expected -10 to 10"
+            )
 
     def passes_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
         """Return the true passing axis of the analyser, degrees from the image's x axis.
@@ -56,20 +58,22 @@ class Films:
             Reading of the rotator; ``None`` takes that of the state.
         """
         if polarizer not in READING_DEG:
-            raise FilmError(f"polarizer: got {polarizer!r}, expected parallel or crossed")
+            raise PolarizerError(f"polarizer: got {polarizer!r}, expected parallel or crossed")
         reading = READING_DEG[polarizer] if analyser_deg is None else analyser_deg
         if not math.isfinite(reading):
-            raise FilmError(f"analyser_deg: got {reading}, expected a finite angle")
+            raise PolarizerError(f"analyser_deg: got {reading}, expected a finite angle")
         if view.analyser_axis_deg is None:
-            raise FilmError(f"view {view.name!r}: has no analyser; give it an analyser_axis_deg")
+            raise PolarizerError(
+                f"view {view.name!r}: has no analyser; give it an analyser_axis_deg"
+            )
         return view.analyser_axis_deg + reading + self.analyser_zero_deg
 
 
-IDEAL = Films(math.inf, math.inf, 0.0)
+IDEAL_POLARIZERS = Polarizers(math.inf, math.inf, 0.0)
 """Films that leak nothing and stand exactly."""
 
 
-def films_of(rig: Rig) -> Films:
+def draw_polarizers(rig: Rig) -> Polarizers:
     """Return the films of a rig; they follow from its cameras' serial numbers.
 
     Parameters
@@ -87,11 +91,13 @@ def films_of(rig: Rig) -> Films:
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
     light, analyser = np.exp(rng.uniform(math.log(1500.0), math.log(6000.0), 2))
     zero = float(np.clip(rng.normal(0.0, 0.5), -1.2, 1.2))
-    return Films(float(light), float(analyser), zero)
+    return Polarizers(float(light), float(analyser), zero)
 
 
 def absorbing_axis(light: Light) -> Float64Array:
     """Return the absorbing axis of a light's film, which faces the rig's origin; shape (3,)."""
     if light.polarizer_axis_deg is None:
-        raise FilmError(f"light {light.name!r}: has no polarizer; give it a polarizer_axis_deg")
+        raise PolarizerError(
+            f"light {light.name!r}: has no polarizer; give it a polarizer_axis_deg"
+        )
     return axis_in_plane(light.polarizer_axis_deg + 90.0, light.position_mm, (0.0, 1.0, 0.0))

@@ -16,7 +16,7 @@ from rigsim.arrays import Float32Array, Float64Array
 SPOT_RADIUS_PX: Final = 12.0
 """Nominal radius of a fibre's end in the camera's image."""
 
-UNEVENNESS: Final = 0.05
+FIBER_END_UNEVENNESS: Final = 0.05
 """Standard deviation of the tilt and of the curvature of the light over a fibre's end, relative:
 its modes are not filled alike."""
 
@@ -149,7 +149,11 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
     place += size.shift_px * _bounded(rng, (1, 2)) + size.place_px * _bounded(rng, (count, 2))
     gain = 1.0 + size.gain * _bounded(rng, (count,))
     radius = SPOT_RADIUS_PX * (1.0 + size.radius * _bounded(rng, (count,)))
-    uneven = UNEVENNESS * _bounded(rng, (count, 3)) if size.radius > 0.0 else np.zeros((count, 3))
+    uneven = (
+        FIBER_END_UNEVENNESS * _bounded(rng, (count, 3))
+        if size.radius > 0.0
+        else np.zeros((count, 3))
+    )
     return ProbeBuild(
         place,
         radius,

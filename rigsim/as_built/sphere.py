@@ -14,7 +14,7 @@ from rigsim.arrays import Float64Array
 from rigsim.as_built.polarizers import absorbing_axis
 from rigsim.shading import axis_in_plane
 
-MOMENTS: Final = ("1", "x", "y", "z")
+MOMENT_NAMES: Final = ("1", "x", "y", "z")
 """What each LED's light is weighted with; every lighting condition is a sum of these four."""
 
 PATTERN_WEIGHTS: Final[dict[str, tuple[float, float, float, float]]] = {
@@ -99,7 +99,7 @@ class BuiltSphere:
         )
 
 
-def as_drawn(rig: Rig) -> BuiltSphere:
+def nominal_sphere(rig: Rig) -> BuiltSphere:
     """Return a sphere that stands exactly as its drawing says.
 
     Parameters
@@ -153,7 +153,7 @@ def build_sphere(
     BuiltSphere
     """
     size = tolerances or SphereTolerances()
-    drawn = as_drawn(rig)
+    drawn = nominal_sphere(rig)
     for name in (*dead, *weak):
         rig.light(name)
     position, intensity, absorbs = [], [], []
@@ -203,7 +203,7 @@ def diffuser_radiance(
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> white = diffuser_radiance(as_drawn(load_rig("gradient")), np.zeros(1), np.zeros(1))
+    >>> white = diffuser_radiance(nominal_sphere(load_rig("gradient")), np.zeros(1), np.zeros(1))
     >>> bool(abs(white[1, 0] / white[0, 0]) < 0.01), bool(white[3, 0] > 0.5 * white[0, 0])
     (True, True)
     """

@@ -28,17 +28,17 @@ from capture.devices.wire import Code
 from capture.rig import Caliper
 from rigsim.boxes.controller import Command, Refused, number
 
-__all__ = ["CONTROL_S", "CaliperUnit", "JawLoad"]
+__all__ = ["CALIPER_CONTROL_PERIOD_S", "CaliperUnit", "JawLoad"]
 
-CONTROL_S = 5e-3
+CALIPER_CONTROL_PERIOD_S = 5e-3
 """Period in which position and force are looked at while the motor runs, s."""
-MOST_STEPS = 15
+MAX_CAPTURE_STEPS = 15
 FORCE_LIMIT_N = (0.05, 10.0)
 """What the sensor can tell; what skin may bear is for a person to say."""
 LAG_MM = 0.05
 """Steps that the motor has lost, mm, from which a stall is known."""
 TURN_DEG_PER_S = 90.0
-ZERO_N = 0.01
+FORCE_ZERO_DEVIATION_N = 0.01
 """Deviation of what a sensor says of no force before it is tared, N."""
 HOME_SPEED = 0.5
 """Of the normal one."""
@@ -48,8 +48,14 @@ COMES_OFF_SHARE = 0.25
 LET_GO_S = 0.25
 """Force that is still beyond the limit so long after the jaws have turned back: let go."""
 
-MOVING, HOMED, INTERLOCK, ATTACHED, TRIPPED = 16, 32, 256, 512, 1024
-_STEP = re.compile(r"-?[0-9]{1,3}")
+STATUS_MOVING, STATUS_HOMED, STATUS_INTERLOCK, STATUS_ATTACHED, STATUS_TRIPPED = (
+    16,
+    32,
+    256,
+    512,
+    1024,
+)
+_STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
 
 
 class JawLoad(Protocol):
@@ -98,7 +104,7 @@ class _Move:
 
     @property
     def next_s(self) -> float:
-        return min(self.start_s + (self.ticks + 1) * CONTROL_S, self.arrives_s)
+        return min(self.start_s + (self.ticks + 1) * CALIPER_CONTROL_PERIOD_S, self.arrives_s)
 
     def driven_to_mm(self, now: float) -> float:
         if now >= self.arrives_s:
@@ -149,8 +155,8 @@ class CaliperUnit:
         self._sensor_dead = sensor_dead
         self._interlock_at = -math.inf if interlock else interlock_after
         self._rng = rng
-        self.step_min = max(caliper.first_step, -MOST_STEPS)
-        self.step_max = min(caliper.last_step, MOST_STEPS)
+        self.step_min = max(caliper.first_step, -MAX_CAPTURE_STEPS)
+        self.step_max = min(caliper.last_step, MAX_CAPTURE_STEPS)
         half = 0.5 * caliper.step_mm
         self._ends_mm = (
             caliper.reading_mm(self.step_min) - half,
@@ -160,7 +166,7 @@ class CaliperUnit:
         # what stays as it is without power: jaws, ring, and the count of moves
         self.aperture_mm = float(rng.uniform(*self._ends_mm))
         self.angle_deg = caliper.angles_deg[0]
-        self._offset_n = float(rng.normal(0.0, ZERO_N))
+        self._offset_n = float(rng.normal(0.0, FORCE_ZERO_DEVIATION_N))
         self._zero_n = 0.0
         self.moves: list[tuple[float, float]] = []  # when and whereto each began
         self._events: list[tuple[str, str]] = []
@@ -197,7 +203,7 @@ class CaliperUnit:
             "turn_deg_per_s": TURN_DEG_PER_S,
             "force_limit_min_n": FORCE_LIMIT_N[0],
             "force_limit_max_n": FORCE_LIMIT_N[1],
-            "control_period_ms": CONTROL_S * 1e3,
+            "control_period_ms": CALIPER_CONTROL_PERIOD_S * 1e3,
         }
 
     def commands(self) -> Mapping[str, Command]:
@@ -270,8 +276,12 @@ class CaliperUnit:
 
     def status_bits(self, now: float) -> int:
         """Return 16 moving, 32 homed, 256 stop open, 512 skin held, 1024 force limit met."""
-        bits = MOVING * self.busy(now) + HOMED * self.homed + INTERLOCK * self.interlock
-        return bits + ATTACHED * self.attached + TRIPPED * (self._barred is not None)
+        bits = (
+            STATUS_MOVING * self.busy(now)
+            + STATUS_HOMED * self.homed
+            + STATUS_INTERLOCK * self.interlock
+        )
+        return bits + STATUS_ATTACHED * self.attached + STATUS_TRIPPED * (self._barred is not None)
 
     @property
     def felt_n(self) -> float:
@@ -407,7 +417,7 @@ class CaliperUnit:
         return answer
 
     def _step(self, arguments: str, now: float) -> str:
-        if _STEP.fullmatch(arguments) is None:
+        if _STEP_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a whole number of steps")
         step = int(arguments)
         if not self.step_min <= step <= self.step_max:

@@ -31,10 +31,10 @@ CAPABILITY_PART = 48
 LEASE_MS = (300, 5000)
 DEFAULT_LEASE_MS = 1000
 
-_NUMBER = re.compile(r"-?[0-9]{1,9}(\.[0-9]{1,9})?")
-_WORD = re.compile(r"[A-Za-z0-9._-]{1,48}")
+_NUMBER_PATTERN = re.compile(r"-?[0-9]{1,9}(\.[0-9]{1,9})?")
+_WORD_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,48}")
 
-_TEXTS = {
+_CODE_TEXTS = {
     Code.SYNTAX: "Syntax error",
     Code.UNDEFINED_HEADER: "Undefined header",
     Code.NOT_ARMED: "Command protected; SYST:ARM first",
@@ -63,7 +63,7 @@ class Refused(Exception):
     def __init__(self, code: Code, detail: str = "") -> None:
         super().__init__(code, detail)
         self.code = code
-        self.reason = _TEXTS[code] + (f"; {detail}" if detail else "")
+        self.reason = _CODE_TEXTS[code] + (f"; {detail}" if detail else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,7 +323,7 @@ class Controller:
 
     def _remember(self, refused: Refused) -> None:
         if len(self._errors) == ERROR_QUEUE:
-            self._errors[-1] = (int(Code.QUEUE_OVERFLOW), _TEXTS[Code.QUEUE_OVERFLOW])
+            self._errors[-1] = (int(Code.QUEUE_OVERFLOW), _CODE_TEXTS[Code.QUEUE_OVERFLOW])
         else:
             self._errors.append((int(refused.code), refused.reason))
 
@@ -443,7 +443,7 @@ def number(text: str, low: float, high: float, unit: str) -> float:
     >>> number("0.5", 0.0, 1.0, "of full power")
     0.5
     """
-    if _NUMBER.fullmatch(text) is None:
+    if _NUMBER_PATTERN.fullmatch(text) is None:
         raise Refused(Code.SYNTAX, "expected a number")
     value = float(text)
     if not low <= value <= high:
@@ -460,6 +460,6 @@ def choice(text: str, names: tuple[str, ...]) -> str:
 
 def word(text: str) -> str:
     """Return the token that a command gives, or refuse with -102."""
-    if _WORD.fullmatch(text) is None:
+    if _WORD_PATTERN.fullmatch(text) is None:
         raise Refused(Code.SYNTAX, "expected 1 to 48 of A-Z a-z 0-9 . _ -")
     return text

@@ -32,7 +32,7 @@ from rigsim.boxes.led_table import (
 
 __all__ = ["DomeUnit", "LedPulse"]
 
-DEFAULT_MS = 100.0
+DEFAULT_LED_MS = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,9 @@ class DomeUnit(LedSequencer[Row]):
             raise Refused(Code.SYNTAX, "expected LEDS,MS,LEVEL")
         leds = self._leds(parts[0])
         longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
-        span_ms = number(parts[1], LED_MS[0], longest_ms, "ms") if len(parts) > 1 else DEFAULT_MS
+        span_ms = (
+            number(parts[1], LED_MS[0], longest_ms, "ms") if len(parts) > 1 else DEFAULT_LED_MS
+        )
         level = whole(parts[2], 1, LEVEL_STEPS) / LEVEL_STEPS if len(parts) > 2 else 1.0
         if len({*leds, *self.bank.lit}) > self._limits.max_at_once:
             raise Refused(Code.OUT_OF_RANGE, f"more than {self._limits.max_at_once} LEDs at once")

@@ -20,7 +20,7 @@ __all__ = ["EyeGuard", "Lit"]
 
 EYE_MM = (0.0, 25.0, 80.0)
 """Between the eyes of a nominal head, rig frame; it looks along +z."""
-BAND_HZ = (3.0, 65.0)
+FLICKER_BAND_HZ = (3.0, 65.0)
 BLUR_S = 1.0 / 65.0
 """Shortest time in which flicker is seen."""
 GRID_S = 2e-3
@@ -88,7 +88,9 @@ class EyeGuard:
         mean = float((weight * (off - on)).sum()) / span
         if span < RMS_FROM_S or mean <= 0.0:
             return 0.0
-        orders = np.arange(math.ceil(BAND_HZ[0] * span), math.floor(BAND_HZ[1] * span) + 1)
+        orders = np.arange(
+            math.ceil(FLICKER_BAND_HZ[0] * span), math.floor(FLICKER_BAND_HZ[1] * span) + 1
+        )
         omega = 2.0 * np.pi * orders / span
         power = 0.0
         for part in np.array_split(omega, max(1, omega.size * on.size // 200_000)):

@@ -30,7 +30,7 @@ Polarizer = Literal["parallel", "crossed"]
 
 MIN_POWER = 1.0 / 256.0
 LAMP_MS = (1.0, 500.0)
-ANALYSER_DEG = (0.0, 180.0)
+ANALYZER_RANGE_DEG = (0.0, 180.0)
 SYNC_US = (0.0, 50_000.0)
 """Delay from camera line to pop; an answer may not keep the line waiting for longer."""
 POP_WINDOW_S = 60.0
@@ -45,7 +45,7 @@ LAMP_TAU_S = 20.0
 HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
 """Temperatures at which the lamp's driver trips and recovers; 1 is where it would settle."""
 
-MOVING, NOT_READY, LAMP_ON, HOT, INTERLOCK = 16, 32, 64, 128, 256
+STATUS_MOVING, STATUS_NOT_READY, STATUS_LAMP_ON, STATUS_HOT, STATUS_INTERLOCK = 16, 32, 64, 128, 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +162,8 @@ class FlashUnit:
         return {
             "power_min": MIN_POWER,
             "power_max": 1.0,
-            "analyser_min_deg": ANALYSER_DEG[0],
-            "analyser_max_deg": ANALYSER_DEG[1],
+            "analyser_min_deg": ANALYZER_RANGE_DEG[0],
+            "analyser_max_deg": ANALYZER_RANGE_DEG[1],
             "sync_min_us": SYNC_US[0],
             "sync_max_us": SYNC_US[1],
             "lamp_min_ms": LAMP_MS[0],
@@ -272,8 +272,14 @@ class FlashUnit:
 
     def status_bits(self, now: float) -> int:
         """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot, 256 stop open."""
-        bits = MOVING * self.busy(now) + NOT_READY * (self._wait_for_fire(now)[0] > 0.0)
-        bits += LAMP_ON * self._lamp.lit + HOT * self._lamp.hot + INTERLOCK * self.interlock
+        bits = STATUS_MOVING * self.busy(now) + STATUS_NOT_READY * (
+            self._wait_for_fire(now)[0] > 0.0
+        )
+        bits += (
+            STATUS_LAMP_ON * self._lamp.lit
+            + STATUS_HOT * self._lamp.hot
+            + STATUS_INTERLOCK * self.interlock
+        )
         return bits
 
     # analyser ---------------------------------------------------------------------------------
@@ -294,7 +300,7 @@ class FlashUnit:
         return "PAR" if self.polarizer == "parallel" else "CROS"
 
     def _set_angle(self, arguments: str, now: float) -> str:
-        self.analyser_deg = number(arguments, *ANALYSER_DEG, "degrees")
+        self.analyser_deg = number(arguments, *ANALYZER_RANGE_DEG, "degrees")
         self._turn(self.analyser_deg, now)
         return ""
 

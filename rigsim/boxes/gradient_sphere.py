@@ -28,7 +28,7 @@ from rigsim.boxes.eye_guard import Lit
 from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run, whole
 from rigsim.boxes.led_table import LEVEL_STEPS, Switch, table_crc
 from rigsim.boxes.pattern_table import (
-    ANALYSER_DEG,
+    ANALYZER_RANGE_DEG,
     PatternRow,
     parse_patterns,
     pattern_name,
@@ -39,9 +39,9 @@ from rigsim.boxes.pattern_table import (
 
 __all__ = ["GradientSphereUnit", "PatternLight"]
 
-DEFAULT_MS = 100.0
-TURNING = 1024
-_GAINS = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
+DEFAULT_LED_MS = 100.0
+STATUS_TURNING = 1024
+_GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +135,8 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         """Return limits and counts, units in the names."""
         return {
             **super().capabilities(),
-            "analyser_min_deg": ANALYSER_DEG[0],
-            "analyser_max_deg": ANALYSER_DEG[1],
+            "analyser_min_deg": ANALYZER_RANGE_DEG[0],
+            "analyser_max_deg": ANALYZER_RANGE_DEG[1],
             "move_s_per_deg": round(self._s_per_deg, 9),
         }
 
@@ -182,7 +182,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     def status_bits(self, now: float) -> int:
         """Return those of all boxes with LEDs, and 1024 turning."""
-        return super().status_bits(now) | TURNING * self.turning(now)
+        return super().status_bits(now) | STATUS_TURNING * self.turning(now)
 
     def _turn(self, reading_deg: float, now: float) -> None:
         start = max(now, self._settled_at)
@@ -193,7 +193,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         return self._set_angle(choice(arguments, ("0", "90")), now)
 
     def _set_angle(self, arguments: str, now: float) -> str:
-        reading_deg = round(number(arguments, *ANALYSER_DEG, "degrees"), 3)
+        reading_deg = round(number(arguments, *ANALYZER_RANGE_DEG, "degrees"), 3)
         self._require_still()
         if self.lit:
             raise Refused(Code.IGNORED, "a light is on; PATT DARK first")
@@ -264,7 +264,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
             self.bank.all_off(now)
             return ""
         longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
-        span_ms = number(more[0], LED_MS[0], longest_ms, "ms") if more else DEFAULT_MS
+        span_ms = number(more[0], LED_MS[0], longest_ms, "ms") if more else DEFAULT_LED_MS
         level = whole(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
         self._require_closed_stop()
         self._require_settled(now)
@@ -324,7 +324,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
     def _define_gains(self, arguments: str, now: float) -> str:
         self._require_still()
         first_text, _, rest = arguments.partition(",")
-        if _GAINS.fullmatch(rest) is None:
+        if _GAINS_PATTERN.fullmatch(rest) is None:
             raise Refused(Code.SYNTAX, "expected FIRST,GAIN+GAIN...")
         first = whole(first_text, 0, len(self._gains_sent))
         gains = [int(part) for part in rest.split("+")]

@@ -24,13 +24,20 @@ from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, table_crc
 
 __all__ = ["LED_MS", "LedSequencer", "Run", "TableRow", "whole"]
 
-_MASK = re.compile(r"[0-9A-Fa-f]{1,8}")
+_MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_MS = (1.0, 500.0)
-EYES = ("OPEN", "CLOSED", "SHIELDED")
+EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
 HISTORY_S = 1.0
 """Light so long ago counts as one with light to come."""
 
-RUNNING, SEQUENCE_ARMED, LIT, HOT, INTERLOCK, EYES_SAFE = 16, 32, 64, 128, 256, 512
+(
+    STATUS_RUNNING,
+    STATUS_SEQUENCE_ARMED,
+    STATUS_LIT,
+    STATUS_HOT,
+    STATUS_INTERLOCK,
+    STATUS_EYES_SAFE,
+) = 16, 32, 64, 128, 256, 512
 
 
 class TableRow(Protocol):
@@ -272,9 +279,13 @@ class LedSequencer(ABC, Generic[RowT]):
 
     def status_bits(self, now: float) -> int:
         """Return 16 running, 32 sequence armed, 64 lit, 128 hot, 256 stop open, 512 eyes safe."""
-        bits = RUNNING * self.running + SEQUENCE_ARMED * self._sequence_armed + LIT * self.lit
-        bits += HOT * self.bank.any_hot + INTERLOCK * self.interlock
-        return bits + EYES_SAFE * (self.eyes != "OPEN")
+        bits = (
+            STATUS_RUNNING * self.running
+            + STATUS_SEQUENCE_ARMED * self._sequence_armed
+            + STATUS_LIT * self.lit
+        )
+        bits += STATUS_HOT * self.bank.any_hot + STATUS_INTERLOCK * self.interlock
+        return bits + STATUS_EYES_SAFE * (self.eyes != "OPEN")
 
     # sequence ---------------------------------------------------------------------------------
 
@@ -369,7 +380,7 @@ class LedSequencer(ABC, Generic[RowT]):
     # cameras, eyes, dose ----------------------------------------------------------------------
 
     def _set_mask(self, arguments: str, now: float) -> str:
-        if _MASK.fullmatch(arguments) is None:
+        if _MASK_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a mask in hexadecimal digits")
         mask = int(arguments, 16)
         if mask >= 1 << self._cameras:
@@ -388,7 +399,7 @@ class LedSequencer(ABC, Generic[RowT]):
         return f"{token},{self._clock_us(now)}"
 
     def _set_eyes(self, arguments: str, now: float) -> str:
-        self.eyes = choice(arguments, EYES)
+        self.eyes = choice(arguments, EYE_STATES)
         self._sequence_armed = False
         return ""
 

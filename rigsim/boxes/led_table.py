@@ -15,7 +15,7 @@ __all__ = ["Row", "Switch", "lit_by", "parse_leds", "parse_rows", "switches", "t
 
 LEVEL_STEPS = 1000
 ROW_US = (2_000, 500_000)
-_ROW = re.compile(r"(-|[0-9+]{1,400}):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})")
+_ROW_PATTERN = re.compile(r"(-|[0-9+]{1,400}):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def parse_rows(text: str, *, count: int, at_once: int, cameras: int, most_us: in
     """Return rows separated by ``;``, each ``leds:level:us:mask``."""
     rows = []
     for part in text.split(";"):
-        found = _ROW.fullmatch(part)
+        found = _ROW_PATTERN.fullmatch(part)
         if found is None:
             raise Refused(Code.SYNTAX, "expected LEDS:LEVEL:US:MASK;...")
         leds_text, level, dwell, mask = found.groups()

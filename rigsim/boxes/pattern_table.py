@@ -16,10 +16,17 @@ from rigsim.arrays import Float64Array
 from rigsim.boxes.controller import Refused, number
 from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch
 
-__all__ = ["ANALYSER_DEG", "PatternRow", "parse_patterns", "pattern_shares", "schedule", "starts"]
+__all__ = [
+    "ANALYZER_RANGE_DEG",
+    "PatternRow",
+    "parse_patterns",
+    "pattern_shares",
+    "schedule",
+    "starts",
+]
 
-ANALYSER_DEG = (0.0, 180.0)
-_ROW = re.compile(
+ANALYZER_RANGE_DEG = (0.0, 180.0)
+_ROW_PATTERN = re.compile(
     r"([A-Za-z-]{1,4}):([0-9]{1,3}(?:\.[0-9]{1,3})?):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})"
 )
 
@@ -63,12 +70,12 @@ def parse_patterns(text: str, *, cameras: int, most_us: int) -> list[PatternRow]
     """Return rows separated by ``;``, each ``pattern:degrees:level:us:mask``."""
     rows = []
     for part in text.split(";"):
-        found = _ROW.fullmatch(part)
+        found = _ROW_PATTERN.fullmatch(part)
         if found is None:
             raise Refused(Code.SYNTAX, "expected PATTERN:DEGREES:LEVEL:US:MASK;...")
         name, angle, level, dwell, mask = found.groups()
         pattern = pattern_name(name)
-        angle_deg = number(angle, *ANALYSER_DEG, "degrees")
+        angle_deg = number(angle, *ANALYZER_RANGE_DEG, "degrees")
         row = PatternRow(pattern, angle_deg, int(level), int(dwell), int(mask, 16))
         if row.level_steps > LEVEL_STEPS or (pattern == "dark") != (row.level_steps == 0):
             raise Refused(Code.OUT_OF_RANGE, f"expected level 1 to {LEVEL_STEPS}, 0 when dark")

@@ -28,10 +28,10 @@ from capture.rig import LedLimits, Light, Probe
 from rigsim.boxes.controller import Command, Later, Refused, number, word
 from rigsim.boxes.source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
 from rigsim.boxes.suction_pump import (
-    CONTROL_S,
-    LEAST_MBAR,
-    LEAST_MS,
-    REACH_S,
+    MAX_PUMPING_S,
+    MIN_SUCTION_MBAR,
+    MIN_SUCTION_MS,
+    PUMP_CONTROL_PERIOD_S,
     Gauge,
     SuctionLoad,
     SuctionPump,
@@ -39,10 +39,18 @@ from rigsim.boxes.suction_pump import (
 
 __all__ = ["ProbeUnit", "SourceLight"]
 
-MOVING, SUCKING, LIT, INTERLOCK, PLACED, RESTING, JAMMED = 16, 32, 64, 256, 512, 1024, 2048
+(
+    STATUS_MOVING,
+    STATUS_SUCKING,
+    STATUS_LIT,
+    STATUS_INTERLOCK,
+    STATUS_PLACED,
+    STATUS_RESTING,
+    STATUS_JAMMED,
+) = 16, 32, 64, 256, 512, 1024, 2048
 THERMOMETER_C = 0.03
 """Standard deviation of one reading of the camera's thermometer, kelvin."""
-_WHOLE = re.compile(r"[0-9]{1,4}")
+_WHOLE_PATTERN = re.compile(r"[0-9]{1,4}")
 
 
 class ProbeUnit:
@@ -142,13 +150,13 @@ class ProbeUnit:
             "shutter_max_ms": round(probe.max_open_s * 1e3, 6),
             "shutter_lag_ms": SHUTTER_MS,
             "cover_ms": COVER_S * 1e3,
-            "suction_min_mbar": LEAST_MBAR,
+            "suction_min_mbar": MIN_SUCTION_MBAR,
             "suction_max_mbar": probe.max_suction_mbar,
-            "suction_min_ms": LEAST_MS,
+            "suction_min_ms": MIN_SUCTION_MS,
             "suction_max_ms": round(probe.max_suction_s * 1e3, 6),
-            "reach_ms": REACH_S * 1e3,
+            "reach_ms": MAX_PUMPING_S * 1e3,
             "rest_ms": round(probe.rest_s * 1e3, 6),
-            "control_period_ms": CONTROL_S * 1e3,
+            "control_period_ms": PUMP_CONTROL_PERIOD_S * 1e3,
             "camera_c": probe.camera_c,
             "source_w": self._source.power_w,
             "dose_ws": self.shutter.dose_limit_ws,
@@ -257,9 +265,13 @@ class ProbeUnit:
     def status_bits(self, now: float) -> int:
         """Return 16 busy, 32 sucking, 64 lit, 256 stop, 512 placed, 1024 resting, 2048 jammed."""
         pump, shutter = self.pump, self.shutter
-        bits = MOVING * self.busy(now) + SUCKING * pump.drawing + LIT * shutter.lit
-        bits += INTERLOCK * self.interlock + PLACED * (pump.placement is not None)
-        return bits + RESTING * (pump.rest_ms(now) > 0) + JAMMED * shutter.jammed
+        bits = (
+            STATUS_MOVING * self.busy(now)
+            + STATUS_SUCKING * pump.drawing
+            + STATUS_LIT * shutter.lit
+        )
+        bits += STATUS_INTERLOCK * self.interlock + STATUS_PLACED * (pump.placement is not None)
+        return bits + STATUS_RESTING * (pump.rest_ms(now) > 0) + STATUS_JAMMED * shutter.jammed
 
     def _let_go(self, now: float, how: str) -> None:
         self.shutter.go_dark(now, how)
@@ -308,8 +320,8 @@ class ProbeUnit:
         length, comma, suction = rest.partition(",")
         if on.upper() != "ON" or not comma:
             raise Refused(Code.SYNTAX, "expected ON,<ms>,<mbar> or VENT")
-        span_ms = number(length, LEAST_MS, self._probe.max_suction_s * 1e3, "ms")
-        mbar = number(suction, LEAST_MBAR, self._probe.max_suction_mbar, "mbar")
+        span_ms = number(length, MIN_SUCTION_MS, self._probe.max_suction_s * 1e3, "ms")
+        mbar = number(suction, MIN_SUCTION_MBAR, self._probe.max_suction_mbar, "mbar")
         self._require_stop_closed()
         return self.pump.draw(span_ms / 1e3, mbar, now)
 
@@ -325,7 +337,7 @@ class ProbeUnit:
     # light ------------------------------------------------------------------------------------
 
     def _set_level(self, arguments: str, now: float) -> str:
-        if _WHOLE.fullmatch(arguments) is None:
+        if _WHOLE_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a whole number of thousandths")
         level = int(arguments)
         if level > LEVEL_STEPS:
@@ -367,7 +379,7 @@ class ProbeUnit:
         if arguments.upper() == "ALL":
             self.shutter.cover(None, now)
             return ""
-        if _WHOLE.fullmatch(arguments) is None:
+        if _WHOLE_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected the number of a fibre, or ALL")
         if int(arguments) >= self.shutter.fibres:
             raise Refused(Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL")

@@ -19,19 +19,26 @@ from capture.devices.wire import Code
 from capture.rig import Probe
 from rigsim.boxes.controller import Refused
 
-__all__ = ["CONTROL_S", "LEAST_MBAR", "REACH_S", "Gauge", "SuctionLoad", "SuctionPump"]
+__all__ = [
+    "MAX_PUMPING_S",
+    "MIN_SUCTION_MBAR",
+    "PUMP_CONTROL_PERIOD_S",
+    "Gauge",
+    "SuctionLoad",
+    "SuctionPump",
+]
 
-CONTROL_S = 0.05
+PUMP_CONTROL_PERIOD_S = 0.05
 """Period in which the gauge is looked at while the pump runs, s."""
-REACH_S = 2.0
+MAX_PUMPING_S = 2.0
 """Time in which `HELD_SHARE` of the suction must be there, s."""
 HELD_SHARE, LOST_SHARE = 0.7, 0.4
 """Of what was asked: from there on it holds; below that it is lost."""
-OVER_SHARE = 1.1
+MAX_SUCTION_RATIO = 1.1
 """Of the most that may be asked: above that the regulator is broken."""
-LEAST_MBAR = 10.0
+MIN_SUCTION_MBAR = 10.0
 """Least suction that may be asked for, well above the gauge's deviation."""
-LEAST_MS = 100.0
+MIN_SUCTION_MS = 100.0
 GAUGE_NOISE_MBAR = 0.3
 GAUGE_ZERO_MBAR = 0.7
 """Standard deviations of one reading of the gauge, and of its zero from box to box."""
@@ -96,7 +103,7 @@ class _Draw:
 
     @property
     def next_s(self) -> float:
-        return min(self.start_s + (self.ticks + 1) * CONTROL_S, self.ends_s)
+        return min(self.start_s + (self.ticks + 1) * PUMP_CONTROL_PERIOD_S, self.ends_s)
 
 
 class SuctionPump:
@@ -192,11 +199,11 @@ class SuctionPump:
             return
         draw.mbar = reading
         draw.held = draw.held or reading >= HELD_SHARE * draw.wanted_mbar
-        if reading > OVER_SHARE * self._probe.max_suction_mbar:
+        if reading > MAX_SUCTION_RATIO * self._probe.max_suction_mbar:
             self._fail(draw, "HIGH", now)
         elif draw.held and reading < LOST_SHARE * draw.wanted_mbar:
             self._fail(draw, "LOST", now)
-        elif not draw.held and now >= draw.start_s + REACH_S:
+        elif not draw.held and now >= draw.start_s + MAX_PUMPING_S:
             self._fail(draw, "LOW", now)
         elif now >= draw.ends_s:
             self._end(draw, "TIMED", now)

@@ -27,7 +27,7 @@ from rigsim.tissue.tissue_mc import TransportError
 
 OVERLAP_NODES: Final = 2000
 
-HARMONICS: Final = 8
+MAX_HARMONIC: Final = 8
 """Highest angular harmonic that is kept by default; light that has been scattered knows few."""
 
 
@@ -68,7 +68,7 @@ def anisotropic_profile(
     azimuth_rad: ArrayLike,
     photons: int,
     rng: np.random.Generator,
-    harmonics: int | None = HARMONICS,
+    harmonics: int | None = MAX_HARMONIC,
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
 ) -> profiles.FibreProfile:
@@ -130,7 +130,7 @@ def anisotropic_profile(
         [tissue.sigma_a_per_mm, tissue.sigma_s_per_mm, tissue.g, tissue.eta, tissue.strength]
     )
     deeper = tissue.sigma_a_per_mm + tissue.sigma_s_per_mm * (1.0 - tissue.g)
-    seeds = tissue_mc.batch_seeds(rng, batches + profiles.PILOTS)
+    seeds = tissue_mc.batch_seeds(rng, batches + profiles.PILOT_RUNS)
 
     if harmonics is None:
         rings, shape = np.zeros((0, 2, 1)), (far.size, 1)

@@ -7,7 +7,7 @@ from math import exp, log, sqrt
 import numpy as np
 from numba import njit
 
-from rigsim.fiber.walk import DEEPEST, MOST_COPIES, STACK_DEPTH
+from rigsim.fiber.walk import MAX_COPIES, MAX_DEPTH_GAIN, STACK_DEPTH
 from rigsim.tissue.photon_walk import draw, fresnel, scatter
 
 
@@ -116,7 +116,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 weight *= scattering / sigma_t
                 cell = min(int(sqrt(x * x + y * y + z * z) * per_mm), cells)
                 chance = min(exp(1.5 - sigma_s * z), 1.0)
-                deeper = min(1.0 + z * deeper_per_mm, DEEPEST)
+                deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                 visited[0, cell] += weight * chance
                 visited[1, cell] += weight / deeper
                 s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
@@ -186,7 +186,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                         break
                     weight = target
                 elif weight > 2.0 * target:
-                    copies = min(int(weight / target), MOST_COPIES, STACK_DEPTH - alive + 1)
+                    copies = min(int(weight / target), MAX_COPIES, STACK_DEPTH - alive + 1)
                     weight /= copies
                     for _copy in range(copies - 1):
                         waiting[alive, 0] = x

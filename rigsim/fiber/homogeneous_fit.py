@@ -3,12 +3,12 @@
 Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
 fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
 given one: the logarithms of the ratios have the least variance over the fibres, all of one weight;
-fibres that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them
-from noise. The factor is for what pigment in a thin layer on top takes from light on its way in and
-out, at all distances alike. Tissue without layers that scatters by direction has no such factor:
-with one its nearest media jump between far valleys from one direction to the next. Of dark skin the
-nearest medium scatters without bounds: its profile is that of a dipole at the surface, which tells
-sigma_tr and no more; the search ends at `MOST_SCATTERING`.
+fibres that take less than `MIN_REFLECTANCE_PER_MM2` are left out, as no camera of the probe tells
+them from noise. The factor is for what pigment in a thin layer on top takes from light on its way
+in and out, at all distances alike. Tissue without layers that scatters by direction has no such
+factor: with one its nearest media jump between far valleys from one direction to the next. Of dark
+skin the nearest medium scatters without bounds: its profile is that of a dipole at the surface,
+which tells sigma_tr and no more; the search ends at `MAX_SCATTERING`.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from rigsim.arrays import Float64Array
 from rigsim.fiber.profile import Fibres
 from rigsim.fiber.white_fiber import WhiteFibre
 
-FAINTEST_PER_MM2: Final = 1e-7
+MIN_REFLECTANCE_PER_MM2: Final = 1e-7
 """R_f that gives a tenth of an electron per pixel and exposure of 30 s for each electron of read
 noise: about ten standard errors of a spot's sum."""
 
-FEWEST: Final = 4
+MIN_BRIGHT_FIBERS: Final = 4
 """Fibres that must be bright enough."""
 
-STARTS: Final = (
+SEARCH_STARTS_PER_MM: Final = (
     (0.03, 1.0),
     (0.1, 2.0),
     (0.4, 3.0),
@@ -43,9 +43,9 @@ STARTS: Final = (
 )
 """sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
 fibres less than far ones, which looks like more scattering than tissue has."""
-MOST_SCATTERING: Final = 200.0
+MAX_SCATTERING: Final = 200.0
 """Of the search, 1/mm."""
-UNHELD: Final = 1e3
+OFF_TABLE_RESIDUAL: Final = 1e3
 """Residual of media that the table does not hold."""
 
 
@@ -98,7 +98,8 @@ def nearest_medium(
     Raises
     ------
     FitError
-        Fewer than `FEWEST` fibres are bright enough, or the best medium lies at the table's end.
+        Fewer than `MIN_BRIGHT_FIBERS` fibres are bright enough, or the best medium lies at the
+        table's end.
 
     Examples
     --------
@@ -109,11 +110,12 @@ def nearest_medium(
     (0.1, 2.0)
     """
     profile = np.asarray(reflectance_per_mm2, np.float64)
-    use = profile >= FAINTEST_PER_MM2
-    if profile.shape != (len(fibres.radii_mm),) or int(use.sum()) < FEWEST:
+    use = profile >= MIN_REFLECTANCE_PER_MM2
+    if profile.shape != (len(fibres.radii_mm),) or int(use.sum()) < MIN_BRIGHT_FIBERS:
         raise FitError(
             f"reflectance_per_mm2: got {int(use.sum())} bright of {profile.shape}, expected "
-            f"{len(fibres.radii_mm)} with at least {FEWEST} of {FAINTEST_PER_MM2} 1/mm^2"
+            f"{len(fibres.radii_mm)} with at least {MIN_BRIGHT_FIBERS} of "
+            f"{MIN_REFLECTANCE_PER_MM2} 1/mm^2"
         )
     table = WhiteFibre.load()
     used = Fibres(
@@ -127,12 +129,12 @@ def nearest_medium(
     both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
     low = table.distance[0] / (min(used.radii_mm) - both)
     # sigma_a / sigma_s' rather than sigma_a, as the table ends there
-    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MOST_SCATTERING]])
+    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MAX_SCATTERING]])
 
     def misfit(logs: Float64Array) -> Float64Array:
         scattering = math.exp(logs[1])
         if not table.holds(math.exp(logs[0]) * scattering, scattering, used):
-            return UNHELD * np.cos(np.arange(target.size))
+            return OFF_TABLE_RESIDUAL * np.cos(np.arange(target.size))
         value, _ = table.profile(math.exp(logs[0]) * scattering, scattering, used)
         off = np.log(value) - target
         return np.asarray(off - off.mean()) if dimmed else off
@@ -141,7 +143,7 @@ def nearest_medium(
         least_squares(
             misfit, np.clip(np.log([a / s, s]), bounds[0] + 0.01, bounds[1] - 0.01), bounds=bounds
         )
-        for a, s in STARTS
+        for a, s in SEARCH_STARTS_PER_MM
     ]
     best = min(ends, key=lambda end: float(end.cost))
     # at the most scattering sigma_tr alone shapes the profile: it stays what it is

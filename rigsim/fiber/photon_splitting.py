@@ -15,8 +15,8 @@ from rigsim.arrays import Float64Array
 
 WINDOW_CELLS: Final = 256
 SMOOTHED_CELLS: Final = 8  # to each side
-ENOUGH_TRACKS: Final = 50.0
-MOST_TRACKS: Final = 30.0
+MIN_TRACKS: Final = 50.0
+MAX_TRACKS: Final = 30.0
 """Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
 light is too deep to be scored, splitting it further is not worth its time."""
 SCORED_DEPTH: Final = 1.5
@@ -42,7 +42,7 @@ def learned_window(
     wanted, peak = _falling(scored[: edge + 1], tracks[0][: edge + 1])
     least, _ = _falling(every[: edge + 1], tracks[1][: edge + 1])
     window = np.ones(len(used))
-    window[peak : edge + 1] = np.maximum(wanted, least / MOST_TRACKS)[peak:]
+    window[peak : edge + 1] = np.maximum(wanted, least / MAX_TRACKS)[peak:]
     # Beyond the fibres light comes back the less the farther it is.
     window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
     return window
@@ -54,7 +54,7 @@ def _falling(weight: Float64Array, tracks: Float64Array) -> tuple[Float64Array, 
     From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
     that chance made too steep would have photons split for minutes.
     """
-    enough = tracks > ENOUGH_TRACKS
+    enough = tracks > MIN_TRACKS
     reached = len(enough) if enough.all() else int(np.argmin(enough))
     if reached < 2:
         return np.ones(len(weight)), 0

@@ -17,12 +17,12 @@ from rigsim.fiber.anisotropic_tissue import anisotropic_profile
 from rigsim.fiber.probe_tissue import FibrousTissue, ProbedTissue, TissueError, TissueOptics
 from rigsim.fiber.profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
 from rigsim.fiber.profile_smoothing import smooth_profile
-from rigsim.fiber.white_fiber import ETA, G, WhiteFibre
+from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, WhiteFibre
 
-KEPT: Final = 64
+MAX_KEPT_PROFILES: Final = 64
 """Profiles and runs of photons that are kept."""
 
-TURNS: Final = 16
+HALF_TURN_DIRECTIONS: Final = 16
 """Directions over half a turn in which anisotropic tissue is traced; it has harmonics to the 8th,
 so that those between follow from them exactly."""
 
@@ -95,7 +95,7 @@ class Profiles:
         suction = SUCTION_STEP_MBAR * round(suction_mbar / SUCTION_STEP_MBAR)
         key = (site, angle_deg, suction)
         if key not in self._profiles:
-            while len(self._profiles) >= KEPT:
+            while len(self._profiles) >= MAX_KEPT_PROFILES:
                 self._profiles.popitem(last=False)
             if isinstance(self.tissue, FibrousTissue):
                 self._profiles[key] = self._turned(self.tissue, angle_deg)
@@ -110,14 +110,17 @@ class Profiles:
             run = anisotropic_profile(
                 tissue.medium(),
                 fibres_of(self.probe),
-                azimuth_rad=np.pi * np.arange(TURNS) / TURNS,
+                azimuth_rad=np.pi * np.arange(HALF_TURN_DIRECTIONS) / HALF_TURN_DIRECTIONS,
                 photons=self.photons,
                 rng=np.random.default_rng([self.seed, zlib.crc32(repr(tissue).encode())]),
                 threads=self.threads,
             )
             self._by_turn = run.batch_reflectance_per_mm2
-        order = np.fft.rfftfreq(TURNS, 1.0 / TURNS)
-        share = np.where((order == 0) | (2 * order == TURNS), 1.0, 2.0) / TURNS
+        order = np.fft.rfftfreq(HALF_TURN_DIRECTIONS, 1.0 / HALF_TURN_DIRECTIONS)
+        share = (
+            np.where((order == 0) | (2 * order == HALF_TURN_DIRECTIONS), 1.0, 2.0)
+            / HALF_TURN_DIRECTIONS
+        )
         wave = share * np.exp(2j * order * np.radians(angle_deg))
         each = (np.fft.rfft(self._by_turn, axis=-1) @ wave).real
         value, error = smooth_profile(np.array(self.probe.radius_mm), each[..., None])
@@ -134,7 +137,7 @@ class Profiles:
     def _run(self, optics: TissueOptics) -> FibrePaths | Profile:
         key = (optics.wavelength_nm, optics.stacks)
         if key not in self._runs:
-            while len(self._runs) >= KEPT:
+            while len(self._runs) >= MAX_KEPT_PROFILES:
                 self._runs.popitem(last=False)
             self._runs[key] = self._traced(optics)
         self._runs.move_to_end(key)
@@ -177,7 +180,7 @@ class Profiles:
             scattering = layer.sigma_s_per_mm * (1.0 - layer.g)
             if (
                 len(stack.layers) > 1
-                or abs(layer.g - G) > 1e-12
+                or abs(layer.g - HENYEY_GREENSTEIN_G) > 1e-12
                 or (layer.eta, stack.eta_above) != (ETA, 1.0)
                 or not table.holds(layer.sigma_a_per_mm, scattering, kind)
             ):

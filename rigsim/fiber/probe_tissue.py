@@ -17,12 +17,12 @@ from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.tissue import skin_layers
-from rigsim.tissue.skin_layers import ANISOTROPY, ETA
+from rigsim.tissue.skin_layers import ETA, SKIN_ANISOTROPY
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
 
-LEAST_SIGMA_A_PER_MM: Final = 1e-7
+MIN_SIGMA_A_PER_MM: Final = 1e-7
 """Absorption that a medium without any is traced with, 1/mm: else photons wander for ever. A path
 of 1 m loses a ten-thousandth."""
 
@@ -44,11 +44,11 @@ CAPILLARY_MBAR: Final = 30.0
 TOUCH_MBAR: Final = 3.0
 """Pressure under a head that is laid on without suction, mbar."""
 
-WAVELENGTH_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
+SKIN_WAVELENGTHS_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
 """Wavelengths that skin is traced at, nm; between them reflectance is linear."""
-PHANTOM_NM: Final = tuple(float(nm) for nm in range(400, 701, 20))
+PHANTOM_WAVELENGTHS_NM: Final = tuple(float(nm) for nm in range(400, 701, 20))
 """The same of the phantom."""
-AS_MADE: Final = (0.8, -0.7)
+PHANTOM_DEVIATIONS: Final = (0.8, -0.7)
 """By how many standard uncertainties the phantom is off its certificate: sigma_a, sigma_s'."""
 
 
@@ -90,7 +90,7 @@ class HomogeneousTissue:
     """Absorption coefficient, 1/mm, >= 0; one for each wavelength, or one for all."""
     sigma_s_prime_per_mm: float | tuple[float, ...]
     """Reduced scattering coefficient, 1/mm, >= 0, likewise."""
-    g: float = ANISOTROPY
+    g: float = SKIN_ANISOTROPY
     """Mean cosine of the Henyey-Greenstein phase function, -1 < g < 1."""
     eta: float = ETA
     """Refractive index, 1 to 3."""
@@ -160,8 +160,8 @@ class FibrousTissue:
         """Return the tissue as photons meet it."""
         return AnisotropicTissue(
             self.sigma_a_per_mm,
-            self.sigma_s_prime_per_mm / (1.0 - ANISOTROPY),
-            ANISOTROPY,
+            self.sigma_s_prime_per_mm / (1.0 - SKIN_ANISOTROPY),
+            SKIN_ANISOTROPY,
             ETA,
             self.strength,
             math.radians(self.axis_deg),
@@ -170,14 +170,14 @@ class FibrousTissue:
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
         """Return the material without its direction, which `medium` tells."""
         del site, angle_deg, suction_mbar
-        stack = half_space(self.sigma_a_per_mm, self.sigma_s_prime_per_mm, ANISOTROPY, ETA)
+        stack = half_space(self.sigma_a_per_mm, self.sigma_s_prime_per_mm, SKIN_ANISOTROPY, ETA)
         return TissueOptics((), (stack,), None, 0.0)
 
 
 def half_space(
     sigma_a_per_mm: float, sigma_s_prime_per_mm: float, g: float, eta: float
 ) -> LayerStack:
-    """Return a half space under air, with `LEAST_SIGMA_A_PER_MM` at least.
+    """Return a half space under air, with `MIN_SIGMA_A_PER_MM` at least.
 
     Examples
     --------
@@ -186,9 +186,7 @@ def half_space(
     (1e-07, 7.5)
     """
     sigma_s = sigma_s_prime_per_mm / (1.0 - g)
-    return LayerStack(
-        (Layer(math.inf, max(sigma_a_per_mm, LEAST_SIGMA_A_PER_MM), sigma_s, g, eta),)
-    )
+    return LayerStack((Layer(math.inf, max(sigma_a_per_mm, MIN_SIGMA_A_PER_MM), sigma_s, g, eta),))
 
 
 class SkinTissue:
@@ -279,7 +277,7 @@ class SkinTissue:
         least = BLOOD_KEPT * rest
         melanin, thickness = self.melanin(site), self.epidermis_mm(site)
         stacks, absorber = [], []
-        for wavelength in WAVELENGTH_NM:
+        for wavelength in SKIN_WAVELENGTHS_NM:
             stack = skin_layers.skin(wavelength, melanin, least)
             top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
             stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
@@ -287,7 +285,7 @@ class SkinTissue:
             dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
             absorber.append([skin_layers.EPIDERMAL_BLOOD_SHARE * dermis, dermis])
         amount = self.blood(site, suction_mbar) - least
-        return TissueOptics(WAVELENGTH_NM, tuple(stacks), np.array(absorber), amount)
+        return TissueOptics(SKIN_WAVELENGTHS_NM, tuple(stacks), np.array(absorber), amount)
 
     def _rest(self, site: str) -> float:
         if site not in BLOOD_AT_REST:
@@ -306,14 +304,14 @@ class SkinTissue:
 
 
 def phantom_certificate() -> Mapping[str, Any]:
-    """Return the certificate of `PHANTOM`, package data of schema ``skinrig.phantom/1``."""
+    """Return the certificate of `PHANTOM_BLOCK`, package data of schema ``skinrig.phantom/1``."""
     path = resources.files("rigsim").joinpath("data", "phantom.json")
     loaded: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return loaded
 
 
 def make_phantom(
-    certificate: Mapping[str, Any], *, deviations: tuple[float, float] = AS_MADE
+    certificate: Mapping[str, Any], *, deviations: tuple[float, float] = PHANTOM_DEVIATIONS
 ) -> HomogeneousTissue:
     """Return a block as it was made, near its certificate.
 
@@ -336,7 +334,7 @@ def make_phantom(
     >>> block.g == paper["g"], block.eta == paper["eta"]
     (True, True)
     """
-    x, known = np.log(PHANTOM_NM), np.log(certificate["wavelength_nm"])
+    x, known = np.log(PHANTOM_WAVELENGTHS_NM), np.log(certificate["wavelength_nm"])
     factor = [
         1.0 + count * certificate["uncertainty"][name]
         for count, name in zip(deviations, ("sigma_a", "sigma_s_prime"), strict=True)
@@ -350,7 +348,7 @@ def make_phantom(
         tuple(scattering.tolist()),
         certificate["g"],
         certificate["eta"],
-        PHANTOM_NM,
+        PHANTOM_WAVELENGTHS_NM,
     )
 
 
@@ -385,7 +383,7 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     except ValueError:
         numbers = []
     if name == "homogeneous" and len(numbers) in (2, 3):
-        sigma_a, scattering, g = (*numbers, ANISOTROPY)[:3]
+        sigma_a, scattering, g = (*numbers, SKIN_ANISOTROPY)[:3]
         return HomogeneousTissue(sigma_a, scattering, g)
     if name == "anisotropic" and len(numbers) in (2, 3, 4):
         return FibrousTissue(*numbers)
@@ -396,5 +394,5 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     )
 
 
-PHANTOM: Final = make_phantom(phantom_certificate())
+PHANTOM_BLOCK: Final = make_phantom(phantom_certificate())
 """The solid block that sessions of target "phantom" are of, as made."""

@@ -39,13 +39,13 @@ PATH_SCALE_MM: Final = 0.05
 PATH_STEP: Final = 0.006
 """Relative spacing of those nodes; a reweighted score is off by (sigma path step)^2 / 8 of it."""
 
-LONGEST_PATH_MM: Final = 20_000.0
+MAX_PATH_MM: Final = 20_000.0
 """Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
 
 PILOT_SHARE: Final = 0.01
-"""Photons that each of `PILOTS` runs spends to learn how many arrive where, of those traced."""
+"""Photons that each of `PILOT_RUNS` runs spends to learn how many arrive where, of those traced."""
 
-PILOTS: Final = 3
+PILOT_RUNS: Final = 3
 """Each pilot sees farther than the one before it."""
 
 
@@ -304,7 +304,7 @@ def fibre_paths(
 
 
 def _path_nodes() -> int:
-    return int(np.ceil(np.log1p(LONGEST_PATH_MM / PATH_SCALE_MM) / PATH_STEP)) + 1
+    return int(np.ceil(np.log1p(MAX_PATH_MM / PATH_SCALE_MM) / PATH_STEP)) + 1
 
 
 def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
@@ -342,7 +342,7 @@ def _trace(
     total = np.zeros((batches, len(order), *nodes, *bands))
     traced = 0
     for index, layers in enumerate(spectral.stacks):
-        seeds = tissue_mc.batch_seeds(rng, batches + PILOTS)
+        seeds = tissue_mc.batch_seeds(rng, batches + PILOT_RUNS)
         if not shares[index] > 0.0:
             continue
         count = -(-round(photons * float(shares[index])) // batches) or 1

@@ -7,11 +7,11 @@ from scipy.interpolate import BSpline
 
 from rigsim.arrays import Float64Array
 
-PIECES = 6
+SPLINE_PIECES = 6
 """Pieces of the cubic spline through the logarithm of a profile."""
-NOISIEST = 0.3
+MAX_RELATIVE_ERROR = 0.3
 """Relative error of a fibre that the spline is still fitted to."""
-FEWEST = 14
+MIN_SPLINE_FIBERS = 14
 """Fibres that a spline is fitted to at least."""
 
 
@@ -31,8 +31,8 @@ def smooth_profile(
     -------
     reflectance, stderr : ndarray
         Shape (F, bands): exp of a cubic spline fitted to log reflectance; its errors by leaving
-        out one batch at a time. Fibres with more than `NOISIEST` of relative error, and all where
-        fewer than `FEWEST` have less, stay as they were.
+        out one batch at a time. Fibres with more than `MAX_RELATIVE_ERROR` of relative error, and
+        all where fewer than `MIN_SPLINE_FIBERS` have less, stay as they were.
 
     Examples
     --------
@@ -49,11 +49,11 @@ def smooth_profile(
     error = batches.std(axis=0, ddof=1) / np.sqrt(count)
     value, spread = mean.copy(), error.copy()
     for band in range(mean.shape[1]):
-        use = (mean[:, band] > 0.0) & (error[:, band] < NOISIEST * mean[:, band])
-        if int(use.sum()) < FEWEST:
+        use = (mean[:, band] > 0.0) & (error[:, band] < MAX_RELATIVE_ERROR * mean[:, band])
+        if int(use.sum()) < MIN_SPLINE_FIBERS:
             continue
         axis = np.log(radii_mm[use] + 0.3)
-        inner = np.linspace(axis[0], axis[-1], PIECES + 1)[1:-1]
+        inner = np.linspace(axis[0], axis[-1], SPLINE_PIECES + 1)[1:-1]
         knots = np.concatenate([[axis[0]] * 4, inner, [axis[-1]] * 4])
         basis = BSpline.design_matrix(axis, knots, 3).toarray()
         relative = error[use, band] / mean[use, band]

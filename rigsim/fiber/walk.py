@@ -22,9 +22,9 @@ TABLE_COLUMNS = 8
 the top below the surface, share of the counted absorber."""
 
 STACK_DEPTH = 512  # copies of photons that wait; when full, photons are not split further
-MOST_COPIES = 16  # of one photon at one collision
-DEEPEST = 30.0  # most that the depth raises the weight at which photons are kept
-_STATE = 9  # x, y, z, ux, uy, uz, weight, path, layer
+MAX_COPIES = 16  # of one photon at one collision
+MAX_DEPTH_GAIN = 30.0  # most that the depth raises the weight at which photons are kept
+_STATE_SIZE = 9  # x, y, z, ux, uy, uz, weight, path, layer
 
 
 @njit(inline="always")
@@ -129,7 +129,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
     eta_above = table[0, 5]
     cells = window.shape[0] - 1
     levels = chances.shape[0]
-    waiting = np.empty((STACK_DEPTH, _STATE))
+    waiting = np.empty((STACK_DEPTH, _STATE_SIZE))
     eta_ratio = eta_above / table[1, 5]
 
     for _ in range(photons):
@@ -228,7 +228,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                 histogram,
                             )
 
-                    deeper = min(1.0 + z * deeper_per_mm, DEEPEST)
+                    deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                     target = window[cell] * deeper
                     visited[0, cell] += weight * chance
                     visited[1, cell] += weight / deeper
@@ -238,7 +238,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                             break
                         weight = target
                     elif weight > 2.0 * target:
-                        copies = min(int(weight / target), MOST_COPIES, STACK_DEPTH - alive + 1)
+                        copies = min(int(weight / target), MAX_COPIES, STACK_DEPTH - alive + 1)
                         if copies > 1:
                             weight /= copies
                             for _copy in range(copies - 1):

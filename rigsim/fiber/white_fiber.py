@@ -24,23 +24,23 @@ from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 from rigsim.arrays import Float64Array
 from rigsim.fiber.profile import Fibres
 
-G: Final = 0.8
+HENYEY_GREENSTEIN_G: Final = 0.8
 ETA: Final = 1.4
-APERTURE: Final = 0.22
-FILE: Final = "white_fibre_mc.npz"
+NUMERICAL_APERTURE: Final = 0.22
+TABLE_FILE: Final = "white_fibre_mc.npz"
 
-DIFFUSES: Final = 0.01
+MAX_CONTINUED_ABSORPTION: Final = 0.01
 """sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
 is that of diffusion to a thousandth."""
 
 DIFFUSED_FROM: Final = (12.0, 20.0)
 """Distances between which what photons told of each goes over into what all of them tell of
 diffused light (`diffused`)."""
-DEPTH2: Final = 17.5
+MEAN_SQUARE_DEPTH: Final = 17.5
 """Mean square depth of that light's source and its image, in 1 / sigma_s'^2: from the photons of
 sigma_a / sigma_s' of 0.003 to 0.009, which alone would say 17.0 to 17.4, and less surely 19.5 of
 none."""
-ALIKE: Final = 4.0
+NODES_PER_KNOT: Final = 4.0
 """Nodes of distance that share their error: the knots that photons are smoothed with."""
 DISC_RADII, DISC_TURNS = 2, 6
 """Points in a core: rings, and points on each."""
@@ -91,7 +91,7 @@ class WhiteFibre:
     @cache
     def load() -> WhiteFibre:
         """Return the stored table, read-only."""
-        path = resources.files("rigsim").joinpath("data", FILE)
+        path = resources.files("rigsim").joinpath("data", TABLE_FILE)
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {
                 name: np.asarray(stored[name], np.float64)
@@ -110,11 +110,11 @@ class WhiteFibre:
         near, far = min(fibres.radii_mm) - both, max(fibres.radii_mm) + both
         apertures = (fibres.numerical_aperture, fibres.source_numerical_aperture)
         return bool(
-            apertures == (APERTURE, APERTURE)
+            apertures == (NUMERICAL_APERTURE, NUMERICAL_APERTURE)
             and near * sigma_s_prime_per_mm >= self.distance[0]
             and (
                 far * sigma_s_prime_per_mm <= self.distance[-1]
-                or sigma_a_per_mm / sigma_s_prime_per_mm <= DIFFUSES
+                or sigma_a_per_mm / sigma_s_prime_per_mm <= MAX_CONTINUED_ABSORPTION
             )
             and sigma_a_per_mm / sigma_s_prime_per_mm <= self.absorption[-1]
         )
@@ -173,8 +173,8 @@ class WhiteFibre:
 def diffused(distance: Float64Array, absorption: float) -> Float64Array:
     """Return the logarithm of diffused light far from its source, up to a constant.
 
-    That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 + `DEPTH2`, and
-    k of transport theory to the second order of the phase function.
+    That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 +
+    `MEAN_SQUARE_DEPTH`, and k of transport theory to the second order of the phase function.
 
     Parameters
     ----------
@@ -184,8 +184,8 @@ def diffused(distance: Float64Array, absorption: float) -> Float64Array:
         sigma_a / sigma_s'.
     """
     a = absorption
-    k = np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a / (1.0 + G))
-    d = np.sqrt(distance**2 + DEPTH2)
+    k = np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a / (1.0 + HENYEY_GREENSTEIN_G))
+    d = np.sqrt(distance**2 + MEAN_SQUARE_DEPTH)
     return np.asarray(np.log1p(k * d) - k * d - 3.0 * np.log(d))
 
 
@@ -196,13 +196,13 @@ def _of_all(table: WhiteFibre) -> tuple[Float64Array, Float64Array]:
     rows = table.distance > near
     x = table.distance[rows]
     share = np.clip(np.log(x / near) / np.log(far / near), 0.0, 1.0)
-    for column in np.flatnonzero(table.absorption <= DIFFUSES):
+    for column in np.flatnonzero(table.absorption <= MAX_CONTINUED_ABSORPTION):
         a = float(table.absorption[column])
         curve = diffused(x, a) + np.log(x) + float(decay(a)) * x
         weight = 1.0 / error[rows, column] ** 2
         level = (weight * (shape[rows, column] - curve)).sum() / weight.sum()
         shape[rows, column] += share * (curve + level - shape[rows, column])
-        together = np.sqrt(ALIKE / weight.sum())
+        together = np.sqrt(NODES_PER_KNOT / weight.sum())
         error[rows, column] += share * (together - error[rows, column])
     return shape, error
 

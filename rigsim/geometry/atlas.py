@@ -132,7 +132,7 @@ def sample(texture: Float32Array, uv: Float32Array, mask: BoolArray) -> Float32A
     return out.reshape(*leading, layers.shape[-1]) if texture.ndim == 3 else out.reshape(leading)
 
 
-def spread(texture: Float32Array, covered: BoolArray, *, steps: int = 4) -> Float32Array:
+def dilate_texture(texture: Float32Array, covered: BoolArray, *, steps: int = 4) -> Float32Array:
     """Fill texels beside the covered ones with their neighbours' mean, so that sampling may blend.
 
     Parameters

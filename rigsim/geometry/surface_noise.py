@@ -24,7 +24,7 @@ def _fibonacci_sphere(count: int) -> FloatArray:
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
 
 
-_GRADIENTS = _fibonacci_sphere(256)
+_GRADIENT_VECTORS = _fibonacci_sphere(256)
 
 
 def smooth_noise(points_mm: FloatArray, cells_mm: tuple[float, ...], *, seed: int) -> Float32Array:
@@ -174,7 +174,7 @@ def _gradient_noise(points, cell, salt):  # type: ignore[no-untyped-def]
         for corner in range(8):
             a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
             h = _hash(i + a, j + b, k + c, salt)
-            slope = _GRADIENTS[h >> np.uint32(24)]
+            slope = _GRADIENT_VECTORS[h >> np.uint32(24)]
             dot = (x - a) * slope[0] + (y - b) * slope[1] + (z - c) * slope[2]
             weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy) * (fz if c else 1.0 - fz)
             total += weight * dot

@@ -3,7 +3,7 @@
 Light that leaves the interior of one patch falls on another, enters it and leaves again. Patches
 are the texels of a coarse texture; the exchange between two that see each other is that of two
 points, each with the boundary's transmittance at its own angle. The series over bounces is summed
-until what is left is below `ENOUGH`.
+until what is left is below `DEFAULT_LAST_BOUNCE`.
 
 Notes
 -----
@@ -23,22 +23,22 @@ from scipy import sparse
 
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
-from rigsim.light.surface_brdf import through
+from rigsim.light.surface_brdf import transmittance
 from rigsim.render import OFFSET_MM, Caster
 
-ENOUGH: Final = 1e-3
+DEFAULT_LAST_BOUNCE: Final = 1e-3
 """Share of the first bounce below which further ones are left out."""
 
-MOST_BOUNCES: Final = 30
+MAX_BOUNCES: Final = 30
 
-PATCHES: Final = 96
+PATCHES_PER_SIDE: Final = 96
 """Texels along one side of the coarse texture. On a pale head under one light what comes by other
 skin, 1 % of all, is 16 % low with 64, 6 % with 96 and 4 % with 128, against Mitsuba."""
 
 PAIRS_AT_ONCE: Final = 1 << 21
 
 
-class SkinBounce:
+class Interreflection:
     """How light goes from patch to patch on one face.
 
     Parameters
@@ -49,7 +49,7 @@ class SkinBounce:
         Texels along one side of the coarse texture, >= 8.
     """
 
-    def __init__(self, caster: Caster, *, patches: int = PATCHES) -> None:
+    def __init__(self, caster: Caster, *, patches: int = PATCHES_PER_SIDE) -> None:
         self.mesh = caster.mesh
         self.atlas = unwrap(caster.mesh, patches)
         covered = self.atlas.covered
@@ -77,7 +77,7 @@ class SkinBounce:
         return (self.atlas.position_mm[self._covered][None], self.atlas.normal[self._covered][None])
 
     def indirect(
-        self, entered: Float32Array, r_d: Float32Array, *, enough: float = ENOUGH
+        self, entered: Float32Array, r_d: Float32Array, *, enough: float = DEFAULT_LAST_BOUNCE
     ) -> Float32Array:
         """Return what enters by way of other skin.
 
@@ -99,7 +99,7 @@ class SkinBounce:
         latest = self.exchange @ (r_d * entered[:, None])
         total = latest.copy()
         least = enough * float(np.abs(latest).max(initial=0.0))
-        for _ in range(MOST_BOUNCES):
+        for _ in range(MAX_BOUNCES):
             if not float(np.abs(latest).max(initial=0.0)) > least:
                 break
             latest = self.exchange @ (r_d * latest)
@@ -109,14 +109,14 @@ class SkinBounce:
         return out
 
 
-_living: WeakValueDictionary[int, SkinBounce] = WeakValueDictionary()
+_living: WeakValueDictionary[int, Interreflection] = WeakValueDictionary()
 
 
-def bounce_on(caster: Caster) -> SkinBounce:
+def interreflection_for(caster: Caster) -> Interreflection:
     """Return the exchange on a mesh, the same as long as anybody holds it."""
     found = _living.get(id(caster.mesh))  # which is the mesh's own while the exchange holds it
     if found is None:
-        found = _living[id(caster.mesh)] = SkinBounce(caster)
+        found = _living[id(caster.mesh)] = Interreflection(caster)
     return found
 
 
@@ -170,4 +170,4 @@ def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
             squared = x * x + y * y + z * z
             length = math.sqrt(squared)
             here, there = min(here / length, 1.0), min(there / length, 1.0)
-            out[n, j - first] = here * there * through(here) * through(there) / squared
+            out[n, j - first] = here * there * transmittance(here) * transmittance(there) / squared

@@ -14,18 +14,18 @@ import numpy as np
 from capture.rig import View
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.light.interreflection import ENOUGH, SkinBounce
-from rigsim.subject import Subject
+from rigsim.light.interreflection import DEFAULT_LAST_BOUNCE, Interreflection
+from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_table import SkinTable
 
-STEPS: Final = (5, 3, 2)
+WAVELENGTH_STEPS: Final = (5, 3, 2)
 """Every how many of the table's wavelengths may be summed at, the most first: the ends stay."""
 
-LEAST: Final = 1e-6
+MIN_REFLECTANCE: Final = 1e-6
 """Reflectance and cover below which a patch has no color."""
 
 
-class BounceColor:
+class InterreflectionColor:
     """How light goes from skin to skin on one face in one state, seen by one camera.
 
     Parameters
@@ -43,15 +43,15 @@ class BounceColor:
     spectral
         Whether wavelengths are told apart; without, each channel is taken as one.
     step
-        Every how many of the table's wavelengths are summed at, 1 or one of `STEPS`.
+        Every how many of the table's wavelengths are summed at, 1 or one of `WAVELENGTH_STEPS`.
     enough
         Share of the first bounce below which further ones are left out.
     """
 
     def __init__(
         self,
-        bounce: SkinBounce,
-        subject: Subject,
+        bounce: Interreflection,
+        subject: SimulatedSubject,
         state: str,
         r_d: Float32Array,
         reflectance: Float32Array,
@@ -60,15 +60,15 @@ class BounceColor:
         light: str,
         spectral: bool = True,
         step: int = 1,
-        enough: float = ENOUGH,
+        enough: float = DEFAULT_LAST_BOUNCE,
     ) -> None:
         self._bounce, self._enough = bounce, enough
         covered = subject.atlas.covered.astype(np.float32)
         blood = subject.hemoglobin(state)
-        factor = r_d / np.maximum(reflectance, np.float32(LEAST))
+        factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
         layers = np.dstack([covered, subject.melanin, blood, factor, r_d]) * covered[..., None]
         coarse = bounce.coarsen(np.asarray(layers, np.float32))
-        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(LEAST))
+        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
         self._r_d = np.ascontiguousarray(coarse[:, 6:])
         self._weights: Float32Array | None = None
         if spectral:
@@ -78,7 +78,7 @@ class BounceColor:
             # what covers the skin (hair, makeup) is gray beside it
             cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
             self._spectrum = np.asarray(skin * cover, np.float32)
-            self._channel = np.maximum(self._spectrum @ weights, LEAST).astype(np.float32)
+            self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)
 
     def entering(self, direct: Float32Array) -> Float32Array:
@@ -105,17 +105,17 @@ class BounceColor:
 
     def on_texture(self, direct: Float32Array, size: int) -> Float32Array:
         """Return `entering` on a texture of so many texels a side, shape (size, size, 3)."""
-        from rigsim.geometry.atlas import sample, spread
+        from rigsim.geometry.atlas import dilate_texture, sample
 
         coarse = self.entering(direct)
-        filled = spread(coarse, self._bounce.atlas.covered, steps=2)
+        filled = dilate_texture(coarse, self._bounce.atlas.covered, steps=2)
         middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)
         u, v = np.meshgrid(middle, middle[::-1])
         uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
         return sample(filled, uv, np.ones((size, size), np.bool_))
 
 
-def color_error(subject: Subject, state: str, view: View, illuminant: str) -> Float64Array:
+def color_error(subject: SimulatedSubject, state: str, view: View, illuminant: str) -> Float64Array:
     """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
 
     Of typical skin.
@@ -128,7 +128,9 @@ def color_error(subject: Subject, state: str, view: View, illuminant: str) -> Fl
     return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
 
 
-def step_error(subject: Subject, state: str, camera: str, light: str, step: int) -> Float64Array:
+def step_error(
+    subject: SimulatedSubject, state: str, camera: str, light: str, step: int
+) -> Float64Array:
     """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
 
     Parameters

@@ -9,7 +9,8 @@ Notes
 -----
 Lengths along u and v are taken as perpendicular (the skew of the texture is left out). Time steps
 are implicit, one direction after the other, each halving the error of splitting by alternating
-the order; the kernel of a stage made of `STEPS` of them has an excess kurtosis of 3 / STEPS.
+the order; the kernel of a stage made of `IMPLICIT_STEPS` of them has an excess kurtosis of 3 /
+STEPS.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
 
-STEPS: Final = 6
+IMPLICIT_STEPS: Final = 6
 """Implicit steps between two widths."""
 
 IGNORED_TEXELS: Final = 0.25
@@ -37,7 +38,7 @@ class LateralError(ValueError):
     """The kernel or the field cannot be used."""
 
 
-def spread_light(
+def scatter_laterally(
     field: Float32Array, atlas: Atlas, sigmas_mm: ArrayLike, weights: ArrayLike
 ) -> Float32Array:
     """Spread a field over the surface by a sum of Gaussians for each channel.
@@ -79,8 +80,8 @@ def spread_light(
     time = 0.0
     for k, width in enumerate(sigma):
         if width > IGNORED_TEXELS * smallest_mm:
-            step = (0.5 * width * width - time) / STEPS
-            for n in range(STEPS):
+            step = (0.5 * width * width - time) / IMPLICIT_STEPS
+            for n in range(IMPLICIT_STEPS):
                 order = (_flow_rows, _flow_columns) if n % 2 == 0 else (_flow_columns, _flow_rows)
                 for flow in order:
                     flow(state, area, along_u if flow is _flow_rows else along_v, step)
@@ -95,7 +96,7 @@ def line_spread_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
     Parameters
     ----------
     sigmas_mm, weights
-        As for `spread_light`.
+        As for `scatter_laterally`.
 
     Returns
     -------

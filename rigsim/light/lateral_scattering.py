@@ -13,24 +13,24 @@ import numpy as np
 
 from rigsim import shading
 from rigsim.arrays import Float32Array
-from rigsim.geometry.atlas import spread
+from rigsim.geometry.atlas import dilate_texture
 from rigsim.light import lateral
-from rigsim.light.interreflection import SkinBounce
-from rigsim.light.interreflection_color import BounceColor
+from rigsim.light.interreflection import Interreflection
+from rigsim.light.interreflection_color import InterreflectionColor
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.subsurface_radiance import PIGMENT_BLUR_MM, typical_kernels
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
 from rigsim.render import Caster, visibility
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
-SHADOW_SAMPLES: Final = 4
+LED_SHADOW_SAMPLES: Final = 4
 """Points on the lamp that cast shadows on each texel."""
 
 
-class SkinBleeding:
+class LateralScattering:
     """One face, ready to be lit from within.
 
     Parameters
@@ -57,14 +57,14 @@ class SkinBleeding:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: SimulatedSubject,
         surface: SkinSurface,
         caster: Caster,
         *,
         camera: str,
         light: str,
         subsurface: bool,
-        bounce: SkinBounce | None,
+        bounce: Interreflection | None,
         spectral: bool = True,
         enough: float = 1e-3,
         relief: ReliefShadow | None = None,
@@ -74,7 +74,7 @@ class SkinBleeding:
         self.subsurface = subsurface
         self._bounce = bounce
         if bounce is not None:
-            self._color = BounceColor(
+            self._color = InterreflectionColor(
                 bounce,
                 subject,
                 "neutral",
@@ -89,7 +89,9 @@ class SkinBleeding:
             blood = subject.hemoglobin("neutral")
             clear = skin_color(camera, light).rgb(np.zeros_like(subject.melanin), blood)
             log_m = np.log(surface.reflectance / clear) * np.float32(0.5)
-            blurred = lateral.spread_light(log_m, subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1)))
+            blurred = lateral.scatter_laterally(
+                log_m, subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1))
+            )
             self._kernels = typical_kernels(subject, "neutral", camera, light)
             self._pigment = np.exp(blurred)
             self._inside = self._pigment * clear
@@ -120,7 +122,7 @@ class SkinBleeding:
         if not self.subsurface:
             if came is None:
                 raise ValueError("glow: got neither subsurface nor bounce, expected one")
-            return spread(surface.r_d * came, atlas.covered)
+            return dilate_texture(surface.r_d * came, atlas.covered)
         entered = entering(self._caster, lamp, atlas.position_mm, surface.normal, atlas.normal)
         if self._relief is not None:
             entered *= self._relief.on_texture(
@@ -131,10 +133,10 @@ class SkinBleeding:
         spreading = np.ascontiguousarray(self._inside * light, np.float32)
         weights = self._kernels.weights
         scale = np.float32(shading.interior_scale(ETA))
-        skin = lateral.spread_light(spreading, atlas, self._kernels.sigmas_mm, weights)
+        skin = lateral.scatter_laterally(spreading, atlas, self._kernels.sigmas_mm, weights)
         hair = subject.hair[..., None]
         over = hair * np.asarray(HAIR_REFLECTANCE, np.float32) * light
-        return spread(scale * ((1.0 - hair) * self._pigment * skin + over), atlas.covered)
+        return dilate_texture(scale * ((1.0 - hair) * self._pigment * skin + over), atlas.covered)
 
 
 def entering(
@@ -166,7 +168,7 @@ def entering(
         mesh_normal,
         lamp.position_mm,
         radius_mm=lamp.radius_mm,
-        samples=SHADOW_SAMPLES,
+        samples=LED_SHADOW_SAMPLES,
     )
     way = np.asarray(lamp.position_mm, np.float32) - position_mm
     squared = np.sum(way * way, axis=-1)

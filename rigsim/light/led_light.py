@@ -11,7 +11,7 @@ from capture.rig import Light, View
 from model import spectra
 from rigsim.arrays import Float64Array
 
-METER_RATE_PER_S: Final = 12.0
+DOME_METER_RATE_PER_S: Final = 12.0
 """Full scales per second in the strongest channel of a perfect white that faces the LED of
 `METER_LED`: white needs 60 ms for 0.7 of full scale."""
 
@@ -51,7 +51,7 @@ def white_intensity(light: Light, view: View) -> Float64Array:
     unit = power * (_exponent(half_deg) + 1.0) / distance_mm**2
     strength = light.power_w * (lobe_exponent(light) + 1.0)
     white = spectra.camera_white(view.spectral_sensitivity, light.illuminant)
-    return np.asarray(METER_RATE_PER_S * strength / unit * white)
+    return np.asarray(DOME_METER_RATE_PER_S * strength / unit * white)
 
 
 def lobe_exponent(light: Light) -> float:

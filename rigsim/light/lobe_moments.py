@@ -12,7 +12,7 @@ Notes
 The table's axes are p = n_xy / (1 + n_z), half the tilt's tangent: a facet's reflection turns with
 its half angle, so the lobe is about equally wide everywhere. Between nodes values are interpolated
 with cubics in p (Catmull and Rom 1974) and linearly over the field. Steeper normals than
-`STEEPEST_DEG` are summed directly.
+`MAX_TILT_DEG` are summed directly.
 
 The LEDs are points here. They stand about 17 degrees apart, so that facets that mirror neighbours
 into the camera differ by 8.5 degrees: a lobe narrower than that resolves them, and the sum over
@@ -34,10 +34,10 @@ from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
 
-STEEPEST_DEG: Final = 70.0
+MAX_TILT_DEG: Final = 70.0
 """Tilt of normals up to which the table is used."""
 
-CHANNELS: Final = 16
+MOMENT_CHANNELS: Final = 16
 """Numbers in a table's node: 4 moments x 3 Stokes parameters, then 4 moments of entering light."""
 
 
@@ -67,12 +67,12 @@ class Moments:
 
     specular: Float32Array
     """Stokes vectors of the surface's reflection, shape (N, 4, 3), radiance in 1/sr per unit of
-    `irradiance_share`; the moments in the order of `rigsim.as_built.sphere.MOMENTS`."""
+    `irradiance_share`; the moments in the order of `rigsim.as_built.sphere.MOMENT_NAMES`."""
     entering: Float32Array
     """Light that enters, shape (N, 4), cosine included."""
 
     def packed(self) -> Float32Array:
-        """Return both as shape (N, `CHANNELS`)."""
+        """Return both as shape (N, `MOMENT_CHANNELS`)."""
         count = len(self.entering)
         return np.concatenate([self.specular.reshape(count, 12), self.entering], axis=1)
 
@@ -210,7 +210,8 @@ class MomentTable:
     """Moments over normal and place in the field."""
 
     values: Float32Array
-    """Shape (alphas, fields, fields, size, size, `CHANNELS`): y, x, then p_y, p_x, all upwards."""
+    """Shape (alphas, fields, fields, size, size, `MOMENT_CHANNELS`): y, x, then p_y, p_x, all
+    upwards."""
     alphas: Float64Array
     """Roughnesses, evenly spaced, 1 or 3 of them; in between by a parabola."""
     half_field_mm: float
@@ -220,7 +221,7 @@ class MomentTable:
 
     def covers(self, normals: Float32Array) -> BoolArray:
         """Return which normals the table holds, shape (N,)."""
-        return np.asarray(normals[:, 2] >= np.float32(math.cos(math.radians(STEEPEST_DEG))))
+        return np.asarray(normals[:, 2] >= np.float32(math.cos(math.radians(MAX_TILT_DEG))))
 
     def lookup(
         self,
@@ -229,7 +230,7 @@ class MomentTable:
         y_mm: Float32Array,
         alpha: Float32Array | None = None,
     ) -> Float32Array:
-        """Return the moments of normals within `STEEPEST_DEG`, shape (N, `CHANNELS`).
+        """Return the moments of normals within `MAX_TILT_DEG`, shape (N, `MOMENT_CHANNELS`).
 
         Parameters
         ----------
@@ -246,12 +247,12 @@ class MomentTable:
         if nodes > 1 and alpha is not None:
             t = (alpha - np.float32(self.alphas[1])) / np.float32(self.alphas[1] - self.alphas[0])
             share[:, 0], share[:, 1], share[:, 2] = 0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)
-        out = np.zeros((len(normals), CHANNELS), np.float32)
+        out = np.zeros((len(normals), MOMENT_CHANNELS), np.float32)
         _lookup(
             self.values,
             np.float32(self.half_field_mm),
             np.float32(self.reach),
-            np.float32(math.cos(math.radians(STEEPEST_DEG))),
+            np.float32(math.cos(math.radians(MAX_TILT_DEG))),
             np.ascontiguousarray(normals, np.float32),
             np.ascontiguousarray(x_mm, np.float32),
             np.ascontiguousarray(y_mm, np.float32),
@@ -300,7 +301,7 @@ def build_table(
     if not half_field_mm > 0.0:
         raise MomentError(f"half_field_mm: got {half_field_mm}, expected > 0")
     # one node more than the cubic needs beyond the steepest normal
-    edge = math.tan(0.5 * math.radians(STEEPEST_DEG))
+    edge = math.tan(0.5 * math.radians(MAX_TILT_DEG))
     reach = edge * (size - 1) / (size - 1 - 4)
     axis = np.linspace(-reach, reach, size)
     py, px = np.meshgrid(axis, axis, indexing="ij")
@@ -310,7 +311,7 @@ def build_table(
     nodes = np.linspace(-half_field_mm, half_field_mm, fields)
     low, high = alpha_range or (surface.alpha, surface.alpha)
     alphas = np.array([low]) if high <= low else np.linspace(low, high, 3)
-    values = np.zeros((len(alphas), fields, fields, size, size, CHANNELS), np.float32)
+    values = np.zeros((len(alphas), fields, fields, size, size, MOMENT_CHANNELS), np.float32)
     # few long sums: one for each LED, over all nodes
     k, row, column, node = np.meshgrid(
         np.arange(len(alphas)),
@@ -323,7 +324,7 @@ def build_table(
     found = direct_moments(
         normals[node.ravel()], places, sphere, surface, leds=leds, alpha=alphas[k.ravel()]
     )
-    values[:, :, :, inside] = found.packed().reshape(*row.shape, CHANNELS)
+    values[:, :, :, inside] = found.packed().reshape(*row.shape, MOMENT_CHANNELS)
     return MomentTable(values, alphas, half_field_mm, reach)
 
 

@@ -18,7 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array, UInt16Array
-from rigsim.light.surface_brdf import R_D_LIMIT, boundary, coated_terms, ggx, surface_terms, through
+from rigsim.light.surface_brdf import (
+    MAX_R_D,
+    boundary,
+    coated_terms,
+    ggx,
+    surface_terms,
+    transmittance,
+)
 from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
 from rigsim.render.depth_of_field import LensPicture, before_focus, lens_spread
 
@@ -26,26 +33,26 @@ LookUp = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
 """Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
 with a coating (n, 11)."""
 
-BAND_RAYS: Final = 1 << 20
+RAYS_PER_BAND: Final = 1 << 20
 """Camera rays worked on at a time; bounds memory at full resolution."""
 
-CHUNK: Final = 1 << 13
+ROWS_PER_CHUNK: Final = 1 << 13
 """Rows that one thread works on at a time."""
 
-PLASTIC: Final = 0.7548776662466927
+INVERSE_PLASTIC_NUMBER: Final = 0.7548776662466927
 """Inverse of the plastic number, the root of x^3 = x + 1."""
 
 DISC_POINTS: Final = 1 << 12
 """Points on a light's disc that rows take in turn."""
 
-SKIN, MATT, METAL = 0, 1, 2
+SKIN_ROWS, MATT_ROWS, METAL_ROWS = 0, 1, 2
 """How rows reflect: skin of `rigsim.light.surface_brdf`, Lambertian, GGX facets of a metal."""
 
-FULL: Final = 65535.0
+UINT16_FULL_SCALE: Final = 65535.0
 NORMAL_SCALE: Final = 32767.0
-FUZZ_LIMIT: Final = 0.01
+MAX_FUZZ: Final = 0.01
 """Largest optical depth of vellus hair that a row can hold."""
-BARE: Final = 7
+BARE_COLUMNS: Final = 7
 """Columns of a surface without a coating."""
 ETA_COLUMN: Final = 9
 """The column that holds the index of a coating's film."""
@@ -94,15 +101,16 @@ class Hits:
     slot: UInt8Array
     """Place in the pixel, row by row, below subpixels^2, shape (n,)."""
     uv: UInt16Array
-    """Texture coordinates times `FULL`, shape (n, 2)."""
+    """Texture coordinates times `UINT16_FULL_SCALE`, shape (n, 2)."""
     surface: UInt16Array
     """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; with a
-    coating also film, its alpha, its index - 1, powder; times `FULL`; shape (n, 7) or (n, 11). Matt
-    rows hold their reflectance as r_d, metal ones too and their alpha as roughness."""
+    coating also film, its alpha, its index - 1, powder; times `UINT16_FULL_SCALE`; shape (n, 7) or
+    (n, 11). Matt rows hold their reflectance as r_d, metal ones too and their alpha as
+    roughness."""
     camera_mm: Float64Array
     """Centre of projection, shape (3,)."""
     kind: int
-    """`SKIN`, `MATT` or `METAL`."""
+    """`SKIN_ROWS`, `MATT_ROWS` or `METAL_ROWS`."""
     lens: LensPicture | None = None
     """How the lens spreads the rows' light; None: it is sharp everywhere."""
 
@@ -146,21 +154,21 @@ def pack_surface(values: Float32Array) -> UInt16Array:
     unit = np.asarray(values, np.float32).copy()
     if not (np.isfinite(unit).all() and unit.min(initial=0.0) >= 0.0):
         raise ValueError("surface: got values that are negative or not finite, expected >= 0")
-    unit[:, :3] = np.sqrt(unit[:, :3] / np.float32(R_D_LIMIT))
-    unit[:, 5] /= np.float32(FUZZ_LIMIT)
-    if unit.shape[1] > BARE:
+    unit[:, :3] = np.sqrt(unit[:, :3] / np.float32(MAX_R_D))
+    unit[:, 5] /= np.float32(MAX_FUZZ)
+    if unit.shape[1] > BARE_COLUMNS:
         unit[:, ETA_COLUMN] = np.maximum(unit[:, ETA_COLUMN] - np.float32(1.0), 0.0)
     if unit.max(initial=0.0) > 1.0 + 1e-6:
         raise ValueError(f"surface: got {unit.max(axis=0)} of its limits, expected at most 1")
-    return np.rint(np.minimum(unit, 1.0) * np.float32(FULL)).astype(np.uint16)
+    return np.rint(np.minimum(unit, 1.0) * np.float32(UINT16_FULL_SCALE)).astype(np.uint16)
 
 
 def unpack_surface(surface: UInt16Array) -> Float32Array:
     """Invert `pack_surface`."""
-    unit = np.asarray(surface, np.float32) / np.float32(FULL)
-    unit[:, :3] = np.float32(R_D_LIMIT) * unit[:, :3] ** 2
-    unit[:, 5] *= np.float32(FUZZ_LIMIT)
-    if unit.shape[1] > BARE:
+    unit = np.asarray(surface, np.float32) / np.float32(UINT16_FULL_SCALE)
+    unit[:, :3] = np.float32(MAX_R_D) * unit[:, :3] ** 2
+    unit[:, 5] *= np.float32(MAX_FUZZ)
+    if unit.shape[1] > BARE_COLUMNS:
         unit[:, ETA_COLUMN] += np.float32(1.0)
     return unit
 
@@ -171,7 +179,7 @@ def find_hits(
     look_up: LookUp,
     *,
     subpixels: int,
-    kind: int = SKIN,
+    kind: int = SKIN_ROWS,
     distortion: ArrayLike | None = None,
     illuminant: str | None = None,
 ) -> Hits:
@@ -200,7 +208,7 @@ def find_hits(
         Rows sorted by pixel.
     """
     k, width, height = subpixels, view.width_px, view.height_px
-    band = max(1, BAND_RAYS // (width * k * k))
+    band = max(1, RAYS_PER_BAND // (width * k * k))
     parts: list[tuple[NDArray[np.generic], ...]] = []
     begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
     for top in range(begin, end, band):
@@ -215,7 +223,9 @@ def find_hits(
                 np.rint(normal * np.float32(NORMAL_SCALE)).astype(np.int16),
                 buffers.prim.reshape(-1)[order],
                 slot,
-                np.rint(buffers.uv.reshape(-1, 2)[order] * np.float32(FULL)).astype(np.uint16),
+                np.rint(buffers.uv.reshape(-1, 2)[order] * np.float32(UINT16_FULL_SCALE)).astype(
+                    np.uint16
+                ),
                 pack_surface(surface),
             )
         )
@@ -330,7 +340,7 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     across, along = disc_points(DISC_POINTS)
     points = np.stack([across, along])[:, :, None] * np.stack([side, other])[:, None]
     targets = center + points.sum(axis=0)
-    chunks = -(-len(hits.position_mm) // CHUNK)
+    chunks = -(-len(hits.position_mm) // ROWS_PER_CHUNK)
     count = np.zeros(chunks + 1, np.int64)
     _count_facing(hits.position_mm, hits.normal, center, count)
     count = np.cumsum(count)
@@ -438,7 +448,10 @@ def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
     The additive sequence of the plastic number, mapped to the disc with even density.
     """
     index = np.arange(count)
-    u, v = (0.5 + index * PLASTIC) % 1.0, (0.5 + index * PLASTIC**2) % 1.0
+    u, v = (
+        (0.5 + index * INVERSE_PLASTIC_NUMBER) % 1.0,
+        (0.5 + index * INVERSE_PLASTIC_NUMBER**2) % 1.0,
+    )
     radius, angle = np.sqrt(u), 2.0 * np.pi * v
     return (radius * np.cos(angle)).astype(np.float32), (radius * np.sin(angle)).astype(np.float32)
 
@@ -470,7 +483,9 @@ def _faces(i, position, normal, center):  # type: ignore[no-untyped-def]
 def _count_facing(position, normal, center, count):  # type: ignore[no-untyped-def]
     for chunk in prange(count.shape[0] - 1):
         n = 0
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
+        for i in range(
+            chunk * ROWS_PER_CHUNK, min((chunk + 1) * ROWS_PER_CHUNK, position.shape[0])
+        ):
             n += _faces(i, position, normal, center)
         count[chunk + 1] = n
 
@@ -481,7 +496,9 @@ def _aim(  # type: ignore[no-untyped-def]
 ):
     for chunk in prange(count.shape[0] - 1):
         at = count[chunk]
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
+        for i in range(
+            chunk * ROWS_PER_CHUNK, min((chunk + 1) * ROWS_PER_CHUNK, position.shape[0])
+        ):
             if not _faces(i, position, normal, center):
                 continue
             k = i % targets.shape[0]
@@ -539,7 +556,7 @@ def _shade(  # type: ignore[no-untyped-def]
         if nv <= 0.0:
             continue
         if has_glow:
-            leaving = through(nv)
+            leaving = transmittance(nv)
             out[0, i] += leaving * glow[i, 0]
             out[1, i] += leaving * glow[i, 1]
             out[2, i] += leaving * glow[i, 2]
@@ -559,9 +576,13 @@ def _shade(  # type: ignore[no-untyped-def]
         strength *= off**exponent
         if relief.shape[0] > 0:
             strength *= relief[i]
-        s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
-        r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
-        if kind == MATT:
+        s0, s1, s2 = (
+            surface[i, 0] / UINT16_FULL_SCALE,
+            surface[i, 1] / UINT16_FULL_SCALE,
+            surface[i, 2] / UINT16_FULL_SCALE,
+        )
+        r0, r1, r2 = MAX_R_D * s0 * s0, MAX_R_D * s1 * s1, MAX_R_D * s2 * s2
+        if kind == MATT_ROWS:
             out[0, i] += strength * r0
             out[1, i] += strength * r1
             out[2, i] += strength * r2
@@ -569,15 +590,19 @@ def _shade(  # type: ignore[no-untyped-def]
         h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
         length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
         nh = min((nl + nv) / length, 1.0)
-        rough = surface[i, 3] / FULL
-        if kind == METAL:
+        rough = surface[i, 3] / UINT16_FULL_SCALE
+        if kind == METAL_ROWS:
             lobe = math.pi * strength * ggx(nl, nv, nh, rough)
             out[0, i] += lobe * r0
             out[1, i] += lobe * r1
             out[2, i] += lobe * r2
             continue
-        oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
-        if surface.shape[1] > BARE:
+        oil, fuzz, bare = (
+            surface[i, 4] / UINT16_FULL_SCALE,
+            surface[i, 5] / UINT16_FULL_SCALE,
+            surface[i, 6] / UINT16_FULL_SCALE,
+        )
+        if surface.shape[1] > BARE_COLUMNS:
             lobe = coated_terms(
                 nl,
                 nv,
@@ -585,14 +610,14 @@ def _shade(  # type: ignore[no-untyped-def]
                 0.5 * length,
                 rough,
                 oil,
-                FUZZ_LIMIT * fuzz,
-                surface[i, 7] / FULL,
-                surface[i, 8] / FULL,
-                1.0 + surface[i, 9] / FULL,
-                surface[i, 10] / FULL,
+                MAX_FUZZ * fuzz,
+                surface[i, 7] / UINT16_FULL_SCALE,
+                surface[i, 8] / UINT16_FULL_SCALE,
+                1.0 + surface[i, 9] / UINT16_FULL_SCALE,
+                surface[i, 10] / UINT16_FULL_SCALE,
             )
         else:
-            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
+            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, MAX_FUZZ * fuzz)
         gloss = math.pi * strength * bare * lobe
         inside = strength * boundary(nl, nv) if diffuse else 0.0
         out[0, i] += gloss + inside * r0

@@ -14,11 +14,11 @@ import numpy as np
 
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.light.olat import (
-    BARE,
+    BARE_COLUMNS,
     DISC_POINTS,
     ETA_COLUMN,
-    FULL,
-    FUZZ_LIMIT,
+    MAX_FUZZ,
+    UINT16_FULL_SCALE,
     Hits,
     Lamp,
     disc_points,
@@ -28,10 +28,10 @@ from rigsim.light.olat import (
 from rigsim.light.surface_brdf import (
     ETA_OIL,
     FUZZ_ALBEDO,
+    MAX_R_D,
     OIL_SMOOTHING,
     POWDER_ALBEDO,
     POWDER_ASYMMETRY,
-    R_D_LIMIT,
 )
 from rigsim.render import Caster, load, with_slack
 from rigsim.tissue.skin_layers import ETA
@@ -155,10 +155,10 @@ class VectorLight:
         # Signed halves: the top bit is the sign.
         signed = [mi.Int32(half << 16) >> 16 for half in halves[:3]]
         normal = dr.normalize(mi.Vector3f(*(mi.Float(half) for half in signed)))
-        unit = [mi.Float(half) * (1.0 / FULL) for half in halves[3:]]
-        colors = [R_D_LIMIT * root * root for root in unit[:3]]
-        known = [*colors, unit[3], unit[4], FUZZ_LIMIT * unit[5], *unit[6:]]
-        if len(known) > BARE:
+        unit = [mi.Float(half) * (1.0 / UINT16_FULL_SCALE) for half in halves[3:]]
+        colors = [MAX_R_D * root * root for root in unit[:3]]
+        known = [*colors, unit[3], unit[4], MAX_FUZZ * unit[5], *unit[6:]]
+        if len(known) > BARE_COLUMNS:
             known[ETA_COLUMN] = 1.0 + known[ETA_COLUMN]
         return normal, known
 

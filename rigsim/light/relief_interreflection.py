@@ -18,12 +18,12 @@ from numba import njit, prange
 
 from rigsim.arrays import Float32Array
 from rigsim.light.self_shadow import horizon_tangent
-from rigsim.light.surface_brdf import through
+from rigsim.light.surface_brdf import transmittance
 
-NODES: Final = 6
+ELEVATION_NODES: Final = 6
 """Elevations at which what passes two boundaries is summed."""
 
-_QUADRATURE: Final = np.polynomial.legendre.leggauss(NODES)
+_ELEVATION_QUADRATURE: Final = np.polynomial.legendre.leggauss(ELEVATION_NODES)
 
 
 def hidden_share(
@@ -63,7 +63,7 @@ def hidden_share(
     In a direction with the normal's part n_t along it and n_z up, between the point's own tangent
     plane at elevation a and the horizon at b, ``int (n_t cos e + n_z sin e) cos e de`` is
     ``n_t (e / 2 + sin 2e / 4) + n_z sin^2 e / 2`` from a to b; with boundaries it is summed at
-    `NODES` elevations. Level skin around the field closes the sky below the horizontal.
+    `ELEVATION_NODES` elevations. Level skin around the field closes the sky below the horizontal.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def hidden_share(
         tangent = horizon_tangent(height_um, pixel_um=pixel_um, azimuth_rad=angle)
         part = np.ascontiguousarray(tangent[inner, inner])
         if boundaries:
-            _add_through(out, normals, part, angle, 2.0 / sectors, *_QUADRATURE)
+            _add_through(out, normals, part, angle, 2.0 / sectors, *_ELEVATION_QUADRATURE)
         else:
             _add(out, normals, part, angle, 2.0 / sectors)
     return np.clip(out, 0.0, 1.0)
@@ -122,6 +122,6 @@ def _add_through(out, normals, tangent, angle, share, nodes, weights):  # type: 
             for k in range(nodes.shape[0]):
                 e = 0.5 * (low + high) + 0.5 * (high - low) * nodes[k]
                 cosine = along * math.cos(e) + upward * math.sin(e)
-                passed = through(min(cosine, 1.0)) if cosine > 0.0 else 0.0
+                passed = transmittance(min(cosine, 1.0)) if cosine > 0.0 else 0.0
                 total += weights[k] * cosine * math.cos(e) * passed * passed
             out[i, j] += share * 0.5 * (high - low) * total

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float32Array
 from rigsim.light.self_shadow import horizon_tangent
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 
-DIRECTIONS: Final = 24
+HORIZON_DIRECTIONS: Final = 24
 """Directions in which horizons are found; between them they are blended."""
 
 SOFT_RAD: Final = 0.02
@@ -34,7 +34,7 @@ class ReliefShadow:
         The face in its pose.
     """
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, subject: SimulatedSubject) -> None:
         atlas = subject.atlas
         self._du, self._dv = atlas.dp_du_mm, atlas.dp_dv_mm
         self._size = atlas.size
@@ -42,8 +42,10 @@ class ReliefShadow:
         # um a texel; what a texel measures along each direction, its own frame says
         self._horizon = np.stack(
             [
-                horizon_tangent(height, pixel_um=1.0, azimuth_rad=2.0 * math.pi * k / DIRECTIONS)
-                for k in range(DIRECTIONS)
+                horizon_tangent(
+                    height, pixel_um=1.0, azimuth_rad=2.0 * math.pi * k / HORIZON_DIRECTIONS
+                )
+                for k in range(HORIZON_DIRECTIONS)
             ]
         )
 

@@ -11,27 +11,27 @@ from capture.rig import Light
 from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.as_built.polarizers import Films, absorbing_axis
+from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import Atlas
 from rigsim.light import lateral
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
 from rigsim.render import Caster, visibility
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 from rigsim.tissue.skin_table import SkinTable
 
 if TYPE_CHECKING:
-    from rigsim.light.interreflection import SkinBounce
+    from rigsim.light.interreflection import Interreflection
 
 
 PIGMENT_BLUR_MM: Final = 0.12
 """Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,
 see `spread_pattern`."""
 
-SHADOW_SAMPLES: Final = 8
+FLASH_SHADOW_SAMPLES: Final = 8
 """Points on each flash that cast shadows."""
 
 
@@ -49,7 +49,7 @@ class SurfaceLight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SkinGlow:
+class SubsurfaceRadiance:
     """Light on and out of a face; textures of shape (N, N[, C])."""
 
     surface: SurfaceLight
@@ -66,10 +66,10 @@ class SkinGlow:
 
 
 def light_surface(
-    subject: Subject,
+    subject: SimulatedSubject,
     lights: tuple[Light, ...],
     weights: Float64Array,
-    films: Films,
+    films: Polarizers,
     *,
     caster: Caster,
     relief: ReliefShadow | None = None,
@@ -111,7 +111,7 @@ def light_surface(
             mesh_normal,
             light.position_mm,
             radius_mm=light.radius_mm,
-            samples=SHADOW_SAMPLES,
+            samples=FLASH_SHADOW_SAMPLES,
         )
         if relief is not None:
             visible[:, k] *= relief.on_texture(
@@ -139,18 +139,18 @@ def light_surface(
 
 
 def light_skin(
-    subject: Subject,
+    subject: SimulatedSubject,
     state: str,
     surface: SurfaceLight,
     *,
     camera: str,
     illuminant: str,
     lateral_transport: bool,
-    bounce: SkinBounce | None = None,
+    bounce: Interreflection | None = None,
     spectral: bool = True,
     step: int = 1,
     enough: float = 1e-3,
-) -> SkinGlow:
+) -> SubsurfaceRadiance:
     """Let the light on a face into its skin and out again.
 
     Parameters
@@ -174,7 +174,7 @@ def light_skin(
 
     Returns
     -------
-    SkinGlow
+    SubsurfaceRadiance
         Textures.
     """
     melanin, blood = subject.melanin, subject.hemoglobin(state)
@@ -185,11 +185,11 @@ def light_skin(
     within = surface.entered[..., None]
     if bounce is not None:
         from rigsim.light.interreflection_color import (
-            BounceColor,  # which knows of skin, and so of this module
+            InterreflectionColor,  # which knows of skin, and so of this module
         )
 
         outside = scale * ((1.0 - hair) * reflectance + covering)
-        color = BounceColor(
+        color = InterreflectionColor(
             bounce,
             subject,
             state,
@@ -215,11 +215,11 @@ def light_skin(
         )
     # Hair is dark and matt, and lets no light into the skin below it.
     spread = (1.0 - hair) * spread + scale * within * covering
-    return SkinGlow(surface, reflectance, sharp, spread, kernels)
+    return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels)
 
 
 def spread_through_pigment(
-    subject: Subject,
+    subject: SimulatedSubject,
     state: str,
     reflectance: Float32Array,
     entered: Float32Array,
@@ -295,13 +295,15 @@ def spread_pattern(
     """
     channels = reflectance.shape[-1]
     log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
-    pigment = np.exp(lateral.spread_light(log_m, atlas, [PIGMENT_BLUR_MM], np.ones((channels, 1))))
+    pigment = np.exp(
+        lateral.scatter_laterally(log_m, atlas, [PIGMENT_BLUR_MM], np.ones((channels, 1)))
+    )
     light = entered if entered.ndim == 3 else entered[..., None]
     inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
-    return pigment * lateral.spread_light(inside, atlas, kernels.sigmas_mm, kernels.weights)
+    return pigment * lateral.scatter_laterally(inside, atlas, kernels.sigmas_mm, kernels.weights)
 
 
-def typical_kernels(subject: Subject, state: str, camera: str, light: str) -> GaussianSum:
+def typical_kernels(subject: SimulatedSubject, state: str, camera: str, light: str) -> GaussianSum:
     """Return the lateral profile of a face's median skin as Gaussians per channel."""
     table = SkinTable.load()
     covered = subject.atlas.covered

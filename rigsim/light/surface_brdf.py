@@ -49,7 +49,7 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
@@ -82,10 +82,10 @@ POWDER_ASYMMETRY: Final = -0.35
 """Mean cosine of single scattering by grains of powder: backwards, as large rough grains do
 (Hapke 1981, doi:10.1029/JB086iB04p03039); the value is chosen."""
 
-CHANNELS: Final = (7, 11)
+LOBE_CHANNELS: Final = (7, 11)
 """What the lobes depend on: of bare skin, and with a coating."""
 
-R_D_LIMIT: Final = 1.25
+MAX_R_D: Final = 1.25
 """No R_d is above this; skin stays below 0.9."""
 
 
@@ -162,7 +162,7 @@ class SkinSurface:
 
 
 def skin_surface(
-    subject: Subject, camera: str, light: str, *, state: str = "neutral"
+    subject: SimulatedSubject, camera: str, light: str, *, state: str = "neutral"
 ) -> SkinSurface:
     """Describe how a face reflects.
 
@@ -237,7 +237,7 @@ def evaluate(
     True
     """
     arrays = [np.asarray(a, np.float32) for a in (packed, normal, to_light, to_camera)]
-    if arrays[0].shape[-1] not in CHANNELS or any(a.shape[-1] != 3 for a in arrays[1:]):
+    if arrays[0].shape[-1] not in LOBE_CHANNELS or any(a.shape[-1] != 3 for a in arrays[1:]):
         raise SurfaceError(
             f"packed, directions: got shapes {[a.shape for a in arrays]}, "
             "expected (n, 7) or (n, 11), (n, 3)"
@@ -379,7 +379,7 @@ def _down(nl, nv, fuzz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def through(cosine):  # type: ignore[no-untyped-def]
+def transmittance(cosine):  # type: ignore[no-untyped-def]
     """Return the transmittance of the boundary."""
     return 1.0 - _fresnel(cosine, ETA)
 
@@ -450,5 +450,5 @@ __all__ = [
     "skin_surface",
     "surface_floor",
     "surface_terms",
-    "through",
+    "transmittance",
 ]

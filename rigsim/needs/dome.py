@@ -18,13 +18,21 @@ from rigsim.needs.effect_sizes import (
     most_irradiance,
     spread_over_noise,
 )
-from rigsim.needs.effects import Effect, Noise, SceneEffects, SceneNeeds, absent, decide, unmodeled
+from rigsim.needs.effects import (
+    Effect,
+    EffectSelection,
+    Noise,
+    SceneEffects,
+    absent,
+    decide,
+    unmodeled,
+)
 from rigsim.needs.flash import (
-    BOUNCES,
-    FAR_LIGHT,
-    LATERAL,
-    SHADOWS,
-    SPECTRAL,
+    INTERREFLECTION_EFFECT,
+    LATERAL_EFFECT,
+    SHADOW_EFFECT,
+    SPECTRAL_EFFECT,
+    UNMODELED_GLARE,
     bands,
     brightest_rgb,
     further_bounces,
@@ -34,14 +42,14 @@ from rigsim.needs.flash import (
     wrinkles,
 )
 from rigsim.render import Caster
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
 
 def dome_needs(
     rig: Rig,
-    subject: Subject | Target,
+    subject: SimulatedSubject | Target,
     state: str,
     *,
     caster: Caster,
@@ -51,7 +59,7 @@ def dome_needs(
     motion: HeadMotion | None,
     effects: SceneEffects,
     subpixels: int,
-) -> SceneNeeds:
+) -> EffectSelection:
     """Decide what a scene in the dome builds.
 
     Parameters
@@ -85,9 +93,13 @@ def dome_needs(
     if isinstance(subject, Target):
         size = 0.0 if exchange_share(caster) == 0.0 else float("inf")
         because = "the target is flat" if size == 0.0 else "the target has hollows"
-        flat = decide(BOUNCES, size, None, switch="interreflections", because=because)
-        opaque = [(LATERAL, f"{subject.name} is opaque")]
-        return SceneNeeds((*made, flat, focus, *absent([*opaque, *world]), *unmodeled(FAR_LIGHT)))
+        flat = decide(
+            INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because
+        )
+        opaque = [(LATERAL_EFFECT, f"{subject.name} is opaque")]
+        return EffectSelection(
+            (*made, flat, focus, *absent([*opaque, *world]), *unmodeled(UNMODELED_GLARE))
+        )
     brightest = brightest_rgb(subject, state, view, illuminant)
     if white_rgb is None:
         white = spectra.camera_white(view.spectral_sensitivity, illuminant)
@@ -103,7 +115,7 @@ def dome_needs(
     more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES,
+        INTERREFLECTION_EFFECT,
         float(unseen.max()),
         effects.interreflections,
         switch="interreflections",
@@ -112,9 +124,9 @@ def dome_needs(
     off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
         *textures(subject, view, illuminant),
-        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
+        Effect(SHADOW_EFFECT, "built", "a face shades itself", noise.share(1.0)),
         decide(
-            LATERAL,
+            LATERAL_EFFECT,
             float(spread_over_noise(lost, level, noise).max()),
             effects.lateral,
             switch="subsurface",
@@ -122,7 +134,7 @@ def dome_needs(
         ),
         bounces,
         decide(
-            SPECTRAL,
+            SPECTRAL_EFFECT,
             float(off.max()),
             effects.spectral,
             switch="spectral",
@@ -138,11 +150,11 @@ def dome_needs(
     made += absent(
         [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]
     )
-    return SceneNeeds((*made, *_limits(made)))
+    return EffectSelection((*made, *_limits(made)))
 
 
 def _movement(
-    subject: Subject, movement: bool, motion: HeadMotion | None, view: View
+    subject: SimulatedSubject, movement: bool, motion: HeadMotion | None, view: View
 ) -> list[Effect]:
     name = "movement of the face with the state"
     made = []
@@ -175,23 +187,23 @@ def _nearness(caster: Caster, place_mm: Vector) -> float:
 
 def _limits(made: list[Effect]) -> list[Effect]:
     out = [
-        *FAR_LIGHT,
+        *UNMODELED_GLARE,
         ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
     ]
     built = {effect.name for effect in made if effect.built}
-    if BOUNCES in built:
+    if INTERREFLECTION_EFFECT in built:
         out.append(("highlights of skin on skin", "only light from inside goes on"))
-    if LATERAL in built:
+    if LATERAL_EFFECT in built:
         out.append(("lateral kernels that vary over the face", "one, of its median skin"))
     return unmodeled(out)
 
 
-def noise_of(sensors: list[Noise]) -> Noise:
+def least_noise(sensors: list[Noise]) -> Noise:
     """Return the least noise of some sensors.
 
     Examples
     --------
-    >>> noise_of([Noise(1e-4, 2e-7), Noise(2e-4, 1e-7)])
+    >>> least_noise([Noise(1e-4, 2e-7), Noise(2e-4, 1e-7)])
     Noise(scale=0.0001, offset=1e-07)
     """
     return Noise(

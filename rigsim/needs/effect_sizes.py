@@ -107,9 +107,9 @@ def exchange_share(caster: Caster) -> float:
     """
     if is_flat(caster.mesh):
         return 0.0
-    from rigsim.light.interreflection import SkinBounce
+    from rigsim.light.interreflection import Interreflection
 
-    exchange = SkinBounce(caster, patches=EXCHANGE_PATCHES).exchange
+    exchange = Interreflection(caster, patches=EXCHANGE_PATCHES).exchange
     return float(np.asarray(exchange.sum(axis=1)).max(initial=0.0))
 
 

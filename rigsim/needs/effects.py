@@ -2,8 +2,8 @@
 
 A scene builds what changes a picture and nothing else. Whether an effect does is asked for the
 plan's sensor and for the subject: its largest change of any pixel against that pixel's noise.
-What is below `ENOUGH` may be left out; `skinrig bench --stage omissions` renders scenes with and
-without to check that.
+What is below `NEGLIGIBLE_NOISE_RATIO` may be left out; `skinrig bench --stage omissions` renders
+scenes with and without to check that.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from rigsim.sensor import Sensor
 
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
 
-ENOUGH: Final = 0.1
+NEGLIGIBLE_NOISE_RATIO: Final = 0.1
 """Largest change of a pixel over its noise that may be left out."""
 
-MEANING: Final[dict[str, str]] = {
+VERDICT_MEANINGS: Final[dict[str, str]] = {
     "built": "it changes pixels, and is in the picture",
-    "negligible": f"it changes no pixel by {ENOUGH:g} of its noise",
+    "negligible": f"it changes no pixel by {NEGLIGIBLE_NOISE_RATIO:g} of its noise",
     "absent": "the simulated world has none: rig, plan or subject say so",
     "asked": "it would change pixels, but was asked to be left out",
     "unmodeled": "a real rig has it and it may change pixels: the simulator cannot build it",
@@ -143,7 +143,7 @@ class Effect:
     name: str
     """In words."""
     verdict: Verdict
-    """What became of it, see `MEANING`."""
+    """What became of it, see `VERDICT_MEANINGS`."""
     reason: str
     """Why, in words."""
     over_noise: float | None = None
@@ -161,11 +161,11 @@ class Effect:
             )
         if not (self.name and self.reason):
             raise NeedsError(f"effect {self.name!r}: got no name or no reason, expected both")
-        small = self.over_noise is not None and self.over_noise < ENOUGH
+        small = self.over_noise is not None and self.over_noise < NEGLIGIBLE_NOISE_RATIO
         if self.verdict == "negligible" and self.over_noise is not None and not small:
             raise NeedsError(
                 f"{self.name}: negligible: got a change of {self.over_noise:.3g} of the noise, "
-                f"expected below {ENOUGH:g}; build it"
+                f"expected below {NEGLIGIBLE_NOISE_RATIO:g}; build it"
             )
 
     @property
@@ -191,12 +191,12 @@ class Effect:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneNeeds:
+class EffectSelection:
     """All effects that a scene knows of.
 
     Examples
     --------
-    >>> needs = SceneNeeds((
+    >>> needs = EffectSelection((
     ...     Effect("polarization", "built", "films before lights and camera"),
     ...     Effect("ambient light", "absent", "the room is dark"),
     ... ))
@@ -238,7 +238,7 @@ class SceneNeeds:
         return [effect.document() for effect in self.effects]
 
 
-def strictest(each: Sequence[SceneNeeds]) -> SceneNeeds:
+def merge_selections(each: Sequence[EffectSelection]) -> EffectSelection:
     """Return what a scene must hold that several cameras look at: what any of them needs.
 
     Parameters
@@ -249,10 +249,10 @@ def strictest(each: Sequence[SceneNeeds]) -> SceneNeeds:
     Examples
     --------
     >>> coarse, fine = (
-    ...     SceneNeeds((decide("blur", size, None, switch="optics", because="a lens"),))
+    ...     EffectSelection((decide("blur", size, None, switch="optics", because="a lens"),))
     ...     for size in (0.01, 5.0)
     ... )
-    >>> strictest([coarse, fine])["blur"].over_noise
+    >>> merge_selections([coarse, fine])["blur"].over_noise
     5.0
     """
     found: dict[str, Effect] = {}
@@ -260,7 +260,7 @@ def strictest(each: Sequence[SceneNeeds]) -> SceneNeeds:
         other = found.get(effect.name)
         if other is None or _need(effect) > _need(other):
             found[effect.name] = effect
-    return SceneNeeds(tuple(found.values()))
+    return EffectSelection(tuple(found.values()))
 
 
 def _need(effect: Effect) -> tuple[bool, float]:
@@ -298,12 +298,14 @@ def decide(
         raise NeedsError(f"{name}: over_noise: got {over_noise}, expected >= 0")
     size = f"{because}: up to {over_noise:.3g} times the noise"
     if asked is None:
-        verdict: Verdict = "built" if over_noise >= ENOUGH else "negligible"
+        verdict: Verdict = "built" if over_noise >= NEGLIGIBLE_NOISE_RATIO else "negligible"
         return Effect(name, verdict, size, over_noise, switch)
     if asked:
-        text = size if over_noise >= ENOUGH else f"{switch}=True asks for it; {size}"
+        text = (
+            size if over_noise >= NEGLIGIBLE_NOISE_RATIO else f"{switch}=True asks for it; {size}"
+        )
         return Effect(name, "built", text, over_noise, switch)
-    if over_noise < ENOUGH:
+    if over_noise < NEGLIGIBLE_NOISE_RATIO:
         return Effect(name, "negligible", size, over_noise, switch)
     return Effect(name, "asked", f"{switch}=False asks for it; {size}", over_noise, switch)
 

@@ -9,7 +9,7 @@ import numpy as np
 from capture.rig import Rig, View
 from rigsim import shading
 from rigsim.arrays import Float64Array, FloatArray
-from rigsim.light.interreflection_color import STEPS, color_error, step_error
+from rigsim.light.interreflection_color import WAVELENGTH_STEPS, color_error, step_error
 from rigsim.light.subsurface_radiance import typical_kernels
 from rigsim.needs.effect_sizes import (
     bounced,
@@ -20,52 +20,52 @@ from rigsim.needs.effect_sizes import (
     spread_over_noise,
 )
 from rigsim.needs.effects import (
-    ENOUGH,
+    NEGLIGIBLE_NOISE_RATIO,
     Effect,
+    EffectSelection,
     Noise,
     SceneEffects,
-    SceneNeeds,
     absent,
     decide,
     unmodeled,
 )
 from rigsim.render import Caster
 from rigsim.render.depth_of_field import facing_depths, lens_spread
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.tissue.skin_color import skin_color
 
-LATERAL = "light spreading sideways in skin"
-BOUNCES = "light from skin to skin"
-SPECTRAL = "color of light from skin to skin, wavelength by wavelength"
-FINER = "wavelengths between those at which light from skin to skin is summed"
-FURTHER = "bounces after the last that is summed"
-POLARIZATION = "polarization"
-SHADOWS = "shadows"
-LENS = "depth of field and lens blur"
-BANDS = "bands of the camera"
-RELIEF = "relief of the skin"
-PIGMENT = "pattern of pigment"
-WRINKLES = "shadows of wrinkles"
+LATERAL_EFFECT = "light spreading sideways in skin"
+INTERREFLECTION_EFFECT = "light from skin to skin"
+SPECTRAL_EFFECT = "color of light from skin to skin, wavelength by wavelength"
+WAVELENGTH_STEP_EFFECT = "wavelengths between those at which light from skin to skin is summed"
+FURTHER_BOUNCES_EFFECT = "bounces after the last that is summed"
+POLARIZATION_EFFECT = "polarization"
+SHADOW_EFFECT = "shadows"
+LENS_EFFECT = "depth of field and lens blur"
+BAND_EFFECT = "bands of the camera"
+RELIEF_EFFECT = "relief of the skin"
+PIGMENT_EFFECT = "pattern of pigment"
+WRINKLE_SHADOW_EFFECT = "shadows of wrinkles"
 
-EVERY = 16
+TEXEL_STEP = 16
 """Of the texels whose reflectance is looked at."""
 
-LAST_BOUNCE = 1e-3
+MAX_LAST_BOUNCE = 1e-3
 """The last bounce that is summed is at most this share of the first."""
 
-EVEN = 1e-5
-EVEN_DEG = 1e-3
+MIN_PIGMENT_CONTRAST = 1e-5
+MIN_RELIEF_TILT_DEG = 1e-3
 """Relative change of reflectance, and tilt of normals, that no sensor tells: full scale is at most
 some thousand times its noise, of which a tenth counts."""
 
-REST = 0.05
+MAX_REMAINING_NOISE_RATIO = 0.05
 """Of the noise: what further bounces may add at most, about."""
 
 
 def flash_needs(
     rig: Rig,
-    subject: Subject | Target,
+    subject: SimulatedSubject | Target,
     state: str,
     *,
     view: View,
@@ -77,7 +77,7 @@ def flash_needs(
     effects: SceneEffects,
     subpixels: int,
     share: float | None = None,
-) -> SceneNeeds:
+) -> EffectSelection:
     """Decide what a scene before the flash rig builds.
 
     Parameters
@@ -87,7 +87,7 @@ def flash_needs(
     subject, state
         Who stands there, in which state.
     view
-        Which of its cameras looks; of several see `rigsim.needs.effects.strictest`.
+        Which of its cameras looks; of several see `rigsim.needs.effects.merge_selections`.
     caster
         The mesh.
     noise
@@ -122,11 +122,13 @@ def flash_needs(
                     effects.optics,
                 )
             )
-            made += unmodeled(FAR_LIGHT)
+            made += unmodeled(UNMODELED_GLARE)
         else:
-            made.append(Effect(LENS, "negligible", "all of the picture is alike", 0.0, "optics"))
-        made.append(Effect(WRINKLES, "absent", f"{subject.name} has none"))
-        return SceneNeeds((*made, *absent(dark)))
+            made.append(
+                Effect(LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
+            )
+        made.append(Effect(WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
+        return EffectSelection((*made, *absent(dark)))
     brightest = brightest_rgb(subject, state, view, illuminant)
     places = [light.position_mm for light in rig.lights]
     most = most_irradiance(caster.mesh, places, weights_mm2)
@@ -143,7 +145,7 @@ def flash_needs(
     more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES,
+        INTERREFLECTION_EFFECT,
         float(unseen.max()),
         effects.interreflections,
         switch="interreflections",
@@ -152,9 +154,9 @@ def flash_needs(
     off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
         *textures(subject, view, illuminant),
-        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
+        Effect(SHADOW_EFFECT, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
         decide(
-            LATERAL,
+            LATERAL_EFFECT,
             float(spread_over_noise(lost, level, noise).max()),
             effects.lateral,
             switch="lateral",
@@ -162,7 +164,7 @@ def flash_needs(
         ),
         bounces,
         decide(
-            SPECTRAL,
+            SPECTRAL_EFFECT,
             float(off.max()),
             effects.spectral,
             switch="spectral",
@@ -172,24 +174,28 @@ def flash_needs(
         ),
         _finer(
             bounces,
-            bool(off.max() >= ENOUGH) if effects.spectral is None else effects.spectral,
+            bool(off.max() >= NEGLIGIBLE_NOISE_RATIO)
+            if effects.spectral is None
+            else effects.spectral,
             spectral_step(subject, state, view, illuminant, bounces),
         ),
         further_bounces(bounces, share * float(brightest.max())),
         lens(view, illuminant, caster, noise, peak, subpixels, effects.optics),
         wrinkles(subject, noise, peak, effects.relief_shadows),
     ]
-    return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
+    return EffectSelection((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 
 
-def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -> Effect:
+def wrinkles(subject: SimulatedSubject, noise: Noise, level: float, asked: bool | None) -> Effect:
     """Return whether the relief of a face that has moved hides lights from itself.
 
     Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
     the skin they would take up to a tenth of its cosine away, see docs/leaving-out.md.
     """
     if subject.pose is None:
-        return Effect(WRINKLES, "unmodeled", "pores of a face at rest tilt the surface only")
+        return Effect(
+            WRINKLE_SHADOW_EFFECT, "unmodeled", "pores of a face at rest tilt the surface only"
+        )
     covered = subject.atlas.covered
     across, along = (mm[covered] for mm in subject.atlas.texel_mm())
     down, right = (
@@ -199,7 +205,7 @@ def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -
     # a light as low as the relief is steep shines with that sine, and may be hidden
     most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
     return decide(
-        WRINKLES,
+        WRINKLE_SHADOW_EFFECT,
         most / float(noise.sigma(0.0)),
         asked,
         switch="relief_shadows",
@@ -207,7 +213,7 @@ def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -
     )
 
 
-FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
+UNMODELED_GLARE = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
 
 
 def lens(
@@ -242,7 +248,7 @@ def lens(
     far = max(abs(depth) for depth in depths)
     gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
     return decide(
-        LENS,
+        LENS_EFFECT,
         gained / float(noise.sigma(gained)),
         asked,
         switch="optics",
@@ -258,18 +264,20 @@ def polarization(rig: Rig, view: View) -> Effect:
         reason = (
             f"films before {len(films)} of {len(rig.lights)} lights, an analyser before {view.name}"
         )
-        return Effect(POLARIZATION, "built", reason)
-    return Effect(POLARIZATION, "absent", "the rig has no polarizing film, and sensors see none")
+        return Effect(POLARIZATION_EFFECT, "built", reason)
+    return Effect(
+        POLARIZATION_EFFECT, "absent", "the rig has no polarizing film, and sensors see none"
+    )
 
 
 def bands(view: View) -> Effect:
     """Return how many colors are kept."""
     if view.cfa == "MONO":
-        return Effect(BANDS, "built", "one: the sensor has no filters")
-    return Effect(BANDS, "built", "three: those of the sensor's filters")
+        return Effect(BAND_EFFECT, "built", "one: the sensor has no filters")
+    return Effect(BAND_EFFECT, "built", "three: those of the sensor's filters")
 
 
-def textures(subject: Subject, view: View, illuminant: str) -> list[Effect]:
+def textures(subject: SimulatedSubject, view: View, illuminant: str) -> list[Effect]:
     """Return whether a face needs its relief and its map of pigment.
 
     Parameters
@@ -287,21 +295,28 @@ def textures(subject: Subject, view: View, illuminant: str) -> list[Effect]:
     blood = np.full_like(ends, np.median(subject.hemoglobin("neutral")[covered]))
     rgb = skin_color(view.spectral_sensitivity, illuminant).rgb(ends, blood)
     least, most = float((rgb[2] / rgb[1]).min()), float((rgb[0] / rgb[1]).max())
-    flat, even = tilt < EVEN_DEG, max(most - 1.0, 1.0 - least) < EVEN
+    flat, even = tilt < MIN_RELIEF_TILT_DEG, max(most - 1.0, 1.0 - least) < MIN_PIGMENT_CONTRAST
     return [
-        Effect(RELIEF, "negligible" if flat else "built", f"it tilts up to {tilt:.0f} degrees"),
         Effect(
-            PIGMENT,
+            RELIEF_EFFECT, "negligible" if flat else "built", f"it tilts up to {tilt:.0f} degrees"
+        ),
+        Effect(
+            PIGMENT_EFFECT,
             "negligible" if even else "built",
             f"reflectance is {least:.2g} to {most:.2g} times its median's",
         ),
     ]
 
 
-def brightest_rgb(subject: Subject, state: str, view: View, illuminant: str) -> Float64Array:
+def brightest_rgb(
+    subject: SimulatedSubject, state: str, view: View, illuminant: str
+) -> Float64Array:
     """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
     covered = subject.atlas.covered
-    melanin, blood = subject.melanin[covered][::EVERY], subject.hemoglobin(state)[covered][::EVERY]
+    melanin, blood = (
+        subject.melanin[covered][::TEXEL_STEP],
+        subject.hemoglobin(state)[covered][::TEXEL_STEP],
+    )
     rgb = skin_color(view.spectral_sensitivity, illuminant).rgb(melanin, blood)
     return np.asarray(rgb.reshape(-1, 3).max(axis=0), np.float64)
 
@@ -314,11 +329,11 @@ def last_bounce(over_noise: float) -> float:
     >>> last_bounce(0.5), last_bounce(500.0)
     (0.001, 0.0001)
     """
-    return min(LAST_BOUNCE, REST / max(over_noise, 1e-9))
+    return min(MAX_LAST_BOUNCE, MAX_REMAINING_NOISE_RATIO / max(over_noise, 1e-9))
 
 
 def spectral_step(
-    subject: Subject, state: str, view: View, illuminant: str, bounces: Effect
+    subject: SimulatedSubject, state: str, view: View, illuminant: str, bounces: Effect
 ) -> tuple[int, float]:
     """Return at which of the table's wavelengths light from skin to skin is summed: every n-th.
 
@@ -330,10 +345,10 @@ def spectral_step(
     """
     size = float(bounces.over_noise or 0.0)
     told = math.inf
-    for step in STEPS:
+    for step in WAVELENGTH_STEPS:
         error = step_error(subject, state, view.spectral_sensitivity, illuminant, step)
         told = size * float(error.max())
-        if told < ENOUGH:
+        if told < NEGLIGIBLE_NOISE_RATIO:
             return step, told
     return 1, told
 
@@ -343,20 +358,22 @@ def _finer(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
     step, over_noise = found
     if not (bounces.built and spectral):
         why = "there is no such light" if not bounces.built else "channels are taken whole"
-        return Effect(FINER, "negligible", why, 0.0, "spectral_step")
+        return Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, 0.0, "spectral_step")
     nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
-    return decide(FINER, over_noise, None, switch="spectral_step", because=nm)
+    return decide(WAVELENGTH_STEP_EFFECT, over_noise, None, switch="spectral_step", because=nm)
 
 
 def further_bounces(bounces: Effect, once: float) -> Effect:
     """Return what is left of light from skin to skin; ``once`` is the share that bounces on."""
     if not bounces.built:
-        return Effect(FURTHER, "negligible", "there is no such light", 0.0, "last_bounce")
+        return Effect(
+            FURTHER_BOUNCES_EFFECT, "negligible", "there is no such light", 0.0, "last_bounce"
+        )
     over_noise = float(bounces.over_noise or 0.0)
     last = last_bounce(over_noise)
     because = f"summing ends at {last:.1g} of the first"
     left = over_noise * last / (1.0 - once)
-    return decide(FURTHER, left, None, switch="last_bounce", because=because)
+    return decide(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", because=because)
 
 
 def _of_target(target: Target, caster: Caster) -> list[Effect]:
@@ -365,13 +382,13 @@ def _of_target(target: Target, caster: Caster) -> list[Effect]:
     because = "the target is flat" if share == 0.0 else "the target has hollows"
     size = 0.0 if share == 0.0 else float("inf")
     return [
-        decide(SHADOWS, size, None, switch="", because=because),
-        decide(BOUNCES, size, None, switch="interreflections", because=because),
-        Effect(LATERAL, "absent", f"{target.name} is opaque"),
+        decide(SHADOW_EFFECT, size, None, switch="", because=because),
+        decide(INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because),
+        Effect(LATERAL_EFFECT, "absent", f"{target.name} is opaque"),
     ]
 
 
-def _movement(subject: Subject, movement: bool) -> list[Effect]:
+def _movement(subject: SimulatedSubject, movement: bool) -> list[Effect]:
     name = "movement of the face with the states"
     if not movement:
         return [Effect(name, "asked", "movement=False asks for it", switch="movement")]
@@ -392,7 +409,7 @@ def _limits() -> list[Effect]:
         ),
         *unmodeled(
             [
-                *FAR_LIGHT,
+                *UNMODELED_GLARE,
                 ("highlights of skin on skin", "only light from inside goes on to other skin"),
                 ("lateral kernels that vary over the face", "one profile, of its median skin"),
                 ("polarized single scattering", "light from inside is taken as depolarized"),

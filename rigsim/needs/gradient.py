@@ -14,22 +14,36 @@ from rigsim.arrays import Float64Array, FloatArray
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
-from rigsim.needs.effects import Effect, Noise, SceneEffects, SceneNeeds, absent, decide, unmodeled
-from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS, bands, polarization
+from rigsim.needs.effects import (
+    Effect,
+    EffectSelection,
+    Noise,
+    SceneEffects,
+    absent,
+    decide,
+    unmodeled,
+)
+from rigsim.needs.flash import (
+    INTERREFLECTION_EFFECT,
+    LATERAL_EFFECT,
+    RELIEF_EFFECT,
+    SHADOW_EFFECT,
+    bands,
+    polarization,
+)
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
 
-OPTICS: Final = "diffraction and defocus"
-RELIEF: Final = "relief of the skin"
+OPTICS_EFFECT: Final = "diffraction and defocus"
 
-STEEPER: Final = 1.6
+MAX_STEEPENING: Final = 1.6
 """How much compression steepens the relief at most: the skin buckles at 0.66 of its length."""
 
-LOOKED_AT: Final = 384
+ANALYZED_TEXELS: Final = 384
 """Texels along one side of the part of the patch that is looked at."""
 
-SECTORS: Final = 8
+HORIZON_SECTORS: Final = 8
 
 
 def gradient_needs(
@@ -42,7 +56,7 @@ def gradient_needs(
     white: float,
     moving: bool,
     effects: SceneEffects,
-) -> SceneNeeds:
+) -> EffectSelection:
     """Decide what a scene in the gradient sphere builds.
 
     Parameters
@@ -70,10 +84,13 @@ def gradient_needs(
     limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
     if not isinstance(subject, MicroSkin):
         flat = "a ball bulges" if subject == "ball" else "the target is flat"
-        for name, switch in ((SHADOWS, "shadows"), (BOUNCES, "interreflections")):
+        for name, switch in (
+            (SHADOW_EFFECT, "shadows"),
+            (INTERREFLECTION_EFFECT, "interreflections"),
+        ):
             made.append(decide(name, 0.0, None, switch=switch, because=flat))
-        made.append(Effect(LATERAL, "absent", f"{subject} is glass, gray or nothing"))
-        return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+        made.append(Effect(LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
+        return EffectSelection((*made, *absent(world), *unmodeled(limits)))
     made += _of_skin(subject, sphere, lens, noise, white, effects)
     if moving:
         made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
@@ -93,14 +110,14 @@ def gradient_needs(
         ("polarized single scattering", "light from inside is taken as depolarized"),
         ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
     ]
-    return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+    return EffectSelection((*made, *absent(world), *unmodeled(limits)))
 
 
 def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:
     nyquist_per_mm = 500.0 / lens.pixel_on_subject_um
     kept = float(lens.transfer(np.array([nyquist_per_mm]))[0])
     return decide(
-        OPTICS,
+        OPTICS_EFFECT,
         noise.share(1.0 - kept),
         asked,
         switch="optics",
@@ -117,12 +134,12 @@ def _of_skin(
     effects: SceneEffects,
 ) -> list[Effect]:
     middle = skin.height_um.shape[0] // 2
-    half = min(middle, LOOKED_AT // 2)
+    half = min(middle, ANALYZED_TEXELS // 2)
     part = np.ascontiguousarray(
         skin.height_um[middle - half : middle + half, middle - half : middle + half]
     )
     down, right = (np.asarray(slope) for slope in np.gradient(part, skin.texel_um))
-    steepest = STEEPER * steepest_slope(right, down)
+    steepest = MAX_STEEPENING * steepest_slope(right, down)
     place = sphere.position_mm[sphere.position_mm[:, 2] > 0.0]
     lowest = float((place[:, 2] / np.hypot(place[:, 0], place[:, 1])).min())
     length = np.sqrt(1.0 + right**2 + down**2)
@@ -132,14 +149,14 @@ def _of_skin(
         normals.astype(np.float32),
         margin=0,
         pixel_um=skin.texel_um,
-        sectors=SECTORS,
+        sectors=HORIZON_SECTORS,
         boundaries=True,
     )
     sigmas, weights = lateral_kernel(skin)
     if effects.lateral is not False:  # what comes from other walls spreads as all light does
         hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
     # light that goes along the surface grows with the square of slopes
-    share = min(STEEPER**2 * float(np.quantile(hidden, 0.999)), 0.9)
+    share = min(MAX_STEEPENING**2 * float(np.quantile(hidden, 0.999)), 0.9)
     brightest = float(skin.albedo.max())
     more = bounced(share, brightest)
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
@@ -147,23 +164,23 @@ def _of_skin(
     level = min(1.0, white * brightest)
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
     return [
-        Effect(RELIEF, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
+        Effect(RELIEF_EFFECT, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
         decide(
-            SHADOWS,
+            SHADOW_EFFECT,
             noise.share(1.0) if steepest > lowest else 0.0,
             effects.relief_shadows,
             switch="shadows",
             because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
         decide(
-            LATERAL,
+            LATERAL_EFFECT,
             noise.share(lost, level),
             effects.lateral,
             switch="lateral",
             because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
         decide(
-            BOUNCES,
+            INTERREFLECTION_EFFECT,
             noise.share(more, level),
             effects.interreflections,
             switch="interreflections",

@@ -9,20 +9,20 @@ import numpy as np
 from capture.rig import Rig
 from rigsim.as_built.probe import ProbeBuild
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
-from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, unmodeled
 from rigsim.needs.flash import bands, polarization
 
-TRANSPORT: Final = "paths of photons between source and fibres"
-CROSSTALK: Final = "light that fibres pass to each other"
-WINGS: Final = "light beyond the spots, from the lens"
-COLOR: Final = "tissue traced color by color"
-LAYERS: Final = "layers of the tissue"
-DARK: Final = "dark current and hot pixels"
+TRANSPORT_EFFECT: Final = "paths of photons between source and fibres"
+CROSSTALK_EFFECT: Final = "light that fibres pass to each other"
+WINGS_EFFECT: Final = "light beyond the spots, from the lens"
+COLOR_EFFECT: Final = "tissue traced color by color"
+LAYERS_EFFECT: Final = "layers of the tissue"
+DARK_CURRENT_EFFECT: Final = "dark current and hot pixels"
 
 
 def probe_needs(
     rig: Rig, tissue: ProbedTissue, build: ProbeBuild, *, noise: Noise, hot: float
-) -> SceneNeeds:
+) -> EffectSelection:
     """Decide what a scene under the probe builds.
 
     Parameters
@@ -45,18 +45,29 @@ def probe_needs(
     made = [
         polarization(rig, view),
         bands(view),
-        Effect(TRANSPORT, "built", "photons are followed: all light in the fibres has been inside"),
-        _sized(CROSSTALK, leaked, noise, f"up to {100 * leaked:.2g} % of a neighbor's light"),
-        _sized(WINGS, build.wings, noise, f"{100 * build.wings:.2g} % of a spot's light"),
-        _sized(DARK, hot, noise, f"up to {100 * hot:.2g} % of full scale in the longest exposure"),
+        Effect(
+            TRANSPORT_EFFECT,
+            "built",
+            "photons are followed: all light in the fibres has been inside",
+        ),
+        _sized(
+            CROSSTALK_EFFECT, leaked, noise, f"up to {100 * leaked:.2g} % of a neighbor's light"
+        ),
+        _sized(WINGS_EFFECT, build.wings, noise, f"{100 * build.wings:.2g} % of a spot's light"),
+        _sized(
+            DARK_CURRENT_EFFECT,
+            hot,
+            noise,
+            f"up to {100 * hot:.2g} % of full scale in the longest exposure",
+        ),
         _color(tissue),
     ]
     if tissue.kind == "homogeneous":
-        made += absent([(LAYERS, "the tissue was asked for as homogeneous")])
+        made += absent([(LAYERS_EFFECT, "the tissue was asked for as homogeneous")])
     elif tissue.kind == "layered":
-        made.append(Effect(LAYERS, "built", "epidermis above dermis, thinned by suction"))
+        made.append(Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"))
     else:
-        made += absent([(LAYERS, "fibrous tissue has one layer")])
+        made += absent([(LAYERS_EFFECT, "fibrous tissue has one layer")])
     world = [
         ("bends and drift of the fibres' transmission", "they lie still in one head"),
         ("movement of the head on the skin", "suction holds it; its coming off is told"),
@@ -74,7 +85,7 @@ def probe_needs(
             ("pressure's effect on scattering and oxygen", "blood's outweighs them"),
             ("hair, pores and veins under the head", "layers are even within a centimeter"),
         ]
-    return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+    return EffectSelection((*made, *absent(world), *unmodeled(limits)))
 
 
 def _sized(name: str, change: float, noise: Noise, because: str) -> Effect:
@@ -85,7 +96,11 @@ def _sized(name: str, change: float, noise: Noise, because: str) -> Effect:
 
 def _color(tissue: ProbedTissue) -> Effect:
     if tissue.kind == "anisotropic":
-        return Effect(COLOR, "absent", "its direction is what is looked for; one color is traced")
+        return Effect(
+            COLOR_EFFECT, "absent", "its direction is what is looked for; one color is traced"
+        )
     if isinstance(tissue, HomogeneousTissue) and not tissue.wavelength_nm:
-        return Effect(COLOR, "negligible", "the tissue is gray: one color serves all bands", 0.0)
-    return Effect(COLOR, "built", "absorption differs from band to band")
+        return Effect(
+            COLOR_EFFECT, "negligible", "the tissue is gray: one color serves all bands", 0.0
+        )
+    return Effect(COLOR_EFFECT, "built", "absorption differs from band to band")

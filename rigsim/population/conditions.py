@@ -46,16 +46,16 @@ from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.light.surface_brdf import Coating, SkinSurface, skin_surface
 from rigsim.shading import interior_scale
-from rigsim.subject import Subject, face_regions
+from rigsim.subject import SimulatedSubject, face_regions
 from rigsim.tissue.skin_layers import ETA
 
-CONDITIONS: Final = ("normal", "cold", "hot", "sweat", "lotion", "makeup", "powder")
+CONDITION_NAMES: Final = ("normal", "cold", "hot", "sweat", "lotion", "makeup", "powder")
 """The seven conditions of dataset A."""
 
 POWDER_MATTE: Final = np.array([0.55, 0.54, 0.52], np.float32)
 """What grains scatter more than once, in the unit of R_d; with `POWDER_ALBEDO` below 1."""
 
-OIL_LIMIT: Final = 0.95
+MAX_OIL: Final = 0.95
 ROUGHNESS_RANGE: Final = (0.1, 0.6)
 
 
@@ -87,7 +87,7 @@ class _Change:
     powder: float = 0.0
 
 
-_CHANGES: Final[Mapping[str, _Change]] = {
+_CONDITION_CHANGES: Final[Mapping[str, _Change]] = {
     "normal": _Change(),
     "cold": _Change(vessels=-0.25, oil=0.5, roughness=1.06),
     "hot": _Change(vessels=0.28, oil=1.6, film=_Film(0.3, 0.12, 1.333, 1.0, 0.7, 3.0)),
@@ -117,16 +117,18 @@ def checked(conditions: Mapping[str, float]) -> dict[str, float]:
     {'lotion': 0.6, 'powder': 1.0}
     """
     for name, amount in conditions.items():
-        if name not in CONDITIONS:
+        if name not in CONDITION_NAMES:
             raise ConditionError(
-                f"condition: got {name!r}, expected one of {', '.join(CONDITIONS)}"
+                f"condition: got {name!r}, expected one of {', '.join(CONDITION_NAMES)}"
             )
         if not 0.0 <= amount <= 1.0:
             raise ConditionError(f"amount of {name}: got {amount}, expected 0 to 1")
-    return {name: float(conditions[name]) for name in CONDITIONS if name in conditions}
+    return {name: float(conditions[name]) for name in CONDITION_NAMES if name in conditions}
 
 
-def conditioned_subject(subject: Subject, conditions: Mapping[str, float]) -> Subject:
+def conditioned_subject(
+    subject: SimulatedSubject, conditions: Mapping[str, float]
+) -> SimulatedSubject:
     """Return a face whose vessels answer to conditions; its surface stays.
 
     Parameters
@@ -141,7 +143,7 @@ def conditioned_subject(subject: Subject, conditions: Mapping[str, float]) -> Su
     Subject
         The same object where nothing changes.
     """
-    change = sum(a * _CHANGES[name].vessels for name, a in checked(conditions).items())
+    change = sum(a * _CONDITION_CHANGES[name].vessels for name, a in checked(conditions).items())
     if change == 0.0:
         return subject
     regions = subject.perfusion.regions
@@ -169,7 +171,7 @@ def conditioned(
     surface
         The surface before; what lies on it already stays below, as a mean film.
     condition
-        One of `CONDITIONS`.
+        One of `CONDITION_NAMES`.
     amount
         0 to 1; 0 returns the surface itself.
     points_mm
@@ -190,7 +192,7 @@ def conditioned(
         The condition or its amount is unknown.
     """
     (amount,) = checked({condition: amount}).values()
-    change = _CHANGES[condition]
+    change = _CONDITION_CHANGES[condition]
     if amount == 0.0 or change == _Change():
         return surface
 
@@ -201,7 +203,7 @@ def conditioned(
     found = dataclasses.replace(
         surface,
         roughness=np.clip(surface.roughness * part(change.roughness), *ROUGHNESS_RANGE),
-        oil=np.clip(surface.oil * part(change.oil), 0.0, OIL_LIMIT),
+        oil=np.clip(surface.oil * part(change.oil), 0.0, MAX_OIL),
         fuzz=surface.fuzz * part(change.fuzz),
     )
     if change.cover > 0.0:
@@ -230,7 +232,7 @@ def conditioned(
 
 
 def conditioned_surface(
-    subject: Subject,
+    subject: SimulatedSubject,
     camera: str,
     light: str,
     conditions: Mapping[str, float],
@@ -254,7 +256,9 @@ def conditioned_surface(
     return coated(changed, skin_surface(changed, camera, light, state=state), conditions)
 
 
-def coated(subject: Subject, surface: SkinSurface, conditions: Mapping[str, float]) -> SkinSurface:
+def coated(
+    subject: SimulatedSubject, surface: SkinSurface, conditions: Mapping[str, float]
+) -> SkinSurface:
     """Return the surface of a face under conditions, in order, on its own points and seed."""
     wanted = {name: a for name, a in checked(conditions).items() if a > 0.0 and name != "normal"}
     if not wanted:
@@ -262,7 +266,7 @@ def coated(subject: Subject, surface: SkinSurface, conditions: Mapping[str, floa
     points = subject.perfusion.points_mm
     for name, amount in wanted.items():
         surface = conditioned(
-            surface, name, amount, points_mm=points, seed=subject.seed + CONDITIONS.index(name)
+            surface, name, amount, points_mm=points, seed=subject.seed + CONDITION_NAMES.index(name)
         )
     return surface
 
@@ -329,7 +333,7 @@ def _over(below: Coating, film: _Film, share: Float32Array) -> Coating:
 
 
 __all__ = [
-    "CONDITIONS",
+    "CONDITION_NAMES",
     "ConditionError",
     "checked",
     "coated",

@@ -38,17 +38,17 @@ from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, par
 from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
 from rigsim.population.textures import MAP_RANGES, SubjectFileError, load, texture
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
-from rigsim.subject import PRESETS, Subject, make_subject, pigment
-from rigsim.subject.perfusion import HEMOGLOBIN_LIMIT
+from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
+from rigsim.subject.perfusion import MAX_HEMOGLOBIN
 
 SCHEMA: Final = "skinrig.subject/1"
-SUFFIX: Final = ".toml"
-MELANIN_RANGE: Final = (0.005, 0.45)
+SUBJECT_SUFFIX: Final = ".toml"
+PRESET_MELANIN_RANGE: Final = (0.005, 0.45)
 """That of the presets: what tables of light in skin are made for."""
-_FILES: Final = ("mesh", *MAP_RANGES)
-_UNUSED: Final[Mapping[str, tuple[str, ...]]] = {
-    "gradient": ("blood", "freckles", "oil", *_FILES),
-    "probe": ("freckles", "oil", *_FILES),
+_FILE_KEYS: Final = ("mesh", *MAP_RANGES)
+_UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
+    "gradient": ("blood", "freckles", "oil", *_FILE_KEYS),
+    "probe": ("freckles", "oil", *_FILE_KEYS),
 }
 """Keys that say nothing of what a rig sees: a patch of plain skin, and skin by its layers."""
 
@@ -78,10 +78,10 @@ class SubjectFile:
         """Check ranges, and that nothing is said twice."""
         checks = Checks("the subject", SubjectFileError)
         checks.that("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
-        known = ", ".join(PRESETS)
-        checks.that("preset", self.preset, self.preset in PRESETS, f"one of {known}")
+        known = ", ".join(PRESET_NAMES)
+        checks.that("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
         for name, low, high in (
-            ("melanin", *MELANIN_RANGE),
+            ("melanin", *PRESET_MELANIN_RANGE),
             ("blood", 0.1, 4.0),
             ("freckles", 0.0, 1.0),
             ("oil", 0.0, 3.0),
@@ -109,7 +109,9 @@ class SubjectFile:
         presets = pigment.MELANIN_PRESETS
         return min(presets, key=lambda name: abs(math.log(presets[name] / self.fraction)))
 
-    def face(self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None) -> Subject:
+    def face(
+        self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None
+    ) -> SimulatedSubject:
         """Return the face.
 
         Parameters
@@ -151,7 +153,7 @@ class SubjectFile:
         if self.hemoglobin_map is not None:
             blood = texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
             # the fold of `Perfusion.blood`, backwards: compartments keep their shares
-            wanted = blood / (1.0 - (blood / HEMOGLOBIN_LIMIT) ** 4) ** 0.25
+            wanted = blood / (1.0 - (blood / MAX_HEMOGLOBIN) ** 4) ** 0.25
             factor = wanted / perfusion.compartments.sum(axis=-1)
             perfusion = dataclasses.replace(
                 perfusion,
@@ -172,7 +174,7 @@ class SubjectFile:
     def unused(self, rig: str) -> tuple[str, ...]:
         """Return the keys that were given and say nothing of what a rig sees."""
         usual = SubjectFile()
-        return tuple(k for k in _UNUSED.get(rig, ()) if getattr(self, k) != getattr(usual, k))
+        return tuple(k for k in _UNUSED_KEYS.get(rig, ()) if getattr(self, k) != getattr(usual, k))
 
 
 def is_file(text: str) -> bool:
@@ -183,10 +185,10 @@ def is_file(text: str) -> bool:
     >>> is_file("people/ann.toml"), is_file("IV"), is_file("P12")
     (True, False, False)
     """
-    return text.endswith(SUFFIX)
+    return text.endswith(SUBJECT_SUFFIX)
 
 
-def named(text: str) -> SubjectFile:
+def load_subject(text: str) -> SubjectFile:
     """Return the subject that a text names.
 
     Parameters
@@ -201,14 +203,15 @@ def named(text: str) -> SubjectFile:
 
     Examples
     --------
-    >>> named("IV").fraction
+    >>> load_subject("IV").fraction
     0.047
     """
     if is_file(text):
         return read(text)
-    if text not in PRESETS:
+    if text not in PRESET_NAMES:
         raise SubjectFileError(
-            f"subject: got {text!r}, expected one of {', '.join(PRESETS)}, or a file NAME{SUFFIX}"
+            f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, or a file "
+            f"NAME{SUBJECT_SUFFIX}"
         )
     return SubjectFile(preset=text)
 
@@ -224,13 +227,13 @@ def tissue(text: str, *, seed: int) -> ProbedTissue:
         Of what differs between subjects.
     """
     if is_file(text):
-        return named(text).tissue(seed=seed)
+        return load_subject(text).tissue(seed=seed)
     try:
         return parse_subject(text, seed=seed)
     except TissueError as error:
         if ":" in text:  # a medium whose numbers are wrong
             raise
-        raise TissueError(f"{error}, or a file NAME{SUFFIX}") from error
+        raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
 
 
 def read(path: str | Path) -> SubjectFile:
@@ -248,7 +251,9 @@ def read(path: str | Path) -> SubjectFile:
         faults.append(Fault("schema", "nothing", f'a first line schema = "{SCHEMA}"'))
     found = _parsed(document, str(path), faults)
     files = {
-        key: str(place.parent / name) for key in _FILES if (name := getattr(found, key)) is not None
+        key: str(place.parent / name)
+        for key in _FILE_KEYS
+        if (name := getattr(found, key)) is not None
     }
     for key, name in files.items():
         if not Path(name).is_file():
@@ -311,7 +316,7 @@ def record(text: str) -> str | dict[str, Any]:
     said: dict[str, Any] = {"file": Path(text).name, "preset": found.preset}
     for key in (field.name for field in dataclasses.fields(found)):
         value = getattr(found, key)
-        if key in _FILES and value is not None:
+        if key in _FILE_KEYS and value is not None:
             digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
             said[key] = {"file": Path(value).name, "sha256": digest}
         elif value != getattr(usual, key):
@@ -324,7 +329,7 @@ __all__ = [
     "SubjectFile",
     "SubjectFileError",
     "is_file",
-    "named",
+    "load_subject",
     "read",
     "record",
     "tissue",

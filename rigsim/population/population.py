@@ -18,7 +18,7 @@ relief, roughness depth of furrows 0.7 to 1.45 times, roughness 0.95 to 1.12 tim
 conditions        none, or lotion, makeup or both in the groups that wear them, amounts 0.6 to 1
 ================= =========================================================================
 
-Members share `HEADS` shapes of head, so that many faces are drawn quickly; everything else is
+Members share `HEAD_SHAPES` shapes of head, so that many faces are drawn quickly; everything else is
 each member's own. Their textures share one layout, and their landmarks differ with the head.
 
 References
@@ -42,21 +42,21 @@ from rigsim.geometry.mesh import Mesh
 from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.conditions import checked, conditioned_surface
-from rigsim.subject import Subject, face_regions, pigment, relief
+from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
 from rigsim.subject.head import build_head
 from rigsim.subject.perfusion import perfuse
 from rigsim.subject.person import SIZE_RANGE
 
-HEADS: Final = 6
+HEAD_SHAPES: Final = 6
 """Shapes of head that the members share."""
 
-KEPT: Final = 6
+MAX_KEPT_HEADS: Final = 6
 """Heads that are kept laid out."""
 
-HAIR_LIMIT: Final = 0.02
+MAX_SKIN_HAIR: Final = 0.02
 """Texels with more hair than this part are not skin."""
 
-MELANIN_RANGE: Final = (0.004, 0.3)
+POPULATION_MELANIN_RANGE: Final = (0.004, 0.3)
 BEARD_FROM: Final = 0.35
 """Members with at least this much stubble are labelled "beard"."""
 FRECKLED_FROM: Final = 0.45
@@ -75,7 +75,7 @@ class Member:
 
     name: str
     group: str
-    """One of `GROUPS`."""
+    """One of `POPULATION_GROUPS`."""
     sex: Sex
     ethnicity: Ethnicity
     age_years: float
@@ -92,15 +92,15 @@ class Member:
     seed: int
     """Seed of everything that is drawn on the face."""
     head: int
-    """Shape of the head, 0 to `HEADS` - 1."""
+    """Shape of the head, 0 to `HEAD_SHAPES` - 1."""
     applied: tuple[tuple[str, float], ...] = ()
-    """Conditions of `rigsim.population.conditions.CONDITIONS` with their amounts."""
+    """Conditions of `rigsim.population.conditions.CONDITION_NAMES` with their amounts."""
     marks: frozenset[str] = frozenset()
     """Names of traits that were added, see `shifted`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for field, (low, high) in _RANGES.items():
+        for field, (low, high) in _FIELD_RANGES.items():
             value = getattr(self, field)
             if not low <= value <= high:
                 raise PopulationError(
@@ -126,7 +126,7 @@ class Member:
         seen |= {"freckles"} if self.freckles >= FRECKLED_FROM else set()
         return frozenset(seen)
 
-    def face(self, size: int = 256) -> Subject:
+    def face(self, size: int = 256) -> SimulatedSubject:
         """Return the face, without conditions (see `surface`).
 
         Parameters
@@ -148,11 +148,11 @@ class Member:
             normal=relief.relief_normals(flat.atlas, height),
         )
 
-    def _flat(self, size: int) -> Subject:
+    def _flat(self, size: int) -> SimulatedSubject:
         """Return the face without relief and of even roughness: all that its color needs."""
         mesh, atlas, points, regions = _laid_out(self.head, size)
         even = np.zeros((size, size), np.float32)
-        return Subject(
+        return SimulatedSubject(
             preset=_nearest_preset(self.melanin),
             seed=self.seed,
             mesh=mesh,
@@ -198,7 +198,7 @@ class Member:
         """
         face = self._flat(size)
         surface = conditioned_surface(face, camera, light, dict(self.applied))
-        return surface.r_d, face.atlas.covered & (face.hair < HAIR_LIMIT)
+        return surface.r_d, face.atlas.covered & (face.hair < MAX_SKIN_HAIR)
 
     def _melanin(self, points: Float32Array, regions: Mapping[str, Float32Array]) -> Float32Array:
         drawn = pigment.melanin_map(
@@ -219,18 +219,18 @@ class Member:
             softness=6.0,
         )
         # Steps of log-odds against the limit, as those of the map itself.
-        odds = drawn / (pigment.MELANIN_LIMIT - drawn) * np.exp(step)
-        return np.asarray(pigment.MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
+        odds = drawn / (pigment.MAX_MELANIN - drawn) * np.exp(step)
+        return np.asarray(pigment.MAX_MELANIN * odds / (1.0 + odds), np.float32)
 
 
-_RANGES: Final[Mapping[str, tuple[float, float]]] = {
+_FIELD_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "age_years": (13.0, 90.0),
-    "melanin": MELANIN_RANGE,
+    "melanin": POPULATION_MELANIN_RANGE,
     "blood": (0.1, 4.0),
     "oil": (0.0, 3.0),
     "freckles": (0.0, 1.0),
     "beard": (0.0, 1.0),
-    "head": (0, HEADS - 1),
+    "head": (0, HEAD_SHAPES - 1),
     "seed": (0, 2**31 - 1),
 }
 
@@ -248,7 +248,7 @@ class Group:
     """Whether its members wear lotion or makeup."""
 
 
-GROUPS: Final = (
+POPULATION_GROUPS: Final = (
     Group("caucasian male", 50, "male", "caucasian", (13, 59)),
     Group("caucasian female", 5, "female", "caucasian", (24, 55)),
     Group("caucasian female, lotion or makeup", 6, "female", "caucasian", (23, 56), wears=True),
@@ -258,7 +258,7 @@ GROUPS: Final = (
 )
 """Table 1: 87 people, 70 of them male."""
 
-_WORN: Final = (("lotion",), ("makeup",), ("lotion", "makeup"))
+_WORN_PRODUCTS: Final = (("lotion",), ("makeup",), ("lotion", "makeup"))
 
 
 def table_1(*, seed: int = 0) -> tuple[Member, ...]:
@@ -272,7 +272,7 @@ def table_1(*, seed: int = 0) -> tuple[Member, ...]:
     Returns
     -------
     tuple of Member
-        87, group by group in the order of `GROUPS`.
+        87, group by group in the order of `POPULATION_GROUPS`.
 
     Examples
     --------
@@ -285,7 +285,7 @@ def table_1(*, seed: int = 0) -> tuple[Member, ...]:
     if seed < 0:
         raise PopulationError(f"seed: got {seed}, expected >= 0")
     members: list[Member] = []
-    for row, group in enumerate(GROUPS):
+    for row, group in enumerate(POPULATION_GROUPS):
         rng = np.random.default_rng([seed, 600, row])
         for index in range(group.count):
             members.append(_drawn(group, index, len(members), rng))
@@ -391,7 +391,7 @@ def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> M
     freckles = float(rng.uniform(0.0, 0.9 if pale else 0.35))
     stubble = float(rng.uniform(0.05, 1.0 if pale else 0.65))
     amounts = rng.uniform(0.6, 1.0, 2)
-    worn = _WORN[index % len(_WORN)] if group.wears else ()
+    worn = _WORN_PRODUCTS[index % len(_WORN_PRODUCTS)] if group.wears else ()
     return Member(
         name=f"P{number + 1:02d}",
         group=group.name,
@@ -404,7 +404,7 @@ def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> M
         freckles=freckles,
         beard=stubble if male and age >= 17.0 else 0.0,
         seed=int(rng.integers(0, 2**31 - 1)),
-        head=int(rng.integers(HEADS)),
+        head=int(rng.integers(HEAD_SHAPES)),
         applied=tuple((name, float(a)) for name, a in zip(worn, amounts, strict=False)),
     )
 
@@ -454,12 +454,12 @@ def _texel_mm(atlas: Atlas) -> float:
     return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
 
 
-@lru_cache(maxsize=HEADS)
+@lru_cache(maxsize=HEAD_SHAPES)
 def _head_mesh(head: int) -> Mesh:
     return build_head(np.random.default_rng([head, 600]))
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=MAX_KEPT_HEADS)
 def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
     """Return a head, its texture, the texels on the mean head and its regions.
 
@@ -475,4 +475,13 @@ def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[
     return mesh, atlas, points, face_regions.region_masks(points)
 
 
-__all__ = ["GROUPS", "HEADS", "Group", "Member", "PopulationError", "member", "shifted", "table_1"]
+__all__ = [
+    "HEAD_SHAPES",
+    "POPULATION_GROUPS",
+    "Group",
+    "Member",
+    "PopulationError",
+    "member",
+    "shifted",
+    "table_1",
+]

@@ -18,7 +18,7 @@ from rigsim.subject import pigment
 from rigsim.subject.person import SIZE_RANGE
 
 MAP_RANGES: Final[Mapping[str, tuple[float, float]]] = {
-    "melanin_map": (0.0005, pigment.MELANIN_LIMIT),
+    "melanin_map": (0.0005, pigment.MAX_MELANIN),
     "hemoglobin_map": (0.0, 0.31),
 }
 """Of blood just below the limit that vessels fill at most, where the compartments would be

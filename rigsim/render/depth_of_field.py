@@ -34,30 +34,30 @@ from rigsim.geometry.mesh import Mesh
 from rigsim.render.lens_blur import BlurError, Lens, lens_of
 
 STEP_PX: Final = 0.1
-MOST_EXACT: Final = 33
+MAX_WEIGHT_DEPTHS: Final = 33
 """Between depths at which weights are computed they are blended; those are so much blur apart, in
 pixels' diameters, or so many."""
 
-SLICES: Final = 256
+DEPTH_SLICES: Final = 256
 """Depths that are told apart."""
 
-RINGS: Final = 4.0
+DIFFRACTION_MARGIN: Final = 4.0
 """Wavelengths times f-number that the picture holds around a circle of confusion."""
 
-COLORS: Final = 3
+SPECTRUM_NODES: Final = 3
 """Wavelengths that stand for the spectrum."""
 
 GAP_MM: Final = 3.0
 GAP_PX: Final = 3.0
 """Gap in depth, the wider of the two, at which one surface stands before another."""
 
-FINE: Final = 1.2
+DEPTH_RANGE_FACTOR: Final = 1.2
 """Step of the ranges of depth for which tables are made."""
 
-BINS: Final = 64
+GAP_BINS: Final = 64
 """Depths that are told apart when a gap is looked for."""
 
-FASTEST: Final = 6.0
+MAX_FREQUENCY: Final = 6.0
 """Highest frequency in cycles per sample that weights are summed over; squares pass 0.2 % of it."""
 
 
@@ -70,9 +70,9 @@ class LensSpread:
     subpixels: int
     """Samples along each side of a pixel."""
     table: Float32Array
-    """Shape (`SLICES`, (2 radius + 1)^2, subpixels^2): by depth, by the sample's pixel seen from
-    the one that gets the light, row by row, and by its place in its pixel, row by row. Over all
-    samples the sum is 1."""
+    """Shape (`DEPTH_SLICES`, (2 radius + 1)^2, subpixels^2): by depth, by the sample's pixel seen
+    from the one that gets the light, row by row, and by its place in its pixel, row by row. Over
+    all samples the sum is 1."""
     distance_mm: float
     """From the pupil to the plane in focus, mm."""
     furthest: float
@@ -87,8 +87,8 @@ class LensSpread:
 
     def slices(self, toward_mm: ArrayLike) -> UInt8Array:
         """Return the rows of the table for points so far before the plane in focus, mm."""
-        place = np.abs(self.off_focus(toward_mm)) * ((SLICES - 1) / max(self.furthest, 1e-12))
-        return np.asarray(np.clip(np.rint(place), 0, SLICES - 1), np.uint8)
+        place = np.abs(self.off_focus(toward_mm)) * ((DEPTH_SLICES - 1) / max(self.furthest, 1e-12))
+        return np.asarray(np.clip(np.rint(place), 0, DEPTH_SLICES - 1), np.uint8)
 
     def spilled(self, toward_mm: ArrayLike) -> float:
         """Return which share of a pixel's light falls on others, at the worst of some depths.
@@ -152,7 +152,7 @@ def spread_of(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread
         )
     furthest = float(np.abs(depths / (lens.distance_mm - depths)).max())
     if furthest > 0.0:  # in steps, so that cameras and faces that are alike share a table
-        furthest = FINE ** math.ceil(math.log(furthest, FINE) - 1e-9)
+        furthest = DEPTH_RANGE_FACTOR ** math.ceil(math.log(furthest, DEPTH_RANGE_FACTOR) - 1e-9)
     return _spread(_few_colors(lens), subpixels, furthest)
 
 
@@ -160,12 +160,12 @@ def spread_of(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread
 def _spread(lens: Lens, subpixels: int, furthest: float) -> LensSpread:
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     pupil_mm = 0.5 * lens.magnification * lens.distance_mm / lens.working_f_number
-    rings = RINGS * 1e-3 * lens.cutoff_period_um
+    rings = DIFFRACTION_MARGIN * 1e-3 * lens.cutoff_period_um
     radius = max(1, math.ceil((pupil_mm * furthest + rings) / pixel_mm))
     count = math.ceil(2.0 * pupil_mm * furthest / pixel_mm / STEP_PX) + 2
-    nodes = np.linspace(0.0, furthest, min(count, MOST_EXACT) if furthest > 0.0 else 1)
+    nodes = np.linspace(0.0, furthest, min(count, MAX_WEIGHT_DEPTHS) if furthest > 0.0 else 1)
     exact = np.stack([_weights(lens, node * lens.distance_mm, radius, subpixels) for node in nodes])
-    place = np.linspace(0.0, len(nodes) - 1.0, SLICES)
+    place = np.linspace(0.0, len(nodes) - 1.0, DEPTH_SLICES)
     low = np.minimum(place.astype(np.int64), max(len(nodes) - 2, 0))
     high = np.minimum(low + 1, len(nodes) - 1)
     share = (place - low)[:, None, None]
@@ -176,14 +176,16 @@ def _spread(lens: Lens, subpixels: int, furthest: float) -> LensSpread:
 
 
 def _few_colors(lens: Lens) -> Lens:
-    """Return the lens with `COLORS` wavelengths: means of equal parts of the spectrum."""
+    """Return the lens with `SPECTRUM_NODES` wavelengths: means of equal parts of the spectrum."""
     count = len(lens.wavelengths_nm)
-    if count <= COLORS:
+    if count <= SPECTRUM_NODES:
         return lens
     weights = np.asarray(lens.weights)
-    part = np.minimum((np.cumsum(weights) - 0.5 * weights) * COLORS, COLORS - 1e-9).astype(int)
-    share = np.bincount(part, weights, COLORS)
-    mean = np.bincount(part, weights * np.asarray(lens.wavelengths_nm), COLORS) / share
+    part = np.minimum(
+        (np.cumsum(weights) - 0.5 * weights) * SPECTRUM_NODES, SPECTRUM_NODES - 1e-9
+    ).astype(int)
+    share = np.bincount(part, weights, SPECTRUM_NODES)
+    mean = np.bincount(part, weights * np.asarray(lens.wavelengths_nm), SPECTRUM_NODES) / share
     return dataclasses.replace(
         lens, wavelengths_nm=tuple(mean.tolist()), weights=tuple((share / share.sum()).tolist())
     )
@@ -196,7 +198,7 @@ def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float6
     offset = (np.arange(wide * subpixels) + 0.5) / subpixels - 0.5 * wide  # pixels
     period = 4 * wide  # pixels after which the sum over frequencies repeats
     cutoff = 1e6 * lens.magnification / (min(lens.wavelengths_nm) * lens.working_f_number)
-    most = min(cutoff * pixel_mm, FASTEST * subpixels)
+    most = min(cutoff * pixel_mm, MAX_FREQUENCY * subpixels)
     frequency = np.arange(math.ceil(most * period) + 1) / period  # cycles per pixel
     squares = np.sinc(frequency) * np.sinc(frequency / subpixels)
     squares *= np.where(frequency > 0.0, 2.0, 1.0)  # those below 0 are the same
@@ -316,7 +318,7 @@ def _layers(  # type: ignore[no-untyped-def]
     for y in prange(height):
         depth = np.empty(wide * wide * per_pixel, np.float32)
         share = np.empty(wide * wide * per_pixel, np.float32)
-        filled = np.empty(BINS, np.uint8)
+        filled = np.empty(GAP_BINS, np.uint8)
         for x in range(width):
             count, missing = 0, np.float32(0.0)
             total, inside = np.float32(0.0), np.float32(0.0)
@@ -344,11 +346,11 @@ def _layers(  # type: ignore[no-untyped-def]
             if high - low > gap:
                 # the widest run of empty bins is the gap, to the width of a bin
                 filled[:] = 0
-                per_mm = np.float32(BINS - 1) / (high - low)
+                per_mm = np.float32(GAP_BINS - 1) / (high - low)
                 for k in range(count):
                     filled[int((depth[k] - low) * per_mm)] = 1
                 run, widest, end = 0, 0, 0
-                for k in range(BINS):
+                for k in range(GAP_BINS):
                     run = 0 if filled[k] else run + 1
                     if run > widest:
                         widest, end = run, k

@@ -23,7 +23,7 @@ from capture.rig import View
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
 
-WAVELENGTHS: Final = 9
+SPECTRUM_NODES: Final = 9
 """Wavelengths that stand for the spectrum."""
 
 SLICE_MM: Final = 0.25
@@ -32,10 +32,10 @@ SLICE_MM: Final = 0.25
 FLAT_MM: Final = 0.15
 """Range of depths that one slice stands for."""
 
-FREQUENCIES: Final = 513
+OTF_NODES: Final = 513
 """Nodes of the radial OTF."""
 
-WORKERS: Final = 2
+FFT_WORKERS: Final = 2
 
 
 class BlurError(ValueError):
@@ -110,7 +110,7 @@ class Lens:
         frequency = np.abs(np.asarray(per_mm, np.float64))
         total = np.zeros(frequency.shape)
         reach = self.working_f_number / self.magnification * 1e-6  # nm to mm
-        nodes = np.linspace(0.0, 2.0, FREQUENCIES)
+        nodes = np.linspace(0.0, 2.0, OTF_NODES)
         for wavelength, weight in zip(self.wavelengths_nm, self.weights, strict=True):
             waves = 1e3 * self.aberration_um(depth_mm) / wavelength
             curve = _defocused_circle(nodes, waves)
@@ -146,14 +146,14 @@ def lens_of(view: View, illuminant: str) -> Lens:
     signal = np.maximum(signal * spectra.illuminant(illuminant), 0.0)
     share = np.cumsum(signal) / signal.sum()
     # wavelengths at the middles of equal parts of the signal
-    nodes = np.interp((np.arange(WAVELENGTHS) + 0.5) / WAVELENGTHS, share, wavelength)
+    nodes = np.interp((np.arange(SPECTRUM_NODES) + 0.5) / SPECTRUM_NODES, share, wavelength)
     return Lens(
         view.f_number * (1.0 + magnification),
         view.focus_distance_mm,
         magnification,
         view.pixel_um,
         tuple(float(node) for node in nodes),
-        (1.0 / WAVELENGTHS,) * WAVELENGTHS,
+        (1.0 / SPECTRUM_NODES,) * SPECTRUM_NODES,
     )
 
 
@@ -222,9 +222,9 @@ def blur(
         spectrum = np.zeros((coarse[0], coarse[1] // 2 + 1), np.complex64)
         for factor, (_, share) in zip(filters, slices, strict=True):
             part = images[k] if share is None else images[k] * share
-            found = scipy.fft.rfft2(np.pad(part, pad, mode="reflect"), workers=WORKERS)
+            found = scipy.fft.rfft2(np.pad(part, pad, mode="reflect"), workers=FFT_WORKERS)
             spectrum += factor * _folded(found, coarse)
-        picture = scipy.fft.irfft2(spectrum, coarse, workers=WORKERS)
+        picture = scipy.fft.irfft2(spectrum, coarse, workers=FFT_WORKERS)
         out[k] = picture[BORDER_PX : BORDER_PX + out.shape[1], BORDER_PX : BORDER_PX + out.shape[2]]
     if subpixels > 1:
         out /= np.float32(subpixels**2)

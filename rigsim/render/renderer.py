@@ -62,7 +62,7 @@ def thread_count() -> int:
     return max(1, min(cores, 16))
 
 
-SLACK: Final = 64
+SLACK_VALUES: Final = 64
 
 
 def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
@@ -78,6 +78,6 @@ def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
     >>> row.tolist(), row.base.size - row.size
     ([0.0, 1.0, 2.0, 3.0, 4.0], 64)
     """
-    held = np.zeros(values.size + SLACK, values.dtype)
+    held = np.zeros(values.size + SLACK_VALUES, values.dtype)
     held[: values.size] = values.reshape(-1)
     return held[: values.size]

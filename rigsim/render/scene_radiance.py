@@ -79,11 +79,11 @@ def radiance(
     return image
 
 
-_EMISSION = ("radiance", "irradiance", "intensity")
+_EMISSION_KEYS = ("radiance", "irradiance", "intensity")
 
 
 def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> None:
-    shines = ("bitmap",) if description.get("type") == "envmap" else _EMISSION
+    shines = ("bitmap",) if description.get("type") == "envmap" else _EMISSION_KEYS
     for name, entry in description.items():
         value = entry
         if isinstance(entry, Mapping):

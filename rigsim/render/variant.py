@@ -26,14 +26,14 @@ logger = logging.getLogger(__name__)
 
 Kind = Literal["rgb", "mono", "mono_polarized", "spectral", "spectral_polarized"]
 
-OLDEST_LLVM: Final = 17
+MIN_LLVM_VERSION: Final = 17
 """Oldest major version of LLVM that has the intrinsics Dr.Jit's kernels need."""
 
 PROBE_TIMEOUT_S: Final = 120.0
 """A probe that takes longer counts as failed; it takes one second on an idle machine."""
 
 # The scalar variants that are built into Mitsuba's wheels; a mono kind has no scalar twin.
-_SCALAR: Final[Mapping[Kind, str]] = {
+_SCALAR_VARIANTS: Final[Mapping[Kind, str]] = {
     "rgb": "scalar_rgb",
     "mono": "scalar_rgb",
     "mono_polarized": "scalar_spectral_polarized",
@@ -41,7 +41,7 @@ _SCALAR: Final[Mapping[Kind, str]] = {
     "spectral_polarized": "scalar_spectral_polarized",
 }
 
-_FOLDERS: Final = (
+_LLVM_FOLDERS: Final = (
     "/usr/lib/*-linux-gnu*",
     "/usr/lib/llvm-*/lib",
     "/usr/lib64",
@@ -55,7 +55,7 @@ _FOLDERS: Final = (
 
 _NOT_RUN: Final = "the probe did not run to its end"
 
-_PROBE: Final = """
+_PROBE_SCRIPT: Final = """
 import drjit as dr, drjit.llvm
 if not dr.has_backend(dr.JitBackend.LLVM):
     raise SystemExit("no LLVM backend")
@@ -123,7 +123,7 @@ def find_libraries(environment: Mapping[str, str] | None = None) -> tuple[Path, 
         found[Path(named).resolve()] = None
     candidates = {
         Path(name).resolve()
-        for folder in _FOLDERS
+        for folder in _LLVM_FOLDERS
         for pattern in ("libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM*.dylib")
         for name in glob(f"{folder}/{pattern}")
     }
@@ -163,8 +163,8 @@ def judge_library(path: Path, *, cache: Path | None = None) -> LibraryVerdict:
     """
     path = path.resolve()
     version = major_version(path)
-    if 0 < version < OLDEST_LLVM:
-        return LibraryVerdict(str(path), False, f"LLVM {version} is older than {OLDEST_LLVM}")
+    if 0 < version < MIN_LLVM_VERSION:
+        return LibraryVerdict(str(path), False, f"LLVM {version} is older than {MIN_LLVM_VERSION}")
     if not path.is_file():
         return LibraryVerdict(str(path), False, "there is no such file")
     folder = user_cache() if cache is None else cache
@@ -198,7 +198,7 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryV
     environment = dict(os.environ, DRJIT_LIBLLVM_PATH=str(path))
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _PROBE % OLDEST_LLVM],
+            [sys.executable, "-c", _PROBE_SCRIPT % MIN_LLVM_VERSION],
             env=environment,
             capture_output=True,
             text=True,
@@ -251,12 +251,12 @@ def choose_variant(
     >>> choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"}).name
     'scalar_rgb'
     """
-    if kind not in _SCALAR:
-        raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(_SCALAR)}")
+    if kind not in _SCALAR_VARIANTS:
+        raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(_SCALAR_VARIANTS)}")
     environment = os.environ if environment is None else environment
     asked = environment.get("SKINRIG_MITSUBA", "")
     if asked == "scalar":
-        return VariantChoice(_SCALAR[kind], "SKINRIG_MITSUBA=scalar asks for it", "")
+        return VariantChoice(_SCALAR_VARIANTS[kind], "SKINRIG_MITSUBA=scalar asks for it", "")
     if asked not in ("", "llvm"):
         raise ValueError(f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing")
     refused = []
@@ -267,7 +267,7 @@ def choose_variant(
         refused.append(f"{verdict.path}: {verdict.why}")
         logger.debug("LLVM library refused: %s: %s", verdict.path, verdict.why)
     why = "; ".join(refused) if refused else "no LLVM library was found"
-    return VariantChoice(_SCALAR[kind], f"no LLVM {OLDEST_LLVM} or newer ({why})", "")
+    return VariantChoice(_SCALAR_VARIANTS[kind], f"no LLVM {MIN_LLVM_VERSION} or newer ({why})", "")
 
 
 def user_cache() -> Path:

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from rigsim.arrays import Float64Array, Int32Array, Int64Array
 
-TRUNCATION: Final = 3.0
+TRUNCATION_VOXELS: Final = 3.0
 """Voxels that lie deeper under the surface than this many sides know nothing of it."""
 
 
@@ -100,7 +100,7 @@ def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[Float64Array, I
     low = seen.min(axis=0) - 2.0 * voxel_mm
     size = np.ceil((np.ptp(seen, axis=0)) / voxel_mm).astype(int) + 5
     distance = np.full(size, np.nan)
-    deep = TRUNCATION * voxel_mm
+    deep = TRUNCATION_VOXELS * voxel_mm
     y, z = np.meshgrid(np.arange(size[1]), np.arange(size[2]), indexing="ij")
     for i in range(size[0]):  # a slab at a time
         points = low + voxel_mm * np.stack([np.full_like(y, i), y, z], axis=-1).reshape(-1, 3)

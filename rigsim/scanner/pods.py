@@ -31,7 +31,7 @@ TARGET_MM: Final = (0.0, 0.0, -40.0)
 """Point that all devices face."""
 MIN_COSINE: Final = 0.25
 """Stripes that arrive or are seen at a flatter angle are not decoded: 76 degrees."""
-JUMP_MM: Final = 4.0
+MAX_RANGE_JUMP_MM: Final = 4.0
 """Neighbouring pixels whose ranges differ by more are at an edge and are dropped."""
 WRAP_NOISE_SHARE: Final = 0.4
 """Part of a range's noise that a wrapped template keeps."""
@@ -260,7 +260,7 @@ def _smooth_around(ranges: Float64Array, good: BoolArray) -> BoolArray:
     far = ndimage.maximum_filter(np.where(good, ranges, -np.inf), 3)
     near = ndimage.minimum_filter(np.where(good, ranges, np.inf), 3)
     with np.errstate(invalid="ignore"):
-        return np.asarray(far - near < JUMP_MM)
+        return np.asarray(far - near < MAX_RANGE_JUMP_MM)
 
 
 def _with_collar(mesh: Mesh) -> Mesh:

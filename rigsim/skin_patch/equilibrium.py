@@ -34,7 +34,7 @@ from scipy import fft
 from scipy.optimize import brentq
 
 from rigsim.arrays import ComplexArray, Float32Array, Float64Array
-from rigsim.skin_patch.stretch_kernels import bending, gather, membrane, spread, tissue
+from rigsim.skin_patch.stretch_kernels import bending, gather, membrane, rotate_coefficients, tissue
 
 Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
@@ -206,7 +206,7 @@ class LayerProblem:
     def _spread(self, q: ComplexArray) -> ComplexArray:
         out = np.empty_like(q)
         with self._threads():
-            spread(q, self._scale, self._unit, out)
+            rotate_coefficients(q, self._scale, self._unit, out)
         return out
 
     @contextmanager

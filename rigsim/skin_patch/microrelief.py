@@ -26,15 +26,15 @@ from scipy.ndimage import map_coordinates
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.polygon_net import polygon_net
 from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
-from rigsim.subject.pigment import MELANIN_LIMIT, MELANIN_PRESETS
+from rigsim.subject.pigment import MAX_MELANIN, MELANIN_PRESETS
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_layers import MAX_C_HD
 from rigsim.tissue.skin_table import SkinTable
 
 SiteName = Literal["forehead", "cheek", "chin"]
-BLOOD: Final = 0.035
+PATCH_BLOOD_FRACTION: Final = 0.035
 """Volume fraction of blood that decides how far light spreads in the patch."""
-SITES: Final = get_args(SiteName)
+SITE_NAMES: Final = get_args(SiteName)
 """Names of the sites."""
 
 TEXEL_RANGE_UM: Final = (2.0, 40.0)
@@ -70,7 +70,7 @@ class _Site:
     alpha: float
 
 
-_SITES: Final[dict[str, _Site]] = {
+_SITE_PARAMETERS: Final[dict[str, _Site]] = {
     # Long furrows across the brow: elongated polygons, along x.
     "forehead": _Site(
         0.42,
@@ -139,7 +139,7 @@ class MicroSkin:
     """A patch in its neutral state; maps are (N, N), row 0 is +y, N even, centre at the origin."""
 
     site: str
-    """One of `SITES`."""
+    """One of `SITE_NAMES`."""
     seed: int
     preset: str
     """Melanin, one of `rigsim.subject.pigment.MELANIN_PRESETS`."""
@@ -233,8 +233,8 @@ def make_micro_skin(
     >>> skin.height_um.shape, bool(skin.height_um.min() < 0.0)
     ((50, 50), True)
     """
-    if site not in _SITES:
-        raise MicroSkinError(f"site: got {site!r}, expected one of {', '.join(SITES)}")
+    if site not in _SITE_PARAMETERS:
+        raise MicroSkinError(f"site: got {site!r}, expected one of {', '.join(SITE_NAMES)}")
     if preset not in MELANIN_PRESETS:
         raise MicroSkinError(
             f"preset: got {preset!r}, expected one of {', '.join(MELANIN_PRESETS)}"
@@ -251,11 +251,11 @@ def make_micro_skin(
     count = max(8, 2 * math.ceil(size_mm * 500.0 / texel_um - 1e-9))
     if count > MAX_TEXELS:
         raise MicroSkinError(f"size_mm: got {count} texels a side, expected <= {MAX_TEXELS}")
-    where = _SITES[site]
+    where = _SITE_PARAMETERS[site]
     places = (np.arange(count) - 0.5 * (count - 1)) * texel_um * 1e-3
     points = np.zeros((count, count, 3), np.float32)
     points[..., 0], points[..., 1] = places[None, :], places[::-1, None]
-    own = len(SITES) * seed + SITES.index(site)
+    own = len(SITE_NAMES) * seed + SITE_NAMES.index(site)
     height, furrow = _relief(where, points, texel_um * 1e-3, own)
     return MicroSkin(
         site=site,
@@ -368,7 +368,7 @@ def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: in
     c_hd = 0.035 * np.exp(0.10 * slow + 0.8 * vessels * patchy)
     table = SkinTable.load()
     band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
-    nodes_m = np.geomspace(melanin / 12.0, min(12.0 * melanin, MELANIN_LIMIT), 48)
+    nodes_m = np.geomspace(melanin / 12.0, min(12.0 * melanin, MAX_MELANIN), 48)
     nodes_h = np.geomspace(0.01, 0.15, 24)
     tabulated = table.spectra(nodes_m[:, None], nodes_h[None, :])[..., band].mean(axis=-1)
     at_m = np.log(np.clip(c_m, nodes_m[0], nodes_m[-1]) / nodes_m[0])
@@ -389,6 +389,6 @@ def lateral_kernel(skin: MicroSkin) -> tuple[Float64Array, Float64Array]:
     table = SkinTable.load()
     band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
     weights = (band / band.sum())[:, None]
-    kernels = table.lateral_kernels(skin.melanin_fraction, BLOOD, weights)
+    kernels = table.lateral_kernels(skin.melanin_fraction, PATCH_BLOOD_FRACTION, weights)
     gaussians = kernels.gaussians(SIGMAS_MM)
     return gaussians.sigmas_mm, gaussians.weights[0]

@@ -23,7 +23,7 @@ from rigsim.skin_patch.stretch_kernels import spline
 Compensation = Literal["volume", "none"] | float
 
 STRETCH_RANGE: Final = (0.5, 2.0)
-TOLERANCE: Final = 5e-3
+FORCE_TOLERANCE: Final = 5e-3
 """Out-of-balance force, relative to that of a relief without a layer, that is accepted."""
 BLEND_UM: Final = 320.0
 """Beyond its border the patch goes on as its mirror image, over so much at least; um."""
@@ -232,7 +232,7 @@ def deform(
     stretch: float,
     angle_deg: float,
     compensation: Compensation = "volume",
-    tolerance: float = TOLERANCE,
+    tolerance: float = FORCE_TOLERANCE,
 ) -> StretchedSkin:
     """Stretch a patch along an axis and let it settle.
 
@@ -309,7 +309,10 @@ def deform(
     # Rows of the equilibrium grow with y.
     height = height.reshape(count, count)[::-1] + problem.rise * mean
     last = count - 1.0
-    inner = np.clip(last - (row - _MARGIN), 0.0, last), np.clip(column - _MARGIN, 0.0, last)
+    inner = (
+        np.clip(last - (row - _SPLINE_MARGIN), 0.0, last),
+        np.clip(column - _SPLINE_MARGIN, 0.0, last),
+    )
     tint = np.empty(row.size)
     spline(_coefficients(skin.albedo), *inner, False, tint, tint, tint)
     albedo = tint.reshape(count, count)[::-1]
@@ -332,7 +335,7 @@ def deform(
     )
 
 
-_MARGIN: Final = 16
+_SPLINE_MARGIN: Final = 16
 """Texels of the periodic neighbourhood that splines see around a patch."""
 
 
@@ -392,7 +395,7 @@ def _coefficients(values: FloatArray) -> Float64Array:
 
 def _filtered(values: Float64Array) -> Float64Array:
     """Return spline coefficients of a periodic field with a margin all around."""
-    return np.asarray(spline_filter(np.pad(values, _MARGIN, mode="wrap"), mode="mirror"))
+    return np.asarray(spline_filter(np.pad(values, _SPLINE_MARGIN, mode="wrap"), mode="mirror"))
 
 
 def _pull_back(
@@ -410,7 +413,7 @@ def _pull_back(
         raise StretchError("stretch: the surface would fold over its own furrows")
     along, up = _filtered(moved[0]), _filtered(moved[1])
     goal_row, goal_column = (
-        m.reshape(-1).astype(np.float64) + _MARGIN for m in np.mgrid[0:count, 0:count]
+        m.reshape(-1).astype(np.float64) + _SPLINE_MARGIN for m in np.mgrid[0:count, 0:count]
     )
     row, column = goal_row.copy(), goal_column.copy()
     a, ar, ac, b, br, bc = (np.empty(row.size) for _ in range(6))

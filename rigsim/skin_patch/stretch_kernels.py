@@ -191,7 +191,7 @@ def bending(height, neutral, stiffness, texel, moment, force):  # type: ignore[n
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def spread(q, scale, unit, out):  # type: ignore[no-untyped-def]
+def rotate_coefficients(q, scale, unit, out):  # type: ignore[no-untyped-def]
     """Turn scaled coefficients along and across each wave, and upright, into those of x, y, z.
 
     Parameters
@@ -257,7 +257,10 @@ def tissue(hat, elastic, unit, weight, pulled):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True, fastmath=True)
 def gather(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
-    """Turn forces on x, y, z into the derivative by scaled coefficients (adjoint of `spread`)."""
+    """Turn forces on x, y, z into the derivative by scaled coefficients.
+
+    This is the adjoint of `rotate_coefficients`.
+    """
     for i in prange(hat.shape[1]):
         for j in range(hat.shape[2]):
             ux, uy, w = unit[0, i, j], unit[1, i, j], weight[i, j]

@@ -1,6 +1,6 @@
 """Simulated subjects: head, pigment, blood, expressions and motion."""
 
-from rigsim.subject.perfusion import STATES
-from rigsim.subject.person import PRESETS, Subject, SubjectError, make_subject
+from rigsim.subject.perfusion import STATE_NAMES
+from rigsim.subject.person import PRESET_NAMES, SimulatedSubject, SubjectError, make_subject
 
-__all__ = ["PRESETS", "STATES", "Subject", "SubjectError", "make_subject"]
+__all__ = ["PRESET_NAMES", "STATE_NAMES", "SimulatedSubject", "SubjectError", "make_subject"]

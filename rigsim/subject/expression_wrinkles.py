@@ -21,21 +21,21 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.subject.face_regions import soft_step
-from rigsim.subject.wrinkle_zones import ZONES, Zone
+from rigsim.subject.wrinkle_zones import WRINKLE_ZONES, Zone
 
 TENSION_RANGE: Final = (0.05, 0.10)
 """Part of its length by which a person's skin at rest is stretched."""
 
-FURROW: Final = 1.2
+GROOVE_NARROWING: Final = 1.2
 """How much narrower furrows are than ridges; 0 is a cosine."""
 
-FINEST_TEXELS: Final = 3.0
+MIN_WAVE_TEXELS: Final = 3.0
 """Texels that a wave needs; finer wrinkles are left out."""
 
 SEAM_STEPS: Final = 6.0
 """Texels that lie farther from each other than so many usual ones have a seam between them."""
 
-_STEPS: Final = 2048
+_PHASE_STEPS: Final = 2048
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
     Returns
     -------
     WrinkleLines
-        The lines of `ZONES`.
+        The lines of `WRINKLE_ZONES`.
     """
     rng = np.random.default_rng([seed, 22])
     tension = float(rng.uniform(*TENSION_RANGE))
@@ -103,7 +103,7 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
     folded = np.column_stack([np.abs(middle[:, 0]), middle[:, 1:]])
     step_mm = np.median(np.linalg.norm(flat[texel + 1] - flat[texel], axis=-1))
     drawn = []
-    for zone in ZONES:
+    for zone in WRINKLE_ZONES:
         wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
         offset = rng.uniform(0.0, 2.0 * math.pi, 2)
         lifts = rng.uniform(0.8, 1.0, 2)
@@ -181,7 +181,7 @@ def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
         slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
         excess = one.share * np.maximum(slack, 0.0)
         wave_mm = 2.0 * math.pi / np.maximum(after, 1e-9)
-        fine = soft_step((wave_mm / texel_mm[one.texel] - FINEST_TEXELS) / 0.5)
+        fine = soft_step((wave_mm / texel_mm[one.texel] - MIN_WAVE_TEXELS) / 0.5)
         if (excess > 0.0).any() and float(np.median(fine)) < 0.5:
             left_out.append(one.zone.name)
         excess *= fine
@@ -212,26 +212,35 @@ def depth_of(excess: ArrayLike) -> Float64Array:
     >>> bool(depth_of(0.0) == 0.0)
     True
     """
-    return np.interp(np.asarray(excess, np.float64), _EXCESS, _DEPTH)
+    return np.interp(np.asarray(excess, np.float64), _WAVE_EXCESS, _WAVE_DEPTH)
 
 
 def _profile(phase: Float64Array) -> Float64Array:
     """Return the height of a wave of depth 1, with zero mean and its furrow at phase 0."""
-    low, high = math.exp(-2.0 * FURROW), 1.0
-    return np.asarray((_BELL_MEAN - np.exp(FURROW * (np.cos(phase) - 1.0))) / (high - low))
+    low, high = math.exp(-2.0 * GROOVE_NARROWING), 1.0
+    return np.asarray(
+        (_BELL_MEAN - np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))) / (high - low)
+    )
 
 
 def _waves() -> tuple[float, Float64Array, Float64Array]:
     """Return the mean of the furrow's bell, and excess of length against depth."""
-    phase = 2.0 * math.pi * (np.arange(_STEPS) + 0.5) / _STEPS
-    bell = np.exp(FURROW * (np.cos(phase) - 1.0))
-    slope = 2.0 * math.pi * FURROW * np.sin(phase) * bell / (1.0 - math.exp(-2.0 * FURROW))
+    phase = 2.0 * math.pi * (np.arange(_PHASE_STEPS) + 0.5) / _PHASE_STEPS
+    bell = np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))
+    slope = (
+        2.0
+        * math.pi
+        * GROOVE_NARROWING
+        * np.sin(phase)
+        * bell
+        / (1.0 - math.exp(-2.0 * GROOVE_NARROWING))
+    )
     depth = np.concatenate([[0.0], np.geomspace(1e-4, 3.0, 400)])
     length = np.sqrt(1.0 + (depth[:, None] * slope) ** 2).mean(axis=1)
     return float(bell.mean()), length - 1.0, depth
 
 
-_BELL_MEAN, _EXCESS, _DEPTH = _waves()
+_BELL_MEAN, _WAVE_EXCESS, _WAVE_DEPTH = _waves()
 
 
 def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> Float64Array:

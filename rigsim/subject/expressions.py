@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
 from rigsim.subject.face_regions import mean_head_scale, on_mean_head
-from rigsim.subject.perfusion import STATES
+from rigsim.subject.perfusion import STATE_NAMES
 
 Vector = tuple[float, float, float]
 
@@ -50,7 +50,7 @@ class _Pull:
     """Whether the same happens mirrored on the image's left."""
 
 
-_ACTIONS: Final[Mapping[str, tuple[_Pull, ...]]] = {
+_ACTION_PULLS: Final[Mapping[str, tuple[_Pull, ...]]] = {
     "inner brow raiser": (_Pull((14.0, 40.0, 3.0), (17.0, 21.0, 42.0), (0.4, 5.8, -0.8)),),
     "outer brow raiser": (_Pull((40.0, 41.0, -12.0), (20.0, 21.0, 42.0), (0.8, 5.8, -1.6)),),
     "brow lowerer": (_Pull((14.0, 42.0, 4.0), (14.0, 16.0, 40.0), (-3.4, -4.2, 0.8)),),
@@ -76,15 +76,15 @@ _ACTIONS: Final[Mapping[str, tuple[_Pull, ...]]] = {
     ),
 }
 
-_JAW: Final = "jaw drop"
+_JAW_ACTION: Final = "jaw drop"
 _JAW_TURN_RAD: Final = 0.075
 """Turn of the lower jaw about its joints at strength 1: 7 mm at the chin."""
 _JAW_JOINT_MM: Final = (0.0, 10.0, -90.0)
 
-ACTIONS: Final = (*_ACTIONS, _JAW)
+ACTION_NAMES: Final = (*_ACTION_PULLS, _JAW_ACTION)
 """Names of the actions."""
 
-EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
+EXPRESSION_STRENGTHS: Final[Mapping[str, Mapping[str, float]]] = {
     "anger": {"brow lowerer": 1.0, "lip tightener": 1.0, "nose wrinkler": 0.2, "chin raiser": 0.3},
     "disgust": {
         "nose wrinkler": 1.0,
@@ -98,7 +98,7 @@ EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
         "outer brow raiser": 0.4,
         "brow lowerer": 0.5,
         "lip stretcher": 0.9,
-        _JAW: 0.35,
+        _JAW_ACTION: 0.35,
     },
     "happiness": {"cheek raiser": 1.0, "lip corner puller": 0.85},
     "sadness": {
@@ -107,7 +107,7 @@ EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
         "lip corner depressor": 0.9,
         "chin raiser": 0.6,
     },
-    "surprise": {"inner brow raiser": 1.0, "outer brow raiser": 1.0, _JAW: 1.0},
+    "surprise": {"inner brow raiser": 1.0, "outer brow raiser": 1.0, _JAW_ACTION: 1.0},
     "smile": {"lip corner puller": 1.0, "cheek raiser": 0.5},
 }
 """Strength of each action in each expression; states that are none do not move the face."""
@@ -125,12 +125,12 @@ _OWN_SHAPES: Final[Mapping[str, Mapping[str, float]]] = {
     "chin raiser": {"mouthShrugLower": 0.5},
     "lip stretcher": {"mouthStretch": 0.55},
     "lip tightener": {"mouthPucker": 0.15},
-    _JAW: {"jawOpen": 0.2},
+    _JAW_ACTION: {"jawOpen": 0.2},
 }
 
 STRENGTH_RANGE: Final = (0.86, 1.12)
 """Range of a person's own strength in each action."""
-ASYMMETRY: Final = 0.06
+MAX_ASYMMETRY: Final = 0.06
 """Largest relative difference of each side from a person's own strength."""
 
 
@@ -147,9 +147,9 @@ def moves(state: str) -> bool:
     >>> moves("smile"), moves("alcohol"), moves("neutral")
     (True, False, False)
     """
-    if state not in STATES:
-        raise ExpressionError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
-    return state in EXPRESSIONS
+    if state not in STATE_NAMES:
+        raise ExpressionError(f"state: got {state!r}, expected one of {', '.join(STATE_NAMES)}")
+    return state in EXPRESSION_STRENGTHS
 
 
 def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 0) -> Float32Array:
@@ -161,7 +161,7 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
         The face at rest, mm, rig frame; its own blend shapes are taken for the actions that they
         name, see `Mesh.shapes`.
     state
-        One of `rigsim.subject.perfusion.STATES`.
+        One of `rigsim.subject.perfusion.STATE_NAMES`.
     amount
         0 (rest) to 1.5 (an extreme).
     seed
@@ -185,7 +185,7 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
     points = on_mean_head(mesh.vertices_mm, mesh).astype(np.float64)
     scale = mean_head_scale(mesh)
     sides = _sides(seed)
-    for action, strength in EXPRESSIONS[state].items():
+    for action, strength in EXPRESSION_STRENGTHS[state].items():
         left, right = (amount * strength * side for side in sides[action])
         own = _own_shapes(mesh.shapes, action, left, right)
         if own is not None:
@@ -197,7 +197,7 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
 
 def blend_shapes(mesh: Mesh, *, seed: int = 0) -> dict[str, Float32Array]:
     """Return the movement of every state that moves the face, {state: (V, 3) in mm}."""
-    return {state: displacement_mm(mesh, state, seed=seed) for state in EXPRESSIONS}
+    return {state: displacement_mm(mesh, state, seed=seed) for state in EXPRESSION_STRENGTHS}
 
 
 def moved(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
@@ -266,11 +266,11 @@ def _edges(points: Float64Array, faces: Int32Array) -> Float64Array:
 def _sides(seed: int) -> dict[str, tuple[float, float]]:
     """Return a person's strength in each action, on the image's left and right."""
     rng = np.random.default_rng([seed, 21])
-    own = rng.uniform(*STRENGTH_RANGE, len(ACTIONS))
-    tilt = rng.uniform(-ASYMMETRY, ASYMMETRY, len(ACTIONS))
+    own = rng.uniform(*STRENGTH_RANGE, len(ACTION_NAMES))
+    tilt = rng.uniform(-MAX_ASYMMETRY, MAX_ASYMMETRY, len(ACTION_NAMES))
     return {
         name: (float(s * (1.0 - t)), float(s * (1.0 + t)))
-        for name, s, t in zip(ACTIONS, own, tilt, strict=True)
+        for name, s, t in zip(ACTION_NAMES, own, tilt, strict=True)
     }
 
 
@@ -296,10 +296,10 @@ def _own_shapes(
 
 def _field(points: Float64Array, action: str, left: float, right: float) -> Float64Array:
     """Return an action's movement at points of the mean head, mm, shape (..., 3)."""
-    if action == _JAW:
+    if action == _JAW_ACTION:
         return 0.5 * (left + right) * _jaw(points)
     total = np.zeros_like(points)
-    for pull in _ACTIONS[action]:
+    for pull in _ACTION_PULLS[action]:
         if not pull.pair:
             total += 0.5 * (left + right) * _bump(points, pull.center, pull.reach, pull.way)
             continue

@@ -29,7 +29,7 @@ REGION_NAMES: Final = (
 """Regions that `region_masks` draws."""
 
 # Landmarks and radii along x, y, z in mm of each region's soft balls.
-_BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] = {
+_REGION_BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] = {
     "forehead": (("forehead", (42.0, 22.0, 40.0)),),
     "cheeks": (("cheek left", (18.0, 17.0, 25.0)), ("cheek right", (18.0, 17.0, 25.0))),
     "nose": (
@@ -51,7 +51,7 @@ _BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] 
     "nose sides": (("fold left", (6.0, 13.0, 12.0)), ("fold right", (6.0, 13.0, 12.0))),
 }
 
-_CENTERS: Final = dict(LANDMARKS_MM) | {
+_BALL_CENTERS_MM: Final = dict(LANDMARKS_MM) | {
     "crow left": (-52.0, 24.0, -22.0),
     "crow right": (52.0, 24.0, -22.0),
     "fold left": (-22.0, -20.0, 2.0),
@@ -130,7 +130,7 @@ def region_masks(points_mm: Float32Array) -> dict[str, Float32Array]:
     dict
         `REGION_NAMES` to masks in [0, 1], shape (...); soft, and they may overlap.
     """
-    masks = {name: _balls(points_mm, balls) for name, balls in _BALLS.items()}
+    masks = {name: _balls(points_mm, balls) for name, balls in _REGION_BALLS.items()}
     masks["lips"] = _lips(points_mm)
     return masks
 
@@ -144,7 +144,7 @@ def _balls(
         # sums over an axis of three elements are the slow way to the same numbers
         x, y, z = (
             (axis - np.float32(middle)) / np.float32(radius)
-            for axis, middle, radius in zip(axes, _CENTERS[name], radii, strict=True)
+            for axis, middle, radius in zip(axes, _BALL_CENTERS_MM[name], radii, strict=True)
         )
         total = np.maximum(total, np.exp(-(x * x + y * y + z * z)))
     return total

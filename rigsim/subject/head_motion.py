@@ -23,8 +23,8 @@ DRIFT_MM: Final = (0.3, 3.0)
 DRIFT_DEG: Final = (0.1, 1.0)
 """Ranges from which the greatest shift and turn are drawn."""
 
-WAVES: Final = 5
-BAND_HZ: Final = (0.02, 0.4)
+SWAY_WAVES: Final = 5
+SWAY_BAND_HZ: Final = (0.02, 0.4)
 """Waves of sway that make up the drift, and their frequencies; heads in rests sway below 0.5 Hz."""
 
 PIVOT_MM: Final = (0.0, 0.0, -70.0)
@@ -156,10 +156,10 @@ def head_motion(
             if not 0.0 <= value <= 10.0:
                 raise MotionError(f"{name}: got {value}, expected 0 to 10")
             sizes[k] = value
-    low, high = np.log(BAND_HZ)
-    frequency = np.exp(rng.uniform(low, high, (WAVES, 6)))
-    amplitude = rng.standard_normal((WAVES, 6)) / np.sqrt(frequency)
-    phase = rng.uniform(0.0, 2.0 * math.pi, (WAVES, 6))
+    low, high = np.log(SWAY_BAND_HZ)
+    frequency = np.exp(rng.uniform(low, high, (SWAY_WAVES, 6)))
+    amplitude = rng.standard_normal((SWAY_WAVES, 6)) / np.sqrt(frequency)
+    phase = rng.uniform(0.0, 2.0 * math.pi, (SWAY_WAVES, 6))
     t = np.linspace(0.0, SPAN_S, 501)[:, None, None]
     track = np.sum(
         amplitude * (np.sin(2.0 * math.pi * frequency * t + phase) - np.sin(phase)), axis=1

@@ -15,7 +15,7 @@ from rigsim.render import Caster
 from rigsim.subject.face_regions import from_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 
-_PAIRS: Final[Mapping[str, tuple[float, float]]] = {
+_PAIRED_POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
     "brow inner": (15.0, 41.0),
     "brow outer": (47.0, 41.0),
     "eye inner": (16.5, 22.0),
@@ -29,19 +29,19 @@ _PAIRS: Final[Mapping[str, tuple[float, float]]] = {
     "chin side": (18.0, -62.0),
     "forehead side": (28.0, 62.0),
 }
-_SINGLE: Final[Mapping[str, tuple[float, float]]] = {
+_MIDLINE_POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead low": (0.0, 52.0),
     "glabella": (0.0, 38.0),
     "nose base": (0.0, -22.0),
     "mouth": (0.0, -42.5),
 }
-_ASIDE: Final = ("neck",)
+_UNPAIRED_POINTS: Final = ("neck",)
 
 POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
-    **{name: (p[0], p[1]) for name, p in LANDMARKS_MM.items() if name not in _ASIDE},
-    **{f"{name} right": p for name, p in _PAIRS.items()},
-    **{f"{name} left": (-p[0], p[1]) for name, p in _PAIRS.items()},
-    **_SINGLE,
+    **{name: (p[0], p[1]) for name, p in LANDMARKS_MM.items() if name not in _UNPAIRED_POINTS},
+    **{f"{name} right": p for name, p in _PAIRED_POINTS_MM.items()},
+    **{f"{name} left": (-p[0], p[1]) for name, p in _PAIRED_POINTS_MM.items()},
+    **_MIDLINE_POINTS_MM,
 }
 """Where the points lie on the mean head seen from the front, (x, y) in mm; left and right as seen
 in the image. On the skin they are where a look along -z meets it."""

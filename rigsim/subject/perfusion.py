@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import line_network, smooth_noise
 
-HEMOGLOBIN_LIMIT: Final = 0.32
+MAX_HEMOGLOBIN: Final = 0.32
 """Largest volume fraction of blood, Jimenez et al. 2010, table 1."""
 
-BASE: Final = 0.018
+BASE_BLOOD_FRACTION: Final = 0.018
 """Blood volume fraction of facial skin between the regions; dermal values of 0.2 to 7 % are
 usual, Jacques 1998, "Skin optics summary", Oregon Medical Laser Center."""
 
@@ -37,10 +37,10 @@ _REGION_GAIN: Final[Mapping[str, float]] = {
     "neck": -0.15,
 }
 
-_SHARES: Final = (0.56, 0.28, 0.16)
+_COMPARTMENT_FRACTIONS: Final = (0.56, 0.28, 0.16)
 """Parts of the blood in bed, loops and plexus."""
 
-_ANSWERS: Final = (0.45, 1.0, 0.8)
+_COMPARTMENT_RESPONSES: Final = (0.45, 1.0, 0.8)
 """How far each compartment's vessels follow a change of radius: loops are muscular and answer
 most, the bed is mostly filled by what reaches it."""
 
@@ -48,7 +48,7 @@ most, the bed is mostly filled by what reaches it."""
 # Jimenez et al. 2010, figures 2 to 5 and section 5: anger flushes and fear pales the whole face
 # (127 % and 81 %), a smile fills the cheeks and empties stretched skin, exercise and alcohol
 # redden different regions.
-_STATES: Final[Mapping[str, Mapping[str, float]]] = {
+_STATE_CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
     "neutral": {},
     "anger": {"all": 0.13, "forehead": 0.10, "cheeks": 0.06, "brows": 0.08, "lips": -0.04},
     "disgust": {"nose sides": 0.14, "nose": 0.08, "lips": -0.08, "lids": 0.05, "cheeks": 0.03},
@@ -61,7 +61,7 @@ _STATES: Final[Mapping[str, Mapping[str, float]]] = {
     "alcohol": {"all": 0.08, "nose": 0.22, "cheeks": 0.13, "lids": 0.05, "neck": 0.09},
 }
 
-STATES: Final = tuple(_STATES)
+STATE_NAMES: Final = tuple(_STATE_CHANGES)
 """Names of the states."""
 
 
@@ -93,15 +93,15 @@ class Perfusion:
         StateError
             The state is unknown.
         """
-        if state not in _STATES:
-            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
+        if state not in _STATE_CHANGES:
+            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATE_NAMES)}")
         change = np.zeros(self.points_mm.shape[:-1], np.float32)
         if state == "neutral":
             return change
-        for name, gain in _STATES[state].items():
+        for name, gain in _STATE_CHANGES[state].items():
             change += np.float32(gain) * (1.0 if name == "all" else self.regions[name])
         # Each person has an own pattern of how strongly the vessels answer (observation 3).
-        salt = self.seed + 60 + STATES.index(state)
+        salt = self.seed + 60 + STATE_NAMES.index(state)
         own = 1.0 + 0.25 * smooth_noise(self.points_mm, (35.0, 15.0), seed=salt)
         return np.asarray(change * np.maximum(own, 0.0), np.float32)
 
@@ -111,7 +111,7 @@ class Perfusion:
         Parameters
         ----------
         state
-            One of `STATES`.
+            One of `STATE_NAMES`.
 
         Returns
         -------
@@ -125,11 +125,11 @@ class Perfusion:
         """
         change = self.dilation(state)
         total = np.zeros(change.shape, np.float32)
-        for index, answer in enumerate(_ANSWERS):
+        for index, answer in enumerate(_COMPARTMENT_RESPONSES):
             radius = np.maximum(1.0 + answer * change, 0.0)
             total += self.compartments[..., index] * radius * radius
         # Vessels fill the dermis at most up to the limit; the fold keeps the order of values.
-        return np.asarray(total / (1.0 + (total / HEMOGLOBIN_LIMIT) ** 4) ** 0.25, np.float32)
+        return np.asarray(total / (1.0 + (total / MAX_HEMOGLOBIN) ** 4) ** 0.25, np.float32)
 
     def dilated(self, change: ArrayLike) -> Perfusion:
         """Return the perfusion after a lasting change of the vessels' radius, such as by heat.
@@ -143,7 +143,7 @@ class Perfusion:
         by = np.asarray(change, np.float32)
         if not np.all(by > -1.0):
             raise ValueError(f"change: got {by.min()}, expected above -1")
-        radius = 1.0 + np.asarray(_ANSWERS, np.float32) * by[..., None]
+        radius = 1.0 + np.asarray(_COMPARTMENT_RESPONSES, np.float32) * by[..., None]
         grown = self.compartments * radius * radius
         return replace(self, compartments=np.asarray(grown, np.float32))
 
@@ -177,7 +177,7 @@ def perfuse(
     for name, gain in _REGION_GAIN.items():
         mean += np.float32(gain * rng.uniform(0.75, 1.25)) * regions[name]
     contrast += 0.5 * regions["cheeks"] + 0.35 * regions["nose"] - 0.3 * regions["lips"]
-    mean *= np.float32(BASE * amount * rng.uniform(0.85, 1.15))
+    mean *= np.float32(BASE_BLOOD_FRACTION * amount * rng.uniform(0.85, 1.15))
 
     bed = 1.0 + 0.16 * contrast * smooth_noise(points_mm, (14.0, 6.0, 3.0), seed=seed + 41)
     loops = 1.0 + 0.24 * contrast * smooth_noise(points_mm, (2.6, 1.5, 0.9), seed=seed + 42)
@@ -187,6 +187,7 @@ def perfuse(
     plexus = 0.45 + 0.3 * np.minimum(fine, 4.0) + 0.25 * contrast * np.minimum(coarse, 4.0)
     layers = (np.maximum(bed, 0.1), np.maximum(loops, 0.05), plexus)
     compartments = np.stack(
-        [share * mean * layer for share, layer in zip(_SHARES, layers, strict=True)], axis=-1
+        [share * mean * layer for share, layer in zip(_COMPARTMENT_FRACTIONS, layers, strict=True)],
+        axis=-1,
     )
     return Perfusion(compartments.astype(np.float32), points_mm, regions, seed)

@@ -17,8 +17,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from rigsim.arrays import Float32Array
-from rigsim.subject.perfusion import STATES, Perfusion, StateError
-from rigsim.subject.person import Subject
+from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError
+from rigsim.subject.person import SimulatedSubject
 
 RELAXATION_S: Final = 0.02
 """Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, saw no phase
@@ -46,7 +46,7 @@ class Course(Protocol):
 
     @property
     def state(self) -> str:
-        """Which state of `rigsim.subject.perfusion.STATES`."""
+        """Which state of `rigsim.subject.perfusion.STATE_NAMES`."""
 
     def tell(self, now_s: float, asked: str) -> None:
         """Let the person hear, at a world time in s, what is asked of him."""
@@ -193,7 +193,7 @@ class HeldPerfusion(Perfusion):
         return np.asarray(np.float32(self.level) * Perfusion.dilation(self, self.held))
 
 
-def with_blood(subject: Subject, state: str, level: float) -> Subject:
+def with_blood(subject: SimulatedSubject, state: str, level: float) -> SimulatedSubject:
     """Return a face whose blood stays at a level of one state in whatever state it is shown.
 
     Parameters
@@ -201,7 +201,7 @@ def with_blood(subject: Subject, state: str, level: float) -> Subject:
     subject
         The face.
     state
-        State of the blood, one of `rigsim.subject.perfusion.STATES`.
+        State of the blood, one of `rigsim.subject.perfusion.STATE_NAMES`.
     level
         Part of the state's dilation of the vessels, 0 to 1.
 
@@ -228,8 +228,8 @@ def with_blood(subject: Subject, state: str, level: float) -> Subject:
 
 
 def _check_state(state: str) -> None:
-    if state not in STATES or state == "neutral":
-        expected = ", ".join(name for name in STATES if name != "neutral")
+    if state not in STATE_NAMES or state == "neutral":
+        expected = ", ".join(name for name in STATE_NAMES if name != "neutral")
         raise StateError(f"state: got {state!r}, expected one of {expected}")
 
 

@@ -23,9 +23,9 @@ from rigsim.subject import (
     relief,
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
-from rigsim.subject.perfusion import STATES, Perfusion, StateError, perfuse
+from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, perfuse
 
-PRESETS: Final = tuple(pigment.MELANIN_PRESETS)
+PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
 
 SIZE_RANGE: Final = (64, 8192)
@@ -61,7 +61,7 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Subject:
+class SimulatedSubject:
     """One face; maps are textures of shape (N, N), row 0 is the top (v = 1)."""
 
     preset: str
@@ -86,7 +86,7 @@ class Subject:
     """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
     pose: Pose | None = None
     """The expression that the geometry is in; ``None`` at rest."""
-    rest: Subject | None = None
+    rest: SimulatedSubject | None = None
     """The same face at rest; ``None`` for a face that is at rest itself."""
     beard: Float32Array | None = None
     """How much stubble lies below the surface, shape (N, N), 0 to 1; ``None``: none."""
@@ -110,14 +110,14 @@ class Subject:
         """
         return self.perfusion.blood(state)
 
-    def posed(self, state: str, amount: float = 1.0) -> Subject:
+    def posed(self, state: str, amount: float = 1.0) -> SimulatedSubject:
         """Return this face in an expression: moved, with its wrinkles.
 
         Parameters
         ----------
         state
-            One of `rigsim.subject.perfusion.STATES`; those that are no expression do not move the
-            face.
+            One of `rigsim.subject.perfusion.STATE_NAMES`; those that are no expression do not move
+            the face.
         amount
             0 (rest) to 1 (full) and 1.5 (an extreme).
 
@@ -135,8 +135,8 @@ class Subject:
         rigsim.subject.expressions.ExpressionError
             The amount is out of range.
         """
-        if state not in STATES:
-            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
+        if state not in STATE_NAMES:
+            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATE_NAMES)}")
         low, high = expressions.AMOUNT_RANGE
         if not low <= amount <= high:
             raise expressions.ExpressionError(f"amount: got {amount}, expected {low:g} to {high}")
@@ -154,7 +154,7 @@ class Subject:
             rest=rest,
         )
 
-    def moved_by(self, offset_mm: tuple[float, float, float]) -> Subject:
+    def moved_by(self, offset_mm: tuple[float, float, float]) -> SimulatedSubject:
         """Return this face standing elsewhere, as a whole.
 
         Parameters
@@ -237,7 +237,7 @@ _lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLin
 """Their lines, by the first three of the same."""
 
 
-def _pose(rest: Subject, state: str, amount: float) -> Pose:
+def _pose(rest: SimulatedSubject, state: str, amount: float) -> Pose:
     """Return a pose of a face at rest; the same object as long as anybody holds it."""
     key = (id(rest.mesh), id(rest.height_um), rest.seed, state, amount)
     pose = _poses.get(key)
@@ -274,13 +274,13 @@ def make_subject(
     size: int = 512,
     mesh: Mesh | str | Path | None = None,
     blood: float = 1.0,
-) -> Subject:
+) -> SimulatedSubject:
     """Make a face.
 
     Parameters
     ----------
     preset
-        One of `PRESETS`: skin types I to VI, or "palest" or "darkest".
+        One of `PRESET_NAMES`: skin types I to VI, or "palest" or "darkest".
     seed
         Seed of shape and patterns, >= 0; the same arguments give the same face.
     size
@@ -310,7 +310,7 @@ def make_subject(
     ((64, 64), ['brow left', 'brow right'])
     """
     if preset not in pigment.MELANIN_PRESETS:
-        raise SubjectError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS)}")
+        raise SubjectError(f"preset: got {preset!r}, expected one of {', '.join(PRESET_NAMES)}")
     if seed < 0:
         raise SubjectError(f"seed: got {seed}, expected >= 0")
     if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
@@ -327,7 +327,7 @@ def make_subject(
     points = face_regions.on_mean_head(atlas.position_mm, surface)
     regions = face_regions.region_masks(points)
     height = relief.height_um(points, regions, texel_mm=_typical_texel_mm(atlas), seed=seed)
-    return Subject(
+    return SimulatedSubject(
         preset=preset,
         seed=seed,
         mesh=surface,
@@ -351,4 +351,4 @@ def _typical_texel_mm(atlas: Atlas) -> float:
     return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
 
 
-__all__ = ["PRESETS", "STATES", "Subject", "SubjectError", "make_subject"]
+__all__ = ["PRESET_NAMES", "STATE_NAMES", "SimulatedSubject", "SubjectError", "make_subject"]

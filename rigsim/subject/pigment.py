@@ -11,7 +11,7 @@ from rigsim.arrays import Float32Array, FloatArray
 from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
 from rigsim.subject.face_regions import soft_step
 
-MELANIN_LIMIT: Final = 0.5
+MAX_MELANIN: Final = 0.5
 """Largest volume fraction, Jimenez et al. 2010, table 1."""
 
 MELANIN_PRESETS: Final[Mapping[str, float]] = {
@@ -72,8 +72,8 @@ def melanin_map(
     step += _tan(points_mm, base, rng)
     step += _freckles(points_mm, regions, base, seed=seed, rng=rng, amount=freckles)
     step += _moles(points_mm, base, seed=seed, rng=rng)
-    odds = base / (MELANIN_LIMIT - base) * np.exp(step)
-    return np.asarray(MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
+    odds = base / (MAX_MELANIN - base) * np.exp(step)
+    return np.asarray(MAX_MELANIN * odds / (1.0 + odds), np.float32)
 
 
 def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:

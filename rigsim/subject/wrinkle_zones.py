@@ -64,21 +64,25 @@ def _y(p: Float64Array) -> Float64Array:
     return np.asarray(p[..., 1])
 
 
-_FOLD = (np.array([17.0, -10.0]), np.array([31.0, -41.0]))
+_FOLD_ENDS_MM = (np.array([17.0, -10.0]), np.array([31.0, -41.0]))
 """Ends of the fold between nose and cheek, mm on the mean head."""
 
 
 def _off_fold(p: Float64Array) -> Float64Array:
-    way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
-    along = (p[..., :2] - _FOLD[0]) @ way
+    way = (_FOLD_ENDS_MM[1] - _FOLD_ENDS_MM[0]) / np.linalg.norm(
+        _FOLD_ENDS_MM[1] - _FOLD_ENDS_MM[0]
+    )
+    along = (p[..., :2] - _FOLD_ENDS_MM[0]) @ way
     # a slight bow towards the cheek
-    side = (p[..., :2] - _FOLD[0]) @ np.array([-way[1], way[0]])
+    side = (p[..., :2] - _FOLD_ENDS_MM[0]) @ np.array([-way[1], way[0]])
     return np.asarray(side - 2.5 * np.sin(np.pi * np.clip(along / 34.0, 0.0, 1.0)))
 
 
 def _near_fold(p: Float64Array) -> Float64Array:
-    way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
-    along = (p[..., :2] - _FOLD[0]) @ way
+    way = (_FOLD_ENDS_MM[1] - _FOLD_ENDS_MM[0]) / np.linalg.norm(
+        _FOLD_ENDS_MM[1] - _FOLD_ENDS_MM[0]
+    )
+    along = (p[..., :2] - _FOLD_ENDS_MM[0]) @ way
     inside = soft_step((along - 1.0) / 3.0) * soft_step((32.0 - along) / 3.0)
     return np.asarray(inside * (p[..., 2] > -25.0))
 
@@ -88,7 +92,7 @@ def _fan(p: Float64Array) -> Float64Array:
     return np.asarray(12.0 * np.arctan2(p[..., 1] - 24.0, np.maximum(p[..., 0] - 42.0, 1.0)))
 
 
-ZONES: Final = (
+WRINKLE_ZONES: Final = (
     Zone(
         "forehead",
         0.36,

@@ -46,7 +46,7 @@ class Target:
     """
 
     name: str
-    """Name, one of `TARGETS`."""
+    """Name, one of `TARGET_NAMES`."""
     kind: Literal["diffuse", "metal", "source", "cap"]
     """How light comes back, see above."""
     mesh: Mesh
@@ -94,9 +94,9 @@ def make_target(name: str) -> Target:
     >>> make_target("white").rgb("Nikon 5100 (NPL)", "D55")[0, 0].round(2).tolist()
     [0.9900000095367432, 0.9900000095367432, 0.9900000095367432]
     """
-    if name not in _MAKERS:
-        raise TargetError(f"target: got {name!r}, expected one of {', '.join(TARGETS)}")
-    return _MAKERS[name]()
+    if name not in _TARGET_MAKERS:
+        raise TargetError(f"target: got {name!r}, expected one of {', '.join(TARGET_NAMES)}")
+    return _TARGET_MAKERS[name]()
 
 
 def patch_centers_mm() -> Float64Array:
@@ -156,7 +156,7 @@ def _chart(*, texels: int = 2048) -> Target:
     return Target("chart", "diffuse", _plate(half_mm, half_mm), palette, index, 0.0)
 
 
-_MAKERS: Final[Mapping[str, Callable[[], Target]]] = {
+_TARGET_MAKERS: Final[Mapping[str, Callable[[], Target]]] = {
     "white": lambda: _even("white", "diffuse", WHITE_REFLECTANCE, 0.0),
     "chart": _chart,
     "malus": lambda: _even("malus", "metal", 0.42, 0.45),
@@ -164,5 +164,5 @@ _MAKERS: Final[Mapping[str, Callable[[], Target]]] = {
     "dark": lambda: _even("dark", "cap", 0.0, 0.0),
 }
 
-TARGETS: Final = tuple(_MAKERS)
+TARGET_NAMES: Final = tuple(_TARGET_MAKERS)
 """Names of the targets."""

@@ -19,7 +19,7 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.targets.mirror_ball import reflection_point
 
-RADIUS_MM: Final = 6.0
+GLASS_BALL_RADIUS_MM: Final = 6.0
 ETA: Final = 1.52
 """Of crown glass."""
 
@@ -27,17 +27,17 @@ CENTER_MM: Final = (0.0, 0.0, -3.0)
 """Where the ball's middle is on average: the spots near the axis, half a radius before the middle,
 are then in focus."""
 
-HAND_MM: Final = 0.3
+BALL_PLACEMENT_DEVIATION_MM: Final = 0.3
 """Standard deviation of where an operator puts it, per axis."""
 
 PUPIL_POINTS: Final = 37
-SUBPIXELS: Final = 4
+RAYS_PER_SIDE: Final = 4
 
 
 def ball_center_mm(seed: int) -> Float64Array:
     """Return where the ball's middle is, mm, rig frame, shape (3,)."""
     rng = np.random.default_rng([seed, 12])
-    return np.array(CENTER_MM) + HAND_MM * rng.standard_normal(3)
+    return np.array(CENTER_MM) + BALL_PLACEMENT_DEVIATION_MM * rng.standard_normal(3)
 
 
 def ball_stokes(
@@ -46,7 +46,7 @@ def ball_stokes(
     *,
     extinction: float,
     center_mm: Float64Array,
-    radius_mm: float = RADIUS_MM,
+    radius_mm: float = GLASS_BALL_RADIUS_MM,
 ) -> Float32Array:
     """Return the picture of the ball for each moment of the light, each pixel averaged.
 
@@ -65,7 +65,7 @@ def ball_stokes(
     -------
     ndarray of float32
         Shape (12, H, W): Stokes vectors of the moments in the order of
-        `rigsim.as_built.sphere.MOMENTS`, radiance in the unit of `rigsim.light.lobe_moments`.
+        `rigsim.as_built.sphere.MOMENT_NAMES`, radiance in the unit of `rigsim.light.lobe_moments`.
     """
     eye = np.array(view.position_mm, np.float64)
     pupil = eye + _pupil(view)
@@ -176,15 +176,15 @@ def _add_spot(  # type: ignore[no-untyped-def]
     part, box, pitch, shape, pupil, center, radius, lamp, beam, lamp_radius
 ):
     """Add which part of each pixel's rays, over pixel and pupil, ends on a lamp's disc."""
-    share = 1.0 / (SUBPIXELS * SUBPIXELS * pupil.shape[0])
+    share = 1.0 / (RAYS_PER_SIDE * RAYS_PER_SIDE * pupil.shape[0])
     ray, place = np.empty(3), np.empty(3)
     for i in range(box[0], box[1]):
         for j in range(box[2], box[3]):
             hits = 0
-            for a in range(SUBPIXELS):
-                for b in range(SUBPIXELS):
-                    y = (0.5 * shape[0] - i - (a + 0.5) / SUBPIXELS) * pitch
-                    x = (j + (b + 0.5) / SUBPIXELS - 0.5 * shape[1]) * pitch
+            for a in range(RAYS_PER_SIDE):
+                for b in range(RAYS_PER_SIDE):
+                    y = (0.5 * shape[0] - i - (a + 0.5) / RAYS_PER_SIDE) * pitch
+                    x = (j + (b + 0.5) / RAYS_PER_SIDE - 0.5 * shape[1]) * pitch
                     for p in range(pupil.shape[0]):
                         ray[0], ray[1], ray[2] = x - pupil[p, 0], y - pupil[p, 1], -pupil[p, 2]
                         length, along, square = 0.0, 0.0, 0.0

@@ -13,7 +13,7 @@ from numba import njit
 
 from rigsim.arrays import Float32Array, Float64Array, Int64Array
 
-REFLECTANCE: Final = 0.62
+CHROMIUM_REFLECTANCE: Final = 0.62
 """Of polished chromium in the visible, at all angles (Fresnel's rise near the rim is left out)."""
 
 CLOTH_MM: Final = 1200.0

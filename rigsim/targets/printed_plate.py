@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
+from rigsim.targets.flat import WHITE_REFLECTANCE
 
 CELL_MM: Final = 4.5
 """Side of a lattice cell, and of one bit of a marker."""
@@ -22,8 +23,6 @@ SQUARE_CELLS: Final = 8
 
 PAPER_REFLECTANCE: Final = 0.80
 INK_REFLECTANCE: Final = 0.05
-WHITE_REFLECTANCE: Final = 0.99
-"""Of sintered PTFE between 400 and 700 nm, Weidner and Hsia 1981, doi:10.1364/JOSA.71.000856."""
 
 DICT_4X4_50: Final = (
     0xB532,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rigsim.arrays import Float32Array, Float64Array, UInt32Array
 from rigsim.render import load
 from rigsim.render.variant import choose_variant
-from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL, TALLIES
+from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL, TALLY_COUNT
 
 PHOTONS_PER_LANE: Final = (32, 256)
 """Fewest and most photons that a lane traces in turn: with more, lanes wait less at the end."""
@@ -24,15 +24,17 @@ PHOTONS_PER_LANE: Final = (32, 256)
 PHOTONS_PER_CALL: Final = 1 << 22
 """Photons whose exits are kept at once, 8 bytes each, batches whole."""
 
-ENOUGH_LANES: Final = 1 << 16
+MIN_LANES: Final = 1 << 16
 """Lanes that keep the threads busy; Dr.Jit gives 16,384 of them to each."""
 
-FAR_MM: Final = 1e30
+INFINITE_MM: Final = 1e30
 """Stands for an infinite thickness or free path in float32."""
 
-ISOTROPIC: Final = 1e-4  # |g| below which float32 cannot tell the phase function from a constant
+MAX_ISOTROPIC_G: Final = (
+    1e-4  # |g| below which float32 cannot tell the phase function from a constant
+)
 
-_UNIT: Final = 2.0**-23
+_UNIFORM_STEP: Final = 2.0**-23
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +88,7 @@ def _batches(
 
     load(choose_variant("mono"))
     batches = len(seed)
-    per_lane = min(max(photons * of // ENOUGH_LANES, PHOTONS_PER_LANE[0]), PHOTONS_PER_LANE[1])
+    per_lane = min(max(photons * of // MIN_LANES, PHOTONS_PER_LANE[0]), PHOTONS_PER_LANE[1])
     per_lane = min(per_lane, photons)
     lanes = -(-photons // per_lane)
     n_layers = len(table) - 2
@@ -97,7 +99,7 @@ def _batches(
     weight, r2, absorbed, roulette = _run(dr, table, words.astype(np.uint32), per_lane)
     weight = weight.reshape(batches, -1).astype(np.float64)
     r2 = r2.reshape(batches, -1)
-    tally = np.zeros((batches, TALLIES + n_layers + len(ring_edges2) - 1))
+    tally = np.zeros((batches, TALLY_COUNT + n_layers + len(ring_edges2) - 1))
     below = r2 < 0.0
     straight = weight < 0.0
     tally[:, 0] = np.where(below | straight, 0.0, weight).sum(axis=1)
@@ -106,7 +108,7 @@ def _batches(
     tally[:, 3] = np.where(below & straight, -weight, 0.0).sum(axis=1)
     tally[:, 4] = roulette.reshape(batches, -1).sum(axis=1)
     for layer, part in enumerate(absorbed):
-        tally[:, TALLIES + layer] = part.reshape(batches, -1).sum(axis=1)
+        tally[:, TALLY_COUNT + layer] = part.reshape(batches, -1).sum(axis=1)
     for batch in range(batches):
         up = (weight[batch] > 0.0) & ~below[batch]
         rings = np.histogram(
@@ -114,7 +116,7 @@ def _batches(
             np.minimum(ring_edges2, np.finfo(np.float64).max),
             weights=weight[batch, up],
         )[0]
-        tally[batch, TALLIES + n_layers :] = rings
+        tally[batch, TALLY_COUNT + n_layers :] = rings
     return LaneTallies(tally, per_lane * lanes)
 
 
@@ -126,11 +128,11 @@ def _run(
 
     lanes = words.shape[1]
     n_layers = len(table) - 2
-    thickness = np.full(len(table), FAR_MM)
+    thickness = np.full(len(table), INFINITE_MM)
     finite = np.isfinite(table[:, :2]).all(axis=1)
     thickness[finite] = np.diff(table[finite, :2])[:, 0]
-    free = 1.0 / np.maximum(table[:, 2], 1.0 / FAR_MM)
-    half_by_g = 0.5 / np.where(np.abs(table[:, 4]) < ISOTROPIC, 1.0, table[:, 4])
+    free = 1.0 / np.maximum(table[:, 2], 1.0 / INFINITE_MM)
+    half_by_g = 0.5 / np.where(np.abs(table[:, 4]) < MAX_ISOTROPIC_G, 1.0, table[:, 4])
     columns = [thickness, free, table[:, 3], table[:, 4], table[:, 5], half_by_g]
     single = n_layers == 1
     stored = [Float(column.astype(np.float32)) for column in columns]
@@ -153,7 +155,7 @@ def _run(
         s[0] = s[0] ^ s[3]
         s[2] = s[2] ^ t
         s[3] = (s[3] << 11) | (s[3] >> 21)
-        return dr.fma(Float(word >> 9), _UNIT, 0.5 * _UNIT)
+        return dr.fma(Float(word >> 9), _UNIFORM_STEP, 0.5 * _UNIFORM_STEP)
 
     def body(
         s0: Any,
@@ -200,7 +202,7 @@ def _run(
         after = dr.select(plays, dr.select(dies, 0.0, kept * (1.0 / ROULETTE_SURVIVAL)), kept)
         lost += Float64(dr.select(collides, kept - after, 0.0))
         u = draw(s)
-        small = dr.abs(g) < ISOTROPIC
+        small = dr.abs(g) < MAX_ISOTROPIC_G
         part = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
         cosine = dr.select(small, 2.0 * u - 1.0, (1.0 + g * g - part * part) * half_by_g)
         cosine = dr.clip(cosine, -1.0, 1.0)

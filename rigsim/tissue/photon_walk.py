@@ -7,30 +7,30 @@ from math import copysign, log, sqrt
 import numpy as np
 from numba import njit
 
-TALLIES = 5
+TALLY_COUNT = 5
 """Scores ahead of the layers and rings: diffuse and unscattered reflectance, diffuse and
 unscattered transmittance, weight removed minus weight added by the roulette."""
 
 ROULETTE_BELOW = 1e-2  # weight under which a photon has to play
 ROULETTE_SURVIVAL = 0.1  # probability to go on, with the weight divided by it
 
-_UNIT = 2.0**-53
-_TWO = np.uint64(2)
-_SHIFTS = tuple(np.uint64(n) for n in (11, 17, 45, 19))
+_UNIFORM_STEP = 2.0**-53
+_UINT64_TWO = np.uint64(2)
+_RNG_SHIFTS = tuple(np.uint64(n) for n in (11, 17, 45, 19))
 
 
 @njit(inline="always")
 def draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
     """Step xoshiro256+ (Blackman, Vigna 2021, doi:10.1145/3460772); uniform in (0, 1]."""
     word = s0 + s3
-    t = s1 << _SHIFTS[1]
+    t = s1 << _RNG_SHIFTS[1]
     s2 ^= s0
     s3 ^= s1
     s1 ^= s2
     s0 ^= s3
     s2 ^= t
-    s3 = (s3 << _SHIFTS[2]) | (s3 >> _SHIFTS[3])
-    return s0, s1, s2, s3, (np.float64(word >> _SHIFTS[0]) + 1.0) * _UNIT
+    s3 = (s3 << _RNG_SHIFTS[2]) | (s3 >> _RNG_SHIFTS[3])
+    return s0, s1, s2, s3, (np.float64(word >> _RNG_SHIFTS[0]) + 1.0) * _UNIFORM_STEP
 
 
 @njit(inline="always")
@@ -102,7 +102,8 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
     seed
         State of the generator, not all zero, uint64, shape (4,).
     tally
-        Sums of weights: the five of `TALLIES`, absorbed per layer, diffuse reflectance per ring.
+        Sums of weights: the five of `TALLY_COUNT`, absorbed per layer, diffuse reflectance per
+        ring.
         float64, shape (5 + n + rings,), added to.
     events
         Rows to fill for photons that return scattered: weight, r^2 in mm^2, path in each layer in
@@ -150,7 +151,7 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
                 y += step * uy
                 z += step * uz
                 path[layer - 1] += step
-                tally[TALLIES + layer - 1] += weight * (1.0 - albedo)
+                tally[TALLY_COUNT + layer - 1] += weight * (1.0 - albedo)
                 weight *= albedo
                 if weight < ROULETTE_BELOW:
                     s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
@@ -192,7 +193,7 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
                 r2 = x * x + y * y
                 ring = np.searchsorted(ring_edges2, r2, side="right") - 1
                 if 0 <= ring < n_rings:
-                    tally[TALLIES + n_layers + ring] += weight
+                    tally[TALLY_COUNT + n_layers + ring] += weight
                 if listed < events.shape[0]:
                     events[listed, 0] = weight
                     events[listed, 1] = r2

@@ -18,7 +18,7 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
 from rigsim.tissue.skin_table import SkinTable
 
-NODES: Final = 257
+NODES_PER_AXIS: Final = 257
 """Nodes along each axis; linear interpolation of log R between them errs by less than 1e-4."""
 
 
@@ -103,12 +103,12 @@ def skin_color(camera: str, light: str) -> SkinColor:
     """
     table = SkinTable.load()
     weights = spectra.band_weights(camera, light, table.wavelength_nm)
-    position = np.linspace(0.0, 1.0, NODES)
+    position = np.linspace(0.0, 1.0, NODES_PER_AXIS)
     melanin = MAX_C_M * position**3
     blood = MAX_C_HD * position**3
-    log_rgb = np.empty((NODES, NODES, 3))
+    log_rgb = np.empty((NODES_PER_AXIS, NODES_PER_AXIS, 3))
     for i, c_m in enumerate(melanin):
-        log_rgb[i] = np.log(table.spectra(np.full(NODES, c_m), blood) @ weights)
+        log_rgb[i] = np.log(table.spectra(np.full(NODES_PER_AXIS, c_m), blood) @ weights)
     log_rgb.setflags(write=False)
     return SkinColor(camera, light, log_rgb)
 

@@ -14,12 +14,12 @@ from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
 EPIDERMIS_MM = 0.25  # Donner et al. 2008, doi:10.1145/1409060.1409093
 ETA = 1.4  # Donner et al. 2008, both layers
-ANISOTROPY = (
+SKIN_ANISOTROPY = (
     0.8  # Henyey-Greenstein g; van Gemert et al. 1989, doi:10.1109/10.42108: .75-.82 visible
 )
 EUMELANIN_SHARE = 0.61  # beta_m, Donner et al. 2008; the rest is pheomelanin
 EPIDERMAL_BLOOD_SHARE = 0.25  # C_he / C_hd, Jimenez et al. 2010, doi:10.1145/1882261.1866167
-OXYGENATION = 0.75  # S, Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417
+BLOOD_OXYGENATION = 0.75  # S, Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417
 BLOOD_G_PER_L, HEMOGLOBIN_G_PER_MOL = 150.0, 64_500.0  # Prahl 1998 (OMLC)
 
 MAX_C_M, MAX_C_HD = 0.5, 0.32  # Jimenez et al. 2010, table 1
@@ -43,7 +43,7 @@ def melanin_per_mm(wavelength_nm: float) -> float:
 
 
 def blood_per_mm(wavelength_nm: float) -> float:
-    """Return the absorption of whole blood in 1/mm at the oxygenation of `OXYGENATION`.
+    """Return the absorption of whole blood in 1/mm at the oxygenation of `BLOOD_OXYGENATION`.
 
     References
     ----------
@@ -55,7 +55,7 @@ def blood_per_mm(wavelength_nm: float) -> float:
     27.618
     """
     oxy, deoxy = hemoglobin_extinction(wavelength_nm)
-    per_cm_molar = OXYGENATION * float(oxy) + (1.0 - OXYGENATION) * float(deoxy)
+    per_cm_molar = BLOOD_OXYGENATION * float(oxy) + (1.0 - BLOOD_OXYGENATION) * float(deoxy)
     molar = BLOOD_G_PER_L / HEMOGLOBIN_G_PER_MOL
     return log(10.0) * molar * per_cm_molar / 10.0
 
@@ -128,10 +128,10 @@ def skin(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStack:
     c_he = EPIDERMAL_BLOOD_SHARE * c_hd
     epidermis = c_m * melanin + c_he * blood + (1.0 - c_m - c_he) * baseline
     dermis = c_hd * blood + (1.0 - c_hd) * baseline
-    sigma_s = epidermis_scattering_per_mm(wavelength_nm) / (1.0 - ANISOTROPY)
+    sigma_s = epidermis_scattering_per_mm(wavelength_nm) / (1.0 - SKIN_ANISOTROPY)
     return LayerStack(
         (
-            Layer(EPIDERMIS_MM, epidermis, sigma_s, ANISOTROPY, ETA),
-            Layer(inf, dermis, 0.5 * sigma_s, ANISOTROPY, ETA),
+            Layer(EPIDERMIS_MM, epidermis, sigma_s, SKIN_ANISOTROPY, ETA),
+            Layer(inf, dermis, 0.5 * sigma_s, SKIN_ANISOTROPY, ETA),
         )
     )

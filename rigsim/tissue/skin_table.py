@@ -34,7 +34,7 @@ from rigsim.arrays import Float64Array
 from rigsim.tissue.lateral_kernels import LateralKernels
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
 
-_FILE = "skin_reflectance_mc.npz"
+_TABLE_FILE = "skin_reflectance_mc.npz"
 EMPTY_RING = 1e-9  # share that stands for a far ring that no photon reached
 
 
@@ -192,7 +192,7 @@ class SkinTable:
 
 @cache
 def _load() -> SkinTable:
-    source = resources.files("rigsim").joinpath("data", _FILE)
+    source = resources.files("rigsim").joinpath("data", _TABLE_FILE)
     with source.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
         arrays = {
             name: stored[name].astype(np.float64) for name in stored.files if name != "provenance"
@@ -270,6 +270,8 @@ def _interpolate(patches, c_m, c_hd, out):  # type: ignore[no-untyped-def]
             out[point, w] = exp(total[w])
 
 
-_SIGNATURE = "void(Array(float64, 4, 'C', readonly=True), float64[::1], float64[::1], {}[:,::1])"
-_interpolate_f64 = njit(_SIGNATURE.format("float64"), cache=True, nogil=True)(_interpolate)
-_interpolate_f32 = njit(_SIGNATURE.format("float32"), cache=True, nogil=True)(_interpolate)
+_KERNEL_SIGNATURE = (
+    "void(Array(float64, 4, 'C', readonly=True), float64[::1], float64[::1], {}[:,::1])"
+)
+_interpolate_f64 = njit(_KERNEL_SIGNATURE.format("float64"), cache=True, nogil=True)(_interpolate)
+_interpolate_f32 = njit(_KERNEL_SIGNATURE.format("float32"), cache=True, nogil=True)(_interpolate)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim.arrays import Float64Array
-from rigsim.tissue.photon_walk import TALLIES, walk
+from rigsim.tissue.photon_walk import TALLY_COUNT, walk
 
 _T = TypeVar("_T")
 
-WORTH_LANES = 100_000  # photons above which Dr.Jit's start pays
+MIN_LANE_PHOTONS = 100_000  # photons above which Dr.Jit's start pays
 MIN_BATCHES = 20  # fewer give a standard error that is itself off by more than 16 %
 
 
@@ -241,10 +241,10 @@ def transport(
     table = layer_table(stack)
     n_layers = len(stack.layers)
     seeds = batch_seeds(rng, batches)
-    if engine == "drjit" or (engine == "auto" and photons >= WORTH_LANES and _lanes_work()):
+    if engine == "drjit" or (engine == "auto" and photons >= MIN_LANE_PHOTONS and _lanes_work()):
         tallies, count = _walk_lanes(table, edges * edges, count, seeds)
     else:
-        tallies = np.zeros((batches, TALLIES + n_layers + edges.size - 1))
+        tallies = np.zeros((batches, TALLY_COUNT + n_layers + edges.size - 1))
         no_events = np.zeros((0, 2 + n_layers))
 
         def run(batch: int) -> None:
@@ -255,8 +255,8 @@ def transport(
     mean = tallies.mean(axis=0)
     error = tallies.std(axis=0, ddof=1) / np.sqrt(batches)
     transmitted = tallies[:, 2] + tallies[:, 3]
-    layer_part = slice(TALLIES, TALLIES + n_layers)
-    ring_part = slice(TALLIES + n_layers, None)
+    layer_part = slice(TALLY_COUNT, TALLY_COUNT + n_layers)
+    ring_part = slice(TALLY_COUNT + n_layers, None)
     return Transport(
         specular=stack.specular_reflectance + float(mean[1]),
         reflectance=float(mean[0]),
@@ -314,7 +314,7 @@ def escape_paths(
     edges2 = np.array([0.0, inf])
 
     def run(batch: int) -> EscapePaths:
-        tally = np.zeros(TALLIES + n_layers + 1)
+        tally = np.zeros(TALLY_COUNT + n_layers + 1)
         events = np.empty((count, 2 + n_layers))
         kept = events[: walk(table, edges2, count, seeds[batch], tally, events)].copy()
         return EscapePaths(kept[:, 0], np.sqrt(kept[:, 1]), kept[:, 2:], count)

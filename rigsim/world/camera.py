@@ -17,7 +17,7 @@ from capture.devices.camera import (
     Trigger,
 )
 from capture.rig import RigError
-from rigsim.world.camera_body import EXPOSURE_S, ISO, CameraBody
+from rigsim.world.camera_body import EXPOSURE_RANGE_S, ISO, CameraBody
 from rigsim.world.world import get_by_name_or_box
 
 __all__ = ["CameraBody", "SimCamera", "open_camera"]
@@ -75,7 +75,7 @@ class SimCamera:
     def configure(self, want: Exposure) -> Exposure:
         """Set an exposure within what the camera can do, and return it."""
         set_to = Exposure(
-            min(max(want.exposure_s, EXPOSURE_S[0]), EXPOSURE_S[1]),
+            min(max(want.exposure_s, EXPOSURE_RANGE_S[0]), EXPOSURE_RANGE_S[1]),
             min(max(want.iso, ISO[0]), ISO[1]),
         )
         self.body.exposure = set_to

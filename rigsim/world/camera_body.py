@@ -21,7 +21,7 @@ from rigsim.world.light_record import Light
 ISO = (50, 25_600)
 
 
-EXPOSURE_S = (1.0 / 8000.0, 30.0)
+EXPOSURE_RANGE_S = (1.0 / 8000.0, 30.0)
 
 
 FOREIGN_SERIAL = "SR-9999"

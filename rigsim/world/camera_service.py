@@ -22,8 +22,8 @@ __all__ = ["CameraService"]
 
 log = logging.getLogger(__name__)
 
-LONGEST_WAIT_S = 600.0
-LOOK_S = 0.2
+MAX_WAIT_S = 600.0
+CLIENT_POLL_S = 0.2
 """How often the wait for a frame looks whether its client is still there, s."""
 
 
@@ -166,7 +166,7 @@ class CameraService:
                 camera.fire()
                 return {}, None
             case "frame":
-                timeout_s = min(max(float(request["timeout_s"]), 0.0), LONGEST_WAIT_S)
+                timeout_s = min(max(float(request["timeout_s"]), 0.0), MAX_WAIT_S)
                 shot = self._next_shot(connection, camera.body, timeout_s)
                 _send(connection, request, developing=True)
                 table, blob = camera_wire.frame_to_message(camera.body.develop(shot))
@@ -186,8 +186,8 @@ class CameraService:
                 if self._holders.get(body.view.name) is not connection or _hung_up(connection):
                     raise ConnectionResetError("the client is gone")
                 with contextlib.suppress(FrameTimeout):
-                    return body.next_shot(min(left_s, LOOK_S))
-            if left_s <= LOOK_S:
+                    return body.next_shot(min(left_s, CLIENT_POLL_S))
+            if left_s <= CLIENT_POLL_S:
                 raise FrameTimeout(f"camera {body.view.serial}: no frame in {timeout_s:g} s")
 
 

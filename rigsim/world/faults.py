@@ -1,8 +1,8 @@
 """What can go wrong on the wire, in a box and in a camera: switches with numbers, seeded.
 
 `Faults` holds one switch per thing that can go wrong; all of them are off by default and each can
-be set in a ``sim://`` URL. `CATALOGUE` names the twenty kinds of trouble a rig must survive, which
-switches provoke each, and what is promised when it happens.
+be set in a ``sim://`` URL. `FAULT_CATALOG` names the twenty kinds of trouble a rig must survive,
+which switches provoke each, and what is promised when it happens.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 from capture.documents import near_miss
 
-__all__ = ["CATALOGUE", "NO_FAULTS", "FaultKind", "Faults"]
+__all__ = ["FAULT_CATALOG", "NO_FAULTS", "FaultKind", "Faults"]
 
-_PROBABILITIES = (
+_PROBABILITY_FIELDS = (
     "drop",
     "flip",
     "glue",
@@ -35,7 +35,7 @@ _PROBABILITIES = (
     "wrong_camera",
     "wrong_exposure",
 )
-_TIMES = (
+_TIME_FIELDS = (
     "late_s",
     "latency",
     "boot_s",
@@ -158,11 +158,11 @@ class Faults:
     """Error of the camera's clock, microseconds per second."""
 
     def __post_init__(self) -> None:
-        for field in _PROBABILITIES:
+        for field in _PROBABILITY_FIELDS:
             value = getattr(self, field)
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{field}: got {value}, expected a probability from 0 to 1")
-        for field in _TIMES:
+        for field in _TIME_FIELDS:
             value = getattr(self, field)
             if not value >= 0.0:
                 raise ValueError(f"{field}: got {value}, expected seconds >= 0")
@@ -257,7 +257,7 @@ class FaultKind:
     """What is promised then."""
 
 
-CATALOGUE: tuple[FaultKind, ...] = (
+FAULT_CATALOG: tuple[FaultKind, ...] = (
     FaultKind(1, "byte lost", ("drop",), "retried, done once"),
     FaultKind(2, "bit flipped", ("flip",), "NAK or retried, done once"),
     FaultKind(3, "line cut or glued to the next", ("glue", "cut"), "retried, done once"),

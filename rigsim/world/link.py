@@ -20,7 +20,7 @@ __all__ = ["Link", "LinkStalled", "Unplugged"]
 
 STALL_BUFFER_BYTES = 256
 """What the line holds while a stalled box takes nothing."""
-BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"
+BOOT_BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"
 
 Record = Callable[[float, str, bytes], None]
 
@@ -147,7 +147,7 @@ class Link:
         for line in data.splitlines(keepends=True):
             if not self.attached or self._strikes(self._faults.lose_answer):
                 continue
-            said = [BANNER] if self._strikes(self._faults.babble) else []
+            said = [BOOT_BANNER] if self._strikes(self._faults.babble) else []
             delay_s = self._faults.latency
             if self._strikes(self._faults.late):
                 delay_s += self._faults.late_s

@@ -72,10 +72,10 @@ def make_box(name: str, wiring: Wiring, *, rng: np.random.Generator) -> Controll
     ValueError
         Unknown name, or the rig does not describe what the box moves.
     """
-    if name not in _UNITS:
-        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(_UNITS)}")
+    if name not in _BOX_MAKERS:
+        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(_BOX_MAKERS)}")
     return Controller(
-        _UNITS[name](wiring, rng),
+        _BOX_MAKERS[name](wiring, rng),
         serial=wiring.faults.serial or SERIAL_NUMBERS[name],
         protocol=wiring.faults.protocol,
         rng=rng,
@@ -175,7 +175,7 @@ def _probe(wiring: Wiring, rng: np.random.Generator) -> Device:
     return unit
 
 
-_UNITS: Final[dict[str, Callable[[Wiring, np.random.Generator], Device]]] = {
+_BOX_MAKERS: Final[dict[str, Callable[[Wiring, np.random.Generator], Device]]] = {
     "flash": _flash,
     "dome": _dome,
     "gradient_sphere": _gradient_sphere,

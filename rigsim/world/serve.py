@@ -29,7 +29,7 @@ __all__ = ["ServeError", "Served", "serve"]
 
 log = logging.getLogger(__name__)
 
-IDLE_S = 0.5
+MAX_IDLE_S = 0.5
 """Longest sleep of the thread that serves the boxes."""
 STALL_POLL_S = 0.02
 
@@ -188,7 +188,7 @@ class Served:
     def _run(self) -> None:
         world = self.world
         while not self._closing.is_set():
-            pause = min(IDLE_S, world.deadline() - world.now)
+            pause = min(MAX_IDLE_S, world.deadline() - world.now)
             if any(end.stalled for end in self._ends):
                 pause = min(pause, STALL_POLL_S)
             for key, _ in self._selector.select(max(0.0, pause)):

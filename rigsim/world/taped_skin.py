@@ -31,7 +31,7 @@ from capture.rig import Caliper
 
 __all__ = ["GripState", "TapeMechanics", "TapedSkin", "TapedSkinError", "draw_mechanics"]
 
-LEAST_STRETCH, MOST_STRETCH = 0.2, 2.5
+MIN_STRETCH, MAX_STRETCH = 0.2, 2.5
 """Between them the skin's stretch is sought; jaws that ask for more are no caliper's."""
 
 
@@ -84,10 +84,10 @@ class TapeMechanics:
             finite = math.isfinite(value) or field.name in ("tape_n_per_mm", "slips_at_n")
             if not (good and finite):
                 raise TapedSkinError(f"{field.name}: got {value}, expected a number > 0")
-        if not LEAST_STRETCH < self.buckles_at < 1.0 < self.detaches_at < MOST_STRETCH:
+        if not MIN_STRETCH < self.buckles_at < 1.0 < self.detaches_at < MAX_STRETCH:
             raise TapedSkinError(
                 f"buckles_at, detaches_at: got {self.buckles_at}, {self.detaches_at}, expected "
-                f"{LEAST_STRETCH} < buckles_at < 1 < detaches_at < {MOST_STRETCH}"
+                f"{MIN_STRETCH} < buckles_at < 1 < detaches_at < {MAX_STRETCH}"
             )
 
     def force_n(self, stretch: float) -> float:
@@ -271,7 +271,7 @@ class TapedSkin:
         """
         law, gap_mm = self.mechanics, self._aperture_mm - offset_mm
         soft = soft_mm_per_n + 1.0 / law.tape_n_per_mm
-        low, high = LEAST_STRETCH, MOST_STRETCH
+        low, high = MIN_STRETCH, MAX_STRETCH
         for _ in range(60):
             middle = 0.5 * (low + high)
             if self._rest_mm * middle + soft * law.force_n(middle) < gap_mm:

@@ -20,8 +20,8 @@ from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import space as brdf_space
 from rigsim.light import surface_brdf
 from rigsim.light.surface_brdf import SkinSurface
-from rigsim.population.conditions import CONDITIONS, conditioned_surface
-from rigsim.population.population import HAIR_LIMIT, Member, table_1
+from rigsim.population.conditions import CONDITION_NAMES, conditioned_surface
+from rigsim.population.population import MAX_SKIN_HAIR, Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 MIN_COS_LIGHT: Final = 0.12
@@ -226,7 +226,7 @@ def dataset_a(
     points: int,
     *,
     member: Member | None = None,
-    conditions: Sequence[str] = CONDITIONS,
+    conditions: Sequence[str] = CONDITION_NAMES,
     noise: float = RADIANCE_NOISE,
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
@@ -240,7 +240,7 @@ def dataset_a(
     member
         Whose; None: `DATASET_A_MEMBER` of table 1.
     conditions
-        Of `rigsim.population.conditions.CONDITIONS`, each of amount 1.
+        Of `rigsim.population.conditions.CONDITION_NAMES`, each of amount 1.
     noise
         See `RADIANCE_NOISE`.
     progress
@@ -312,7 +312,7 @@ def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
     worn = dict(member.applied) if conditions is None else conditions
     face = member.face(DATASET_TEXELS)
     surface = conditioned_surface(face, camera, light, worn)
-    return surface, face.atlas.position_mm, face.atlas.covered & (face.hair < HAIR_LIMIT)
+    return surface, face.atlas.position_mm, face.atlas.covered & (face.hair < MAX_SKIN_HAIR)
 
 
 def _gathered(

@@ -246,14 +246,14 @@ def _with_states(
     """Return the mesh with shapes for states that it lacks, and the names that it has itself."""
     from rigsim.geometry.mesh import build_mesh
     from rigsim.subject.expressions import displacement_mm, moves
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
     own = tuple(name for name in names if name in mesh.shapes)
-    unknown = [name for name in names if name not in mesh.shapes and name not in STATES]
+    unknown = [name for name in names if name not in mesh.shapes and name not in STATE_NAMES]
     if unknown:
         raise ApplyError(
-            f"weights: got {unknown[0]!r}, expected a state ({', '.join(STATES)}) or a shape of "
-            f"the mesh ({', '.join(mesh.shapes) or 'it has none'})"
+            f"weights: got {unknown[0]!r}, expected a state ({', '.join(STATE_NAMES)}) or a shape "
+            f"of the mesh ({', '.join(mesh.shapes) or 'it has none'})"
         )
     missing = [name for name in names if name not in own and moves(name)]
     if not missing:
@@ -285,7 +285,7 @@ def _noise(
     out: Float32Array | None,
 ) -> Float32Array:
     """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
-    from rigsim.geometry.atlas import spread, unwrap
+    from rigsim.geometry.atlas import dilate_texture, unwrap
 
     finest = NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
     if finest <= MIN_WAVES_PER_MM:
@@ -296,7 +296,7 @@ def _noise(
     noise = VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
     # places lie smoothly between the texels of a smaller atlas: microns off at most
     atlas = unwrap(_face(mesh), POSITION_ATLAS_PX)
-    places = spread(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)
+    places = dilate_texture(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)
     target = np.empty((size_px, size_px), np.float32) if out is None else out
     columns = (np.arange(size_px) + 0.5) * POSITION_ATLAS_PX / size_px - 0.5
     for top in range(0, size_px, ROWS_PER_NOISE_BAND):

@@ -53,23 +53,23 @@ def wants(incomplete: str) -> list[str]:
 
 def subjects(incomplete: str) -> list[str]:
     """Return presets of skin."""
-    from rigsim.subject import PRESETS
+    from rigsim.subject import PRESET_NAMES
 
-    return beginning(PRESETS, incomplete)
+    return beginning(PRESET_NAMES, incomplete)
 
 
 def states(incomplete: str) -> list[str]:
     """Return states of a simulated face."""
-    from rigsim.subject import STATES
+    from rigsim.subject import STATE_NAMES
 
-    return beginning(STATES, incomplete)
+    return beginning(STATE_NAMES, incomplete)
 
 
 def conditions(incomplete: str) -> list[str]:
     """Return conditions of a simulated face."""
-    from rigsim.population.conditions import CONDITIONS
+    from rigsim.population.conditions import CONDITION_NAMES
 
-    return beginning(CONDITIONS, incomplete)
+    return beginning(CONDITION_NAMES, incomplete)
 
 
 def stages(incomplete: str) -> list[str]:

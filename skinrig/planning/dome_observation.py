@@ -80,7 +80,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     rig
         The dome as drawn.
     subject
-        Preset of the face, see `rigsim.subject.PRESETS`.
+        Preset of the face, see `rigsim.subject.PRESET_NAMES`.
     seed
         Of the face and of the points.
     points
@@ -93,7 +93,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     from rigsim.sensor import sensor_of
 
     points = POINTS if points is None else points
-    face = subject_file.named(subject).face(seed=seed, size=TEXELS)
+    face = subject_file.load_subject(subject).face(seed=seed, size=TEXELS)
     texels = np.flatnonzero(face.atlas.covered & (face.hair < 0.5))
     along_u, along_v = face.atlas.texel_mm()
     area = (along_u * along_v).reshape(-1)[texels]
@@ -176,11 +176,11 @@ def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: flo
 
 def _averaged(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
     """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
-    from rigsim.light.lateral import spread_light
+    from rigsim.light.lateral import scatter_laterally
 
     covered = atlas.covered[..., None]
     field = np.where(covered, r_d, 0.0).astype(np.float32)
-    spread = spread_light(field, atlas, [sigma_mm], np.ones((field.shape[-1], 1)))
+    spread = scatter_laterally(field, atlas, [sigma_mm], np.ones((field.shape[-1], 1)))
     return np.asarray(spread.reshape(-1, field.shape[-1]), np.float64)
 
 

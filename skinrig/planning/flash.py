@@ -100,7 +100,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     rig
         The flash rig.
     subject, seed
-        The face, see `rigsim.subject.PRESETS`.
+        The face, see `rigsim.subject.PRESET_NAMES`.
     width_px
         Pixels across; fewer see the same face with the same noise a pixel.
     """
@@ -114,7 +114,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
     view = small.views[0]
     scene = FlashScene(
-        small, subject_file.named(subject).face(seed=seed, size=TEXTURE_PX), seed=seed
+        small, subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_PX), seed=seed
     )
     truth = scene.truth()
     chip = sensor_of(view)

@@ -101,15 +101,15 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
         Pixels across.
     """
     from model.metrics import angular_error_rad
-    from rigsim.as_built.sphere import as_drawn
+    from rigsim.as_built.sphere import nominal_sphere
     from rigsim.population import files as subject_file
     from rigsim.scenes.gradient.scene import GradientScene
     from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
 
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
     size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
-    skin = subject_file.named(subject).patch("forehead", seed=seed, size_mm=size_mm)
-    sphere = as_drawn(small)
+    skin = subject_file.load_subject(subject).patch("forehead", seed=seed, size_mm=size_mm)
+    sphere = nominal_sphere(small)
     scene = GradientScene(small, skin, sphere=sphere, seed=seed)
     rates = {
         (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)

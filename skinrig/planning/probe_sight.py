@@ -56,7 +56,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE
     from rigsim.as_built.probe import SPOT_RADIUS_PX
     from rigsim.fiber.probe_profile import Profiles
     from rigsim.population import files as subject_file
-    from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
+    from rigsim.scenes.probe.scene import DARK_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
     from rigsim.sensor import sensor_of
     from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
     from skinrig.simulating.probe import TRUTH_PHOTONS
@@ -79,9 +79,9 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE
         block.per_mm2,
         block.stderr / block.per_mm2,
         block.common,
-        METER_RATE_PER_S * np.asarray(white, np.float64),
+        PROBE_METER_RATE_PER_S * np.asarray(white, np.float64),
         area * np.array([0.25, 0.5, 0.25]),
-        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING),
+        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=LENS_VIGNETTING),
         rig.probe,
     )
 

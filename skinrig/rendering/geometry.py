@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
-from rigsim.geometry.atlas import Atlas, spread, unwrap
+from rigsim.geometry.atlas import Atlas, dilate_texture, unwrap
 from rigsim.geometry.mesh import Mesh, MeshError, MeshFileError, build_mesh, load_mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.rendering.lookup_kernels import look_up
@@ -344,7 +344,7 @@ def unit(vectors: ArrayLike) -> Float32Array:
 def _frames(atlas: Atlas) -> Float64Array:
     """Return the tangents along u and v and the normal, as rows, shape (N, N, 3, 3)."""
     layers = np.concatenate([atlas.dp_du_mm, atlas.dp_dv_mm, atlas.normal], axis=-1)
-    wide = spread(layers, atlas.covered, steps=FRAME_DILATION_STEPS)
+    wide = dilate_texture(layers, atlas.covered, steps=FRAME_DILATION_STEPS)
     return wide.reshape(atlas.size, atlas.size, 3, 3).astype(np.float64)
 
 

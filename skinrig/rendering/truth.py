@@ -14,10 +14,10 @@ import numpy as np
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
-from rigsim.geometry.atlas import spread
+from rigsim.geometry.atlas import dilate_texture
 from rigsim.light import surface_brdf
 from rigsim.scenes.dome.scene import DomeScene
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light
 
@@ -56,7 +56,7 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     SkinReflectance
         With brows and lashes; its translucency is 1 mm and means nothing.
     """
-    if not isinstance(scene.subject, Subject):
+    if not isinstance(scene.subject, SimulatedSubject):
         raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
     surface, atlas = scene.surface(scene.rig.view(view)), scene.subject.atlas
     at = (surface.roughness - TRUE_ROUGHNESS_NODES[0]) / (
@@ -73,7 +73,7 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     count = covered.reshape(size, binning, size, binning).sum(axis=(1, 3))
     total = np.where(covered[..., None], values, 0.0).reshape(size, binning, size, binning, -1)
     mean = total.sum(axis=(1, 3)) / np.maximum(count, 1)[..., None]
-    wide = spread(mean.astype(np.float32), count > 0)
+    wide = dilate_texture(mean.astype(np.float32), count > 0)
     length = np.linalg.norm(wide[..., 3:6], axis=-1, keepdims=True)
     return SkinReflectance(
         r_d=wide[..., :3],

@@ -113,10 +113,12 @@ def _asked(order: DomeOrder, rig: Rig) -> dict[str, Any]:
 
 def _check_state(order: DomeOrder) -> None:
     """Raise for a state that no face has."""
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
-    if order.state not in STATES:
-        raise SimulationError(f"state: got {order.state!r}, expected one of {', '.join(STATES)}")
+    if order.state not in STATE_NAMES:
+        raise SimulationError(
+            f"state: got {order.state!r}, expected one of {', '.join(STATE_NAMES)}"
+        )
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
@@ -268,9 +270,9 @@ def _rig(order: DomeOrder) -> Rig:
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-    from rigsim.scenes.dome.targets import PLACES, plate_normals
+    from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals
 
-    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
+    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else TARGET_POSES
     return dome_calibration_plan(
         rig,
         cast(DomeTarget, target),
@@ -300,7 +302,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         person = one.face(TEXTURE_TEXELS)
         conditions = dict(one.applied) | conditions
     else:
-        subject = subject_file.named(order.subject)
+        subject = subject_file.load_subject(order.subject)
         person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
@@ -336,12 +338,12 @@ def _light_of_skin(order: DomeOrder) -> dict[str, Any]:
 def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
     from rigsim.scanner.pods import Scanner, scan_face, wrap_template
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
     scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
-        rng = np.random.default_rng([order.seed, 7, STATES.index(order.state)])
+        rng = np.random.default_rng([order.seed, 7, STATE_NAMES.index(order.state)])
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
         scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)

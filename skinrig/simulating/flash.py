@@ -21,11 +21,13 @@ def simulate_flash(order: FlashOrder) -> Simulated:
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states
     if target is None:
-        from rigsim.subject.perfusion import STATES
+        from rigsim.subject.perfusion import STATE_NAMES
 
-        unknown = [state for state in states if state not in STATES]
+        unknown = [state for state in states if state not in STATE_NAMES]
         if unknown:
-            raise SimulationError(f"state: got {unknown[0]!r}, expected one of {', '.join(STATES)}")
+            raise SimulationError(
+                f"state: got {unknown[0]!r}, expected one of {', '.join(STATE_NAMES)}"
+            )
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
@@ -84,7 +86,7 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     if order.target is not None:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
-    person = subject_file.named(order.subject).face(seed=seed, mesh=order.mesh)
+    person = subject_file.load_subject(order.subject).face(seed=seed, mesh=order.mesh)
     person = person.moved_by(_stance_mm(rig, order.nearer_mm))
     return {
         state: FlashScene(

@@ -130,7 +130,9 @@ def make_scene(
         angle_deg=angles.pop() if len(angles) == 1 else None,
         shift_mm=MAX_SHIFT_MM,
     )
-    skin = subject_file.named(subject).patch(site or DEFAULT_SITE, seed=seed, size_mm=size_mm)
+    skin = subject_file.load_subject(subject).patch(
+        site or DEFAULT_SITE, seed=seed, size_mm=size_mm
+    )
     on_s = None if plan is None else longest_on_s(plan)
     return GradientScene(
         rig,

@@ -58,11 +58,11 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     """Simulate a sequence with the flash rig; see `simulation.simulate`."""
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
     from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 
-    if sequence.state not in STATES or sequence.state == "neutral":
-        expected = ", ".join(state for state in STATES if state != "neutral")
+    if sequence.state not in STATE_NAMES or sequence.state == "neutral":
+        expected = ", ".join(state for state in STATE_NAMES if state != "neutral")
         raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")
     width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
     rig = load_rig("flash").resized(width)
@@ -92,7 +92,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     texels = (
         TEXTURE_TEXELS_BY_WIDTH[0] if width <= MAX_COARSE_WIDTH_PX else TEXTURE_TEXELS_BY_WIDTH[1]
     )
-    subject = subject_file.named(order.subject)
+    subject = subject_file.load_subject(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
     if order.progress is not None:

@@ -162,7 +162,7 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
     from rigsim.population import files as subject_file
     from rigsim.scenes.flash.scene import FlashScene
 
-    scene = FlashScene(rig, subject_file.named(subject).face(seed=seed), seed=seed)
+    scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
     scene.radiance("crossed")
     return scene
@@ -173,7 +173,7 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
     from rigsim.population import files as subject_file
     from rigsim.scenes.dome.scene import DomeScene
 
-    person = subject_file.named(subject).face(seed=seed)
+    person = subject_file.load_subject(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
@@ -189,7 +189,7 @@ def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
     except probe_tissue.TissueError as error:
         raise SimulationError(str(error)) from error
     skin = ProbeScene(rig, tissue, seed=seed, photons=PROBE_PHOTONS)
-    block = ProbeScene(rig, probe_tissue.PHANTOM, seed=seed, photons=PROBE_PHOTONS)
+    block = ProbeScene(rig, probe_tissue.PHANTOM_BLOCK, seed=seed, photons=PROBE_PHOTONS)
     # the photons of the usual places are traced before anybody asks: the box holds the head on the
     # skin meanwhile, and waits for its host for some seconds only
     for site in (*PROBE_SITES, PHANTOM_SITE):

@@ -57,7 +57,7 @@ def assigned(
     members
         The population.
     conditions
-        Of `rigsim.population.conditions.CONDITIONS`; "normal" is nothing.
+        Of `rigsim.population.conditions.CONDITION_NAMES`; "normal" is nothing.
     amounts
         Range of even draws.
     rng

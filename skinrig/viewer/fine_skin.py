@@ -14,7 +14,7 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.map_filling import filled
 
 if TYPE_CHECKING:
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
 
 
 PERSON_PX: Final = 512
@@ -28,13 +28,13 @@ class FineSkin:
 
     Parameters
     ----------
-    person : rigsim.subject.Subject
+    person : rigsim.subject.SimulatedSubject
         At rest.
     size : int
         Texels a side, at least the person's.
     """
 
-    def __init__(self, person: Subject, size: int) -> None:
+    def __init__(self, person: SimulatedSubject, size: int) -> None:
         """Lay out the surface."""
         from rigsim.geometry.atlas import unwrap
         from rigsim.subject import face_regions

@@ -13,7 +13,7 @@ from skinrig.viewer.scene import MAX_TEXTURE_PX, SceneError, SceneSource, Viewer
 
 if TYPE_CHECKING:
     from rigsim.geometry.mesh import Mesh
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
 
 DEFAULT_PRESET = "III"
 """Skin type of faces of whom nothing else is known."""
@@ -30,7 +30,7 @@ def scene(
     Parameters
     ----------
     preset
-        One of `rigsim.subject.PRESETS`.
+        One of `rigsim.subject.PRESET_NAMES`.
     size
         Texels a side of the textures, 64 to 4096.
     seed
@@ -69,7 +69,7 @@ def check_size(size: int) -> None:
         raise SceneError(f"size: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX} texels")
 
 
-def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> Subject:
+def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> SimulatedSubject:
     """Return the simulated person that wears a mesh, or the procedural head, coarsely."""
     from rigsim.subject import make_subject
 
@@ -97,7 +97,7 @@ def load_mesh(path: Path) -> Mesh:
     return centered(build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes))
 
 
-def viewer_mesh(subject: Subject) -> ViewerMesh:
+def viewer_mesh(subject: SimulatedSubject) -> ViewerMesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
     rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}

@@ -19,7 +19,7 @@ from skinrig.arrays import Float32Array, Int32Array
 
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
     from skinrig.viewer.fine_skin import FineSkin
 
 Storage = Literal["u8", "u16", "f16", "f32"]
@@ -166,7 +166,7 @@ class SceneSource:
     mesh: ViewerMesh
     size: int
     seed: int = 0
-    subject: Subject | None = None
+    subject: SimulatedSubject | None = None
     skin: FineSkin | None = None
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)

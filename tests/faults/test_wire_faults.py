@@ -9,7 +9,7 @@ from capture.devices.flash import FlashBox
 from capture.devices.port import LinkLost, Port, PortTimeout, WrongDevice
 from capture.rig import load_rig
 from rigsim.world import World
-from rigsim.world.faults import CATALOGUE, Faults
+from rigsim.world.faults import FAULT_CATALOG, Faults
 from rigsim.world.serve import serve
 
 RIG = load_rig("flash").resized(16)
@@ -135,8 +135,8 @@ def test_a_box_whose_cable_was_put_back_is_found_again_under_another_name(world)
 
 
 def test_every_fault_of_a_flash_box_or_camera_has_its_switch():
-    assert [kind.number for kind in CATALOGUE] == list(range(1, 21))
-    fields = {"latency", "baud", *(name for kind in CATALOGUE for name in kind.switches)}
+    assert [kind.number for kind in FAULT_CATALOG] == list(range(1, 21))
+    fields = {"latency", "baud", *(name for kind in FAULT_CATALOG for name in kind.switches)}
     assert fields | {"interlock"} == set(Faults.__dataclass_fields__)
     tried = {number for number, _, _ in ON_THE_LINE}
     # 11, 13, 14, 15 and 17 to 20 have tests of their own

@@ -10,7 +10,7 @@ from fixtures.framed_bench import ANY, SHARED_COMMANDS
 from capture.devices import wire
 from capture.devices.wire import Code, Request
 from capture.rig import load_rig
-from rigsim.boxes.caliper import CONTROL_S, CaliperUnit
+from rigsim.boxes.caliper import CALIPER_CONTROL_PERIOD_S, CaliperUnit
 from rigsim.world import World
 from rigsim.world.faults import Faults
 from rigsim.world.taped_skin import TapedSkin, TapeMechanics
@@ -161,7 +161,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
     assert (limits["step_min"], limits["step_max"]) == (caliper.first_step, caliper.last_step)
     assert (limits["step_mm"], limits["aperture_mm"]) == (0.8, 8.0)
     assert limits["angles_deg"] == [0.0, 45.0, 90.0, 135.0]
-    assert limits["control_period_ms"] == 1e3 * CONTROL_S
+    assert limits["control_period_ms"] == 1e3 * CALIPER_CONTROL_PERIOD_S
     assert not any("default" in name for name in limits)
 
 
@@ -342,7 +342,11 @@ def test_a_force_at_its_limit_turns_the_jaws_back(bench, step, limit_n):
     assert (end, stands) == ("FORCE", "0")
     over_n = abs(float(newton)) - limit_n
     slope_n_per_mm = 0.7 * np.exp(5.0 * 0.25) / 8.0
-    assert -5e-4 <= over_n <= slope_n_per_mm * RIG.caliper.speed_mm_per_s * CONTROL_S + 5e-4
+    assert (
+        -5e-4
+        <= over_n
+        <= slope_n_per_mm * RIG.caliper.speed_mm_per_s * CALIPER_CONTROL_PERIOD_S + 5e-4
+    )
     assert np.sign(float(newton)) == np.sign(step)
     trip_mm, trip_n, _ = bench.events("CAL:FORC:TRIP")[0].split(",")
     assert (trip_mm, trip_n) == (mm, newton)
@@ -416,7 +420,10 @@ def test_a_stall_is_noticed_within_its_lag(make):
     _, end, _, mm, _, t_us = move(bench, 4)
     assert end == "STALL"
     seen_s = 1e-6 * int(t_us) - begin
-    assert seen_s <= (float(mm) - 8.0 + 0.05) / RIG.caliper.speed_mm_per_s + CONTROL_S + 1e-6
+    assert (
+        seen_s
+        <= (float(mm) - 8.0 + 0.05) / RIG.caliper.speed_mm_per_s + CALIPER_CONTROL_PERIOD_S + 1e-6
+    )
 
 
 def test_a_home_mark_that_is_never_seen_ends_at_the_end_of_the_travel(make):

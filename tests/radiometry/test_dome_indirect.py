@@ -9,7 +9,7 @@ import pytest
 from capture.rig import Rig, load_rig
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.interreflection import SkinBounce
+from rigsim.light.interreflection import Interreflection
 from rigsim.needs.effects import SceneEffects
 from rigsim.render import Caster
 from rigsim.scenes.dome import reference as dome_reference
@@ -65,11 +65,11 @@ def test_patches_of_a_flat_plate_exchange_nothing_and_of_a_groove_no_more_than_a
     square = np.array([[0, 0, 0], [40, 0, 0], [40, 40, 0], [0, 40, 0]], float)
     wall = square[:, [2, 1, 0]] - [0.01, 0.0, 0.0]  # vertices in one place share their normals
     flat = build_mesh(square, [[0, 1, 2], [0, 2, 3]], [[0, 0], [0.5, 0], [0.5, 1], [0, 1]])
-    assert SkinBounce(Caster(flat), patches=16).exchange.nnz == 0
+    assert Interreflection(Caster(flat), patches=16).exchange.nnz == 0
     uv = [[0, 0], [0.45, 0], [0.45, 1], [0, 1], [0.55, 0], [1, 0], [1, 1], [0.55, 1]]
     faces = [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]]
     groove = build_mesh(np.concatenate([square, wall]), faces, uv)
-    bounce = SkinBounce(Caster(groove), patches=32)
+    bounce = Interreflection(Caster(groove), patches=32)
     rows = np.asarray(bounce.exchange.sum(axis=1)).ravel()
     assert rows.max() < 0.5
     assert 0.75 * 0.2 < rows.mean() < 0.9 * 0.2

@@ -410,7 +410,7 @@ def test_ignoring_exit_polarization_fails_the_bound_that_the_correction_meets():
 @pytest.mark.parametrize("kind", ["sensor", "polarization", "color"])
 def test_targets_captured_by_the_whole_rig_calibrate_to_the_truth(kind, tmp_path):
     """Through boxes, camera, session and disk at 384 pixels: the truth within 5 stated errors."""
-    from rigsim.as_built.polarizers import films_of
+    from rigsim.as_built.polarizers import draw_polarizers
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.simulating.simulation import simulate_session
 
@@ -426,7 +426,7 @@ def test_targets_captured_by_the_whole_rig_calibrate_to_the_truth(kind, tmp_path
             found = get(serial, name)
             assert (np.abs(found.value - getattr(truth, name)) < 5 * found.stderr).all(), name
     elif kind == "polarization":
-        films = films_of(rig)
+        films = draw_polarizers(rig)
         zero, leak = get(serial, "analyser_zero_rad"), get(serial, "leak")
         assert abs(zero.value + np.deg2rad(films.analyser_zero_deg)) < 5 * zero.stderr
         least = 1 / films.light_extinction + 1 / films.analyser_extinction

@@ -16,7 +16,7 @@ from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from rigsim import shading
-from rigsim.as_built.polarizers import Films
+from rigsim.as_built.polarizers import Polarizers
 from rigsim.as_built.sphere import build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.gradient.scene import GradientScene
@@ -29,7 +29,7 @@ SEED = 3
 WIDTH_PX = 1024  # the whole field with pixels of 11 um: a quarter of the work
 RIG = load_rig("gradient").resized(WIDTH_PX)
 DEAD = tuple(f"G{k:03d}" for k in range(4, 132, 10))  # a tenth
-FILMS = Films(2200.0, 3100.0, 0.6)
+FILMS = Polarizers(2200.0, 3100.0, 0.6)
 
 
 def shots_of(scene, *, series=BALL_SERIES, flat=True, seed=0, turned_deg=0.0):

@@ -14,11 +14,11 @@ from rigsim.as_built.dome import BuiltDome
 from rigsim.scenes.exposing import LitLight, full_power_s
 from rigsim.sensor import Sensor, expose
 
-POWER_DEVIATION: Final = 0.001
+LED_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
 
 KEPT_FRAMES: Final = 16
-KEPT_BYTES: Final = 2**28
+KEPT_FRAME_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
@@ -83,7 +83,7 @@ class Exposures:
         light = np.zeros((view.height_px, view.width_px, 3), np.float32)
         for pulse in pops:
             on_s = full_power_s(pulse, f"LED {pulse.led}")
-            energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            energy = on_s * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
             if energy > 0.0:
                 middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
                 led = self._dome.answering(pulse.led)
@@ -96,7 +96,7 @@ class Exposures:
         key = (view.name, light, t_s)
         if key not in self._frames:
             # a capture comes back to each light in its next pass
-            most = max(KEPT_FRAMES, KEPT_BYTES // (12 * view.width_px * view.height_px))
+            most = max(KEPT_FRAMES, KEPT_FRAME_BYTES // (12 * view.width_px * view.height_px))
             while len(self._frames) >= most:
                 self._frames.popitem(last=False)
             self._frames[key] = render(view, light, t_s)

@@ -17,13 +17,13 @@ import numpy as np
 
 from capture.rig import Rig, View, load_rig
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.geometry.atlas import spread
+from rigsim.geometry.atlas import dilate_texture
 from rigsim.light.plastic import plastic_scale
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.needs.effects import SceneEffects
 from rigsim.render import MovedLight, look_at, radiance
 from rigsim.scenes.dome.scene import DomeScene
-from rigsim.subject import Subject, make_subject
+from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.tissue.skin_layers import ETA
 
 Integrator = Literal["path", "direct"]
@@ -58,7 +58,7 @@ class Comparison:
         return way.seconds / self.ours.seconds * min(1.0, (way.error / self.ours.error) ** 2)
 
 
-def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subject:
+def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> SimulatedSubject:
     """Return a face whose normals are those of its mesh: without pores and wrinkles."""
     face = make_subject(preset, seed=seed, size=size)
     return dataclasses.replace(face, normal=face.atlas.normal)
@@ -71,7 +71,12 @@ class DirectScene(DomeScene):
     """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
 
     def __init__(
-        self, rig: Rig, subject: Subject, *, effects: SceneEffects = DIRECT_LIGHT, **settings: Any
+        self,
+        rig: Rig,
+        subject: SimulatedSubject,
+        *,
+        effects: SceneEffects = DIRECT_LIGHT,
+        **settings: Any,
     ) -> None:
         super().__init__(rig, subject, effects=effects, **settings)
 
@@ -134,7 +139,7 @@ def compare(
     reference = np.stack([_per_steradian(fine_scene, k) for k in chosen])
     theirs = {
         name: MovedLight(describe(fine_scene, view, name, sampler=sampler), kind="rgb")
-        for name in _INTEGRATORS
+        for name in _INTEGRATOR_SETTINGS
     }
     del fine_scene
     samples = subpixels**2
@@ -207,7 +212,7 @@ def mitsuba_image(
     return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
 
 
-_INTEGRATORS: dict[Integrator, dict[str, Any]] = {
+_INTEGRATOR_SETTINGS: dict[Integrator, dict[str, Any]] = {
     "path": {"type": "path", "max_depth": 2},
     "direct": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
 }
@@ -219,7 +224,7 @@ def describe(
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
     subject = _face(scene)
     return _look(view, sampler) | {
-        "integrator": _INTEGRATORS[integrator],
+        "integrator": _INTEGRATOR_SETTINGS[integrator],
         "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
     }
 
@@ -279,13 +284,13 @@ def matt_image(
     return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
 
 
-def _face(scene: DomeScene) -> Subject:
-    if not isinstance(scene.subject, Subject):
+def _face(scene: DomeScene) -> SimulatedSubject:
+    if not isinstance(scene.subject, SimulatedSubject):
         raise TypeError(f"subject: got the target {scene.subject.name!r}, expected a face")
     return scene.subject
 
 
-def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
+def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     """Return our reflection as a blend of Mitsuba's materials, at half its strength.
 
     Its ``plastic`` divides by 1 minus the inner diffuse reflectance and by the index squared; the
@@ -316,7 +321,7 @@ def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
     }
 
 
-def _matt(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
+def _matt(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     """Return the diffuse term behind the boundary, without the mirror that stands on it."""
     r_d = surface.r_d * np.float32(plastic_scale(ETA))
     return {
@@ -329,7 +334,7 @@ def _matt(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
 
 
 def _texture(values: Float32Array, covered: BoolArray) -> dict[str, Any]:
-    filled = np.flipud(spread(values, covered))  # Mitsuba's v runs down the rows
+    filled = np.flipud(dilate_texture(values, covered))  # Mitsuba's v runs down the rows
     return {
         "type": "bitmap",
         "bitmap": filled if filled.ndim == 3 else filled[..., None],

@@ -11,14 +11,14 @@ import numpy as np
 from capture.rig import View
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.geometry.atlas import spread, unwrap
+from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.olat_vector import VectorLight
 from rigsim.render import Caster
 from rigsim.scenes.dome import views as dome_views
 from rigsim.scenes.exposing import SceneError
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
@@ -47,7 +47,7 @@ class DomeRows:
     def __init__(
         self,
         dome: BuiltDome,
-        subject: Subject | Target,
+        subject: SimulatedSubject | Target,
         caster: Caster,
         *,
         motion: HeadMotion | None,
@@ -56,7 +56,7 @@ class DomeRows:
         subpixels: int,
     ) -> None:
         self._dome, self._subject, self._caster = dome, subject, caster
-        self._motion = motion if isinstance(subject, Subject) else None
+        self._motion = motion if isinstance(subject, SimulatedSubject) else None
         self._illuminant, self._optics, self._subpixels = illuminant, optics, subpixels
         self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
         self._vector: dict[tuple[str, float], VectorLight] = {}
@@ -135,7 +135,7 @@ class DomeRows:
             mesh, atlas = self._motion.twitched(subject.mesh, amount), subject.atlas
             caster = Caster(mesh, choice=caster.choice)
             # The relief turns with the surface below it.
-            turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
+            turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
             texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
         return dome_views.at_skin(caster, moved, texture, how), caster
 

@@ -27,16 +27,22 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.geometry.atlas import sample, spread
+from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light import olat, surface_brdf
 from rigsim.light.led_light import white_intensity
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.dome import dome_needs, noise_of
-from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds
-from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
+from rigsim.needs.dome import dome_needs, least_noise
+from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, Noise, SceneEffects
+from rigsim.needs.flash import (
+    INTERREFLECTION_EFFECT,
+    LATERAL_EFFECT,
+    LENS_EFFECT,
+    SPECTRAL_EFFECT,
+    WRINKLE_SHADOW_EFFECT,
+)
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
@@ -44,10 +50,10 @@ from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome import views as dome_views
 from rigsim.scenes.dome.exposures import Exposures, Pulse
 from rigsim.scenes.dome.rows import DomeRows
-from rigsim.scenes.dome.subsurface_radiance import DomeGlow
+from rigsim.scenes.dome.subsurface_radiance import DomeSubsurfaceRadiance
 from rigsim.scenes.exposing import SceneError
 from rigsim.sensor import Sensor, sensor_of
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
@@ -66,7 +72,7 @@ class DomeScene:
     motion
         How the head moves; ``None`` holds it still. Targets stand still.
     state
-        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression
+        State of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its expression
         where the state is one; targets have none.
     movement
         Whether the face moves and wrinkles with the state. A subject that is already posed
@@ -93,7 +99,7 @@ class DomeScene:
     def __init__(
         self,
         rig: Rig,
-        subject: Subject | Target,
+        subject: SimulatedSubject | Target,
         *,
         dome: BuiltDome | None = None,
         motion: HeadMotion | None = None,
@@ -123,11 +129,11 @@ class DomeScene:
         self.dome = dome
         self.rig = dome.rig
         self.conditions = skin_conditions.checked(conditions or {})
-        if isinstance(subject, Subject):
+        if isinstance(subject, SimulatedSubject):
             subject = skin_conditions.conditioned_subject(subject, self.conditions)
         elif self.conditions:
             raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
-        if movement and isinstance(subject, Subject) and subject.pose is None:
+        if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
             subject = subject.posed(state)
         self.subject = subject
         self.state = state
@@ -143,12 +149,12 @@ class DomeScene:
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
         self._exposures = Exposures(dome, seed=seed)
-        self.needs: SceneNeeds = dome_needs(
+        self.needs: EffectSelection = dome_needs(
             rig,
             subject,
             state,
             caster=self._caster,
-            noise=noise_of([Noise.of(sensor) for sensor in self._sensors.values()]),
+            noise=least_noise([Noise.of(sensor) for sensor in self._sensors.values()]),
             white_rgb=None if on_s is None else on_s * self._white_in_origin(),
             movement=movement,
             motion=motion,
@@ -156,22 +162,22 @@ class DomeScene:
             subpixels=subpixels,
         )
         """What is built, what is not, and why."""
-        self.interreflections = self.needs.builds(BOUNCES)
-        self.subsurface = self.needs.builds(LATERAL)
-        self.optics = self.needs.builds(LENS)
+        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
+        self.subsurface = self.needs.builds(LATERAL_EFFECT)
+        self.optics = self.needs.builds(LENS_EFFECT)
         self._relief: ReliefShadow | None = None
-        if isinstance(subject, Subject) and self.needs.builds(WRINKLES):
+        if isinstance(subject, SimulatedSubject) and self.needs.builds(WRINKLE_SHADOW_EFFECT):
             self._relief = ReliefShadow(subject)
-        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
-        self._glow: DomeGlow | None = None
-        if isinstance(subject, Subject) and (self.subsurface or self.interreflections):
-            self._glow = DomeGlow(
+        summed = flash_needs.last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
+        self._glow: DomeSubsurfaceRadiance | None = None
+        if isinstance(subject, SimulatedSubject) and (self.subsurface or self.interreflections):
+            self._glow = DomeSubsurfaceRadiance(
                 subject,
                 self._caster,
                 illuminant=self._illuminant,
                 subsurface=self.subsurface,
                 interreflections=self.interreflections,
-                spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                spectral=self.interreflections and self.needs.builds(SPECTRAL_EFFECT),
                 enough=summed if effects.last_bounce is None else effects.last_bounce,
                 relief=self._relief,
             )
@@ -378,8 +384,8 @@ class DomeScene:
 
     # inside -----------------------------------------------------------------------------------
 
-    def _face(self) -> Subject:
-        if not isinstance(self.subject, Subject):
+    def _face(self) -> SimulatedSubject:
+        if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
         return self.subject
 
@@ -406,7 +412,7 @@ class DomeScene:
         if camera not in self._textures:
             atlas, surface = self._face().atlas, self.surface(view)
             layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
-            self._textures[camera] = spread(layers, atlas.covered)
+            self._textures[camera] = dilate_texture(layers, atlas.covered)
         return self._textures[camera]
 
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
@@ -420,11 +426,11 @@ class DomeScene:
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
         glow = None
-        if self._glow is not None and hits.kind == olat.SKIN:
+        if self._glow is not None and hits.kind == olat.SKIN_ROWS:
             glow = self._glow.on_rows(hits, lamp, view, self.surface, light=light, t_s=t_s)
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
-        if hits.kind == olat.SKIN and caster.scene is not None:
+        if hits.kind == olat.SKIN_ROWS and caster.scene is not None:
             rows = self._rows.vector_light(view, t_s, hits, caster)
             return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
         visible = olat.seen_from(hits, caster, lamp)
@@ -432,9 +438,9 @@ class DomeScene:
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return which part of a light the texture's relief leaves to each row."""
-        if self._relief is None or hits.kind != olat.SKIN:
+        if self._relief is None or hits.kind != olat.SKIN_ROWS:
             return None
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
         return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
 

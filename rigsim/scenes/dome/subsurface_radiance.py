@@ -13,13 +13,13 @@ from capture.rig import View
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import sample
 from rigsim.light import olat
-from rigsim.light.interreflection import SkinBounce, bounce_on
-from rigsim.light.lateral_scattering import SkinBleeding
+from rigsim.light.interreflection import Interreflection, interreflection_for
+from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.render import Caster
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 
 Float16Array = NDArray[np.float16]
 
@@ -31,7 +31,7 @@ HALF_RANGE: Final = 1000.0
 """Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
 
 
-class DomeGlow:
+class DomeSubsurfaceRadiance:
     """What leaves the interior of one face besides what its own points send back.
 
     Parameters
@@ -56,7 +56,7 @@ class DomeGlow:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: SimulatedSubject,
         caster: Caster,
         *,
         illuminant: str,
@@ -69,8 +69,8 @@ class DomeGlow:
         self._subject, self._caster, self._illuminant = subject, caster, illuminant
         self._subsurface, self._interreflections = subsurface, interreflections
         self._spectral, self._enough, self._relief = spectral, enough, relief
-        self._bounce: SkinBounce | None = None
-        self._bleeding: dict[str, SkinBleeding] = {}
+        self._bounce: Interreflection | None = None
+        self._bleeding: dict[str, LateralScattering] = {}
         self._kept: OrderedDict[tuple[str, int, float], tuple[np.float32, Float16Array]] = (
             OrderedDict()
         )
@@ -109,8 +109,8 @@ class DomeGlow:
         camera = view.spectral_sensitivity
         if camera not in self._bleeding:
             if self._interreflections and self._bounce is None:
-                self._bounce = bounce_on(self._caster)
-            self._bleeding[camera] = SkinBleeding(
+                self._bounce = interreflection_for(self._caster)
+            self._bleeding[camera] = LateralScattering(
                 self._subject,
                 surface(view),
                 self._caster,
@@ -132,5 +132,5 @@ class DomeGlow:
             self._kept[key] = unit, np.asarray(glow / unit, np.float16)
         self._kept.move_to_end(key)
         unit, kept = self._kept[key]
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
         return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))

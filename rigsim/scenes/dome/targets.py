@@ -1,8 +1,9 @@
 """Calibration targets in the dome: a ChArUco board, mirror balls, a white plate.
 
 An operator puts the target into one place after the other; `TargetScene.show` is that hand. Places
-are drawn near those of `PLACES`: nobody holds a board to a tenth of a millimetre. Only the first
-place is exact: a jig holds the board in the rig's origin, facing +z, and so defines the rig frame.
+are drawn near those of `TARGET_POSES`: nobody holds a board to a tenth of a millimetre. Only the
+first place is exact: a jig holds the board in the rig's origin, facing +z, and so defines the rig
+frame.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.light.led_light import lobe_exponent, white_intensity
-from rigsim.needs.effects import Effect, Noise, SceneNeeds, absent, decide, unmodeled
-from rigsim.scenes.dome.exposures import Pulse
+from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
+from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION, Pulse
 from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
@@ -31,8 +32,6 @@ WHITE_SLOPE_DEG: Final = 0.05
 """RMS slope of the white plate's surface in each direction."""
 LED_SIZES: Final = 2e-4
 """By how much light of an LED's disc differs from that of its middle, relative, at most."""
-POWER_DEVIATION: Final = 0.001
-"""Relative standard deviation of an LED's energy from pulse to pulse."""
 
 BOARD_PLACES: Final = (
     (0, 0, 0, 0, 0, 0),
@@ -71,15 +70,15 @@ BALL_PLACES: Final = (
 )
 """Middle of the ball, mm."""
 
-PLACES: Final[dict[str, int]] = {
+TARGET_POSES: Final[dict[str, int]] = {
     "charuco": len(BOARD_PLACES),
     "mirror": len(BALL_PLACES),
     "white": len(PLATE_PLACES),
 }
 """How many places each target has."""
 
-HAND_MM: Final = 3.0
-HAND_DEG: Final = 2.0
+PLACEMENT_DEVIATION_MM: Final = 3.0
+PLACEMENT_DEVIATION_DEG: Final = 2.0
 """Standard deviations of where an operator puts a target."""
 
 
@@ -118,14 +117,14 @@ class TargetScene:
             if kind == "white"
             else printed_plate.charuco_board()
         )
-        self._hand = rng.standard_normal((max(PLACES.values()), 6))
+        self._hand = rng.standard_normal((max(TARGET_POSES.values()), 6))
         self._rays: dict[str, Float64Array] = {}
         lights = self.rig.lights
         self._lamp_mm = np.array([light.position_mm for light in lights])
         self._exponent = np.array([lobe_exponent(light) for light in lights])
 
     @property
-    def needs(self) -> SceneNeeds:
+    def needs(self) -> EffectSelection:
         """What is built, what is not, and why."""
         noise = Noise.of(sensor_of(self.rig.views[0]))
         sizes = noise.share(LED_SIZES)
@@ -156,7 +155,7 @@ class TargetScene:
                 ]
             ),
         ]
-        return SceneNeeds(tuple(effects))
+        return EffectSelection(tuple(effects))
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -165,8 +164,8 @@ class TargetScene:
 
     def show(self, pose: int) -> None:
         """Put the target into its place number ``pose``."""
-        if not 0 <= pose < PLACES[self.kind]:
-            raise TargetError(f"pose: got {pose}, expected 0 to {PLACES[self.kind] - 1}")
+        if not 0 <= pose < TARGET_POSES[self.kind]:
+            raise TargetError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
         self.pose = pose
 
     def exposure(
@@ -199,7 +198,7 @@ class TargetScene:
             light = self.dome.answering(pulse.led)
             if self.rig.lights[light].name not in self.dome.dead:
                 energy = pulse.level * (pulse.t_off_s - pulse.t_on_s)
-                on_s[light] += energy * (1.0 + POWER_DEVIATION * rng.standard_normal())
+                on_s[light] += energy * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
         return expose(
             self.light(view_name, on_s), sensor=sensor_of(view), rng=rng, exposure_s=exposure_s
         )
@@ -253,7 +252,14 @@ class TargetScene:
         values = np.array(places[number], np.float64)
         if number > 0 or self.kind == "white":
             hand = self._hand[number]
-            values = values + hand * [HAND_DEG, HAND_DEG, HAND_DEG, HAND_MM, HAND_MM, HAND_MM]
+            values = values + hand * [
+                PLACEMENT_DEVIATION_DEG,
+                PLACEMENT_DEVIATION_DEG,
+                PLACEMENT_DEVIATION_DEG,
+                PLACEMENT_DEVIATION_MM,
+                PLACEMENT_DEVIATION_MM,
+                PLACEMENT_DEVIATION_MM,
+            ]
         azimuth, elevation, turn = np.radians(values[:3])
         front = np.array(
             [
@@ -272,7 +278,7 @@ class TargetScene:
     def ball_mm(self, pose: int | None = None) -> Float64Array:
         """Return the middle of the mirror ball."""
         number = self.pose if pose is None else pose
-        return np.array(BALL_PLACES[number]) + HAND_MM * self._hand[number, :3]
+        return np.array(BALL_PLACES[number]) + PLACEMENT_DEVIATION_MM * self._hand[number, :3]
 
     def truth(self) -> dict[str, Any]:
         """Return what calibration should find; lengths in mm, rig frame.
@@ -295,7 +301,7 @@ class TargetScene:
             "intensity": intensity * alive[:, None],
             "gain": dict(self.dome.gain),
         }
-        places = range(PLACES[self.kind])
+        places = range(TARGET_POSES[self.kind])
         if self.kind == "mirror":
             out["ball_mm"] = np.array([self.ball_mm(k) for k in places])
         else:
@@ -325,7 +331,7 @@ class TargetScene:
         ball = self.ball_mm()
         cloth = mirror_ball.light_on_cloth(*lamps)
         image = mirror_ball.surroundings(
-            rays, eye, ball, BALL_RADIUS_MM, mirror_ball.REFLECTANCE, cloth, EDGE_SUBPIXELS
+            rays, eye, ball, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE, cloth, EDGE_SUBPIXELS
         )
         for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
             radius = self.rig.lights[index].radius_mm
@@ -340,7 +346,7 @@ class TargetScene:
                     eye,
                     ball,
                     BALL_RADIUS_MM,
-                    mirror_ball.REFLECTANCE,
+                    mirror_ball.CHROMIUM_REFLECTANCE,
                     lamp,
                     axis,
                     float(exponent),

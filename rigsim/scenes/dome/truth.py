@@ -12,13 +12,11 @@ from model.skin import UNITS, SkinAppearance, SkinMap
 from rigsim.light import olat, surface_brdf
 from rigsim.light.olat import Hits
 from rigsim.light.surface_brdf import SkinSurface
+from rigsim.population.population import MAX_SKIN_HAIR
 from rigsim.scenes.dome.views import unit
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 
-HAIR_LIMIT: Final = 0.02
-"""Pixels with more hair than this part are not skin."""
-
-COATING: Final = ("film", "film_alpha", "film_eta", "powder")
+COATING_MAPS: Final = ("film", "film_alpha", "film_eta", "powder")
 """Names of a coating's maps, in the order of `SkinSurface.packed` (`rigsim.light.surface_brdf`)."""
 
 
@@ -29,8 +27,8 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
     maps = hits.scatter(surface)
     hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
     coverage = hits.coverage()
-    uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
-    coating = dict(zip(COATING, np.moveaxis(maps, -1, 0)[7:], strict=False))
+    uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
+    coating = dict(zip(COATING_MAPS, np.moveaxis(maps, -1, 0)[7:], strict=False))
     return {
         **coating,
         "r_d": maps[..., :3],
@@ -41,12 +39,12 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
         "fuzz": maps[..., 5],
         "uv": hits.scatter(uv),
         "hair": hair,
-        "mask": (coverage > 1.0 - 1e-6) & (hair < HAIR_LIMIT),
+        "mask": (coverage > 1.0 - 1e-6) & (hair < MAX_SKIN_HAIR),
     }
 
 
 def appearance_of(
-    subject: Subject,
+    subject: SimulatedSubject,
     surface: SkinSurface,
     *,
     conditions: Mapping[str, float],
@@ -54,7 +52,7 @@ def appearance_of(
     seed: int,
 ) -> SkinAppearance:
     """Return the truth on a face's own texture, see `rigsim.scenes.dome.scene.DomeScene`."""
-    valid = subject.atlas.covered & (subject.hair < HAIR_LIMIT)
+    valid = subject.atlas.covered & (subject.hair < MAX_SKIN_HAIR)
     floor = np.zeros(valid.shape, np.float32)
     floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
     white = "camera RGB over that of a perfect white, without hair"

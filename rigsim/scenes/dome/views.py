@@ -79,7 +79,7 @@ def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
         view,
         look_up,
         subpixels=how.subpixels,
-        kind=olat.METAL if target.kind == "metal" else olat.MATT,
+        kind=olat.METAL_ROWS if target.kind == "metal" else olat.MATT_ROWS,
         distortion=how.distortion,
         illuminant=how.illuminant if how.optics else None,
     )

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
-from rigsim.needs.effects import EFFECTS_BY_SIZE, SceneEffects, SceneNeeds, unmodeled
+from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, SceneEffects, unmodeled
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.flash.scene import POWER_DEVIATION, FlashScene
+from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene
 from rigsim.sensor import expose
-from rigsim.subject import Subject, landmarks
+from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.subject.perfusion_course import Course, with_blood
 
-LEVELS: Final = (0.0, 0.5, 1.0)
+BLOOD_LEVELS: Final = (0.0, 0.5, 1.0)
 """Levels of the blood that are rendered."""
 
 
@@ -67,7 +67,7 @@ class FlashCourseScene:
     def __init__(
         self,
         rig: Rig,
-        subject: Subject,
+        subject: SimulatedSubject,
         course: Course,
         *,
         seed: int = 0,
@@ -87,7 +87,7 @@ class FlashCourseScene:
         self._images: dict[tuple[object, ...], Float32Array] = {}
 
     def at(self, pose: str, level: float) -> FlashScene:
-        """Return the scene of a pose and one of `LEVELS`; all of one pose share what they trace."""
+        """Return the scene of a pose and one of `BLOOD_LEVELS`; those of a pose share rays."""
         shown = pose if self.movement else "neutral"
         key = (shown, level)
         if key not in self._scenes:
@@ -102,11 +102,11 @@ class FlashCourseScene:
         return self._scenes[key]
 
     @property
-    def needs(self) -> SceneNeeds:
+    def needs(self) -> EffectSelection:
         """What is built, what is not, and why."""
         name = "the movement between two expressions"
         between = unmodeled([(name, "the face is in one or the other")])
-        return SceneNeeds((*self.at(self.course.state, 1.0).needs, *between))
+        return EffectSelection((*self.at(self.course.state, 1.0).needs, *between))
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -124,7 +124,7 @@ class FlashCourseScene:
     ) -> Float32Array:
         """Return the light on the sensor at power 1 with blood at any level, shape (H, W, 3)."""
         total = None
-        for node, weight in zip(LEVELS, parabola_weights(level), strict=True):
+        for node, weight in zip(BLOOD_LEVELS, parabola_weights(level), strict=True):
             if weight == 0.0:
                 continue
             key = (pose if self.movement else "", node, polarizer, analyser_deg, view_name)
@@ -149,7 +149,7 @@ class FlashCourseScene:
             if not 0.0 <= power <= 1.0:
                 raise SceneError(f"power: got {power}, expected 0 to 1")
             level, pose = self.course.level(t_s), self.course.pose(t_s)
-            energy = power * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            energy = power * (1.0 + POP_ENERGY_DEVIATION * rng.standard_normal())
             light += np.float32(energy) * self.radiance(
                 pose,
                 level,
@@ -159,7 +159,7 @@ class FlashCourseScene:
             )
             if self._on_flash is not None:
                 self._on_flash(FlashTime(str(pop.token), t_s, level, pose))  # type: ignore[attr-defined]
-        sensor = self.at("neutral", LEVELS[0]).sensor(view_name)
+        sensor = self.at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 
     def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
@@ -170,8 +170,8 @@ class FlashCourseScene:
         dict
             Name to (x, y), px of the sensor, also of points that something stands before.
         """
-        face = self.at(pose, LEVELS[0]).subject
-        if not isinstance(face, Subject):
+        face = self.at(pose, BLOOD_LEVELS[0]).subject
+        if not isinstance(face, SimulatedSubject):
             raise SceneError(f"landmarks: got {face.name!r}, expected a face")
         points = face.surface_landmarks()
         pixels = landmarks.project(points.on(face.mesh), self.rig.views[0])
@@ -179,24 +179,24 @@ class FlashCourseScene:
 
     def hemoglobin(self, pose: str, levels: Sequence[float]) -> Float32Array:
         """Return the true blood seen by the first camera, shape (len(levels), H, W), 0 to 0.32."""
-        nodes = np.stack([self.at(pose, node).truth()["hemoglobin"] for node in LEVELS])
+        nodes = np.stack([self.at(pose, node).truth()["hemoglobin"] for node in BLOOD_LEVELS])
         weights = np.array([parabola_weights(level) for level in levels])
         return np.tensordot(weights, nodes, axes=1).astype(np.float32)
 
     def truth(self, pose: str, level: float) -> Mapping[str, NDArray[np.generic]]:
-        """Return the truth maps of a pose at one of `LEVELS`; see `FlashScene.truth`."""
+        """Return the truth maps of a pose at one of `BLOOD_LEVELS`; see `FlashScene.truth`."""
         return self.at(pose, level).truth()
 
 
 def parabola_weights(level: float) -> tuple[float, float, float]:
-    """Return the weights of what is known at `LEVELS` for a level from 0 to 1; they sum to 1.
+    """Return the weights of what is known at `BLOOD_LEVELS` for a level from 0 to 1; they sum to 1.
 
     Examples
     --------
     >>> parabola_weights(0.25)
     (0.375, 0.75, -0.125)
     """
-    a, b, c = LEVELS
+    a, b, c = BLOOD_LEVELS
     return (
         (level - b) * (level - c) / ((a - b) * (a - c)),
         (level - a) * (level - c) / ((b - a) * (b - c)),

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from capture.rig import Rig, View
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.as_built.polarizers import Films, absorbing_axis
-from rigsim.geometry.atlas import sample, spread
+from rigsim.as_built.polarizers import Polarizers, absorbing_axis
+from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.olat import pixel_order
-from rigsim.light.subsurface_radiance import SkinGlow, spread_through_pigment, toward
+from rigsim.light.subsurface_radiance import SubsurfaceRadiance, spread_through_pigment, toward
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
 from rigsim.render.depth_of_field import LensPicture, LensSpread, before_focus
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
-BAND_RAYS: Final = 1 << 21
+RAYS_PER_BAND: Final = 1 << 21
 """Camera rays worked on at a time; bounds memory at full resolution."""
 
 WHITE_UNIT: Final = np.float32(4.0)
@@ -62,7 +62,7 @@ class Look:
     """The rig."""
     view: View
     """The camera."""
-    films: Films
+    films: Polarizers
     """The polarizing films."""
     weights: Float64Array
     """Energy of each light over the sum that a plate at the origin gets, mm^2."""
@@ -71,7 +71,9 @@ class Look:
     spread: LensSpread | None = None
     """How the lens spreads light; None: it is sharp everywhere."""
 
-    def at_skin(self, caster: Caster, subject: Subject, state: str, glow: SkinGlow) -> Picture:
+    def at_skin(
+        self, caster: Caster, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
+    ) -> Picture:
         """Look at a face.
 
         Parameters
@@ -110,7 +112,7 @@ class Look:
 
     def _in_bands(self, caster: Caster, see: Callable[[GBuffer], Parts]) -> Picture:
         k, view = self.subpixels, self.view
-        rows_per_band = max(1, BAND_RAYS // (view.width_px * k * k))
+        rows_per_band = max(1, RAYS_PER_BAND // (view.width_px * k * k))
         around = 0 if self.spread is None else self.spread.radius
         bands = []
         for top in range(0, view.height_px, rows_per_band):
@@ -138,7 +140,9 @@ class Look:
             diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage, reached
         )
 
-    def blurred_maps(self, subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32Array]:
+    def blurred_maps(
+        self, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
+    ) -> dict[str, Float32Array]:
         """Return the fractions and the reflectance of even skin that would look as the skin looks.
 
         Parameters
@@ -167,7 +171,7 @@ class Look:
         }
 
     def at_maps(
-        self, caster: Caster, subject: Subject, maps: Mapping[str, Float32Array]
+        self, caster: Caster, subject: SimulatedSubject, maps: Mapping[str, Float32Array]
     ) -> Picture:
         """Look at maps of a face without light.
 
@@ -276,7 +280,9 @@ class Look:
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
 
-def _textures(subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32Array]:
+def _textures(
+    subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
+) -> dict[str, Float32Array]:
     """Return what the camera samples from the face's texture, shape (N, N, C) each."""
     layers = {
         "glow": glow.spread,
@@ -295,10 +301,12 @@ def _textures(subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32
     return _fillings(layers, subject)
 
 
-def _fillings(layers: Mapping[str, Float32Array], subject: Subject) -> dict[str, Float32Array]:
+def _fillings(
+    layers: Mapping[str, Float32Array], subject: SimulatedSubject
+) -> dict[str, Float32Array]:
     """Return textures whose borders are filled, so that sampling may blend, (N, N, C) each."""
     covered = subject.atlas.covered
-    return {name: spread(np.atleast_3d(layer), covered) for name, layer in layers.items()}
+    return {name: dilate_texture(np.atleast_3d(layer), covered) for name, layer in layers.items()}
 
 
 def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) -> Float32Array:

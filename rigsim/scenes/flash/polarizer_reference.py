@@ -23,14 +23,14 @@ from rigsim.light.subsurface_radiance import toward
 from rigsim.render import Caster, g_buffer, look_at, radiance
 from rigsim.render.variant import choose_variant
 
-RADIUS_MM: Final = 80.0
+SPHERE_RADIUS_MM: Final = 80.0
 ETA: Final = 1.4
-ALPHA: Final = 0.25
-ALBEDO: Final = 0.5
-INTENSITY: Final = 1e6
+SPHERE_ALPHA: Final = 0.25
+SPHERE_ALBEDO: Final = 0.5
+FLASH_INTENSITY: Final = 1e6
 """Radiant intensity of each flash per steradian before its film."""
 
-ANALYSER_DEG: Final = {"parallel": 90.0, "crossed": 0.0}
+ANALYZER_AXIS_DEG: Final = {"parallel": 90.0, "crossed": 0.0}
 """Passing axis of the analyser; both flashes pass vertical light."""
 
 
@@ -57,7 +57,7 @@ class Comparison:
     @property
     def noise_ratio(self) -> float:
         """How many times smaller the closed forms' error is; the worse of both images."""
-        return min(self.mitsuba_error[k] / self.closed_form_error[k] for k in ANALYSER_DEG)
+        return min(self.mitsuba_error[k] / self.closed_form_error[k] for k in ANALYZER_AXIS_DEG)
 
 
 def polarizer_reference(
@@ -97,7 +97,7 @@ def polarizer_reference(
         between = time.perf_counter()
         theirs = {
             name: mitsuba_image(rig, view, name, samples=samples, seed=seed + k)
-            for k, name in enumerate(ANALYSER_DEG)
+            for k, name in enumerate(ANALYZER_AXIS_DEG)
         }
         closed_form_s = min(closed_form_s, between - start)
         mitsuba_s = min(mitsuba_s, time.perf_counter() - between)
@@ -112,11 +112,11 @@ def polarizer_reference(
     return Comparison(
         closed_form_s=closed_form_s,
         mitsuba_s=mitsuba_s,
-        closed_form_error={name: error(ours[name], name) for name in ANALYSER_DEG},
-        mitsuba_error={name: error(theirs[name], name) for name in ANALYSER_DEG},
+        closed_form_error={name: error(ours[name], name) for name in ANALYZER_AXIS_DEG},
+        mitsuba_error={name: error(theirs[name], name) for name in ANALYZER_AXIS_DEG},
         mean_ratio={
             name: float(theirs[name][whole].mean() / truth[name][whole].mean())
-            for name in ANALYSER_DEG
+            for name in ANALYZER_AXIS_DEG
         },
     )
 
@@ -139,12 +139,18 @@ def closed_forms(
         cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
         entry = shading.entry_transmittance(normal, to_light, eta=ETA, light_absorbs=absorbs)
         lobe = shading.specular_stokes(
-            normal, to_light, to_camera, ALPHA, eta=ETA, light_absorbs=absorbs, image_right=right
+            normal,
+            to_light,
+            to_camera,
+            SPHERE_ALPHA,
+            eta=ETA,
+            light_absorbs=absorbs,
+            image_right=right,
         )
-        inner = np.float32(ALBEDO / math.pi) * cosine * entry
-        stokes += np.float32(INTENSITY) * falloff[:, None] * (lobe + inner[:, None] * leaving)
+        inner = np.float32(SPHERE_ALBEDO / math.pi) * cosine * entry
+        stokes += np.float32(FLASH_INTENSITY) * falloff[:, None] * (lobe + inner[:, None] * leaving)
     images = {}
-    for name, angle in ANALYSER_DEG.items():
+    for name, angle in ANALYZER_AXIS_DEG.items():
         full = np.zeros(buffers.mask.size, np.float32)
         full[inside] = shading.analyse(
             stokes, to_camera, passes_deg=angle, image_right=right, image_up=up
@@ -157,7 +163,10 @@ def closed_forms(
 def mitsuba_image(rig: Rig, view: View, name: str, *, samples: int, seed: int) -> Float32Array:
     """Return one image by Mitsuba's path tracer through polarizing films, shape (H, W)."""
     image = radiance(
-        describe(rig, view, ANALYSER_DEG[name]), kind="mono_polarized", samples=samples, seed=seed
+        describe(rig, view, ANALYZER_AXIS_DEG[name]),
+        kind="mono_polarized",
+        samples=samples,
+        seed=seed,
     )
     return np.asarray(image[..., 0], np.float32)
 
@@ -188,13 +197,13 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
         "analyser": _film(place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg),
         "ball": {
             "type": "sphere",
-            "radius": RADIUS_MM,
+            "radius": SPHERE_RADIUS_MM,
             "bsdf": {
                 "type": "pplastic",
-                "diffuse_reflectance": {"type": "uniform", "value": ALBEDO},
+                "diffuse_reflectance": {"type": "uniform", "value": SPHERE_ALBEDO},
                 "int_ior": ETA,
                 "ext_ior": 1.0,
-                "alpha": ALPHA,
+                "alpha": SPHERE_ALPHA,
                 "distribution": "ggx",
             },
         },
@@ -204,7 +213,7 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
         scene[f"light {light.name}"] = {
             "type": "point",
             "position": where.tolist(),
-            "intensity": {"type": "uniform", "value": INTENSITY},
+            "intensity": {"type": "uniform", "value": FLASH_INTENSITY},
         }
         before = where * (1.0 - 2.0 / float(np.linalg.norm(where)))
         axis_deg = light.polarizer_axis_deg
@@ -219,7 +228,7 @@ def reference_rig(width_px: int) -> tuple[Rig, View]:
 
     rig = load_rig("flash")
     view = rig.views[0]
-    pixel_um = 2.2 * RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3
+    pixel_um = 2.2 * SPHERE_RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3
     square = dataclasses.replace(view, width_px=width_px, height_px=width_px, pixel_um=pixel_um)
     return dataclasses.replace(rig, views=(square,)), square
 
@@ -237,7 +246,7 @@ def sphere_mesh(*, columns: int = 480, rows: int = 240) -> Mesh:
         [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)]
     )
     flat = unit.reshape(-1, 3)
-    return build_mesh(RADIUS_MM * flat, faces, np.clip(uv, 0.0, 1.0), flat)
+    return build_mesh(SPHERE_RADIUS_MM * flat, faces, np.clip(uv, 0.0, 1.0), flat)
 
 
 def _film(place: Any, faces: Any, half_mm: float, passes_deg: float) -> dict[str, Any]:

@@ -21,23 +21,40 @@ from capture.rig import Rig, RigError, View
 from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
-from rigsim.as_built.polarizers import Films, films_of
+from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.subsurface_radiance import SkinGlow, SurfaceLight, light_skin, light_surface
+from rigsim.light.subsurface_radiance import (
+    SubsurfaceRadiance,
+    SurfaceLight,
+    light_skin,
+    light_surface,
+)
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds, strictest
-from rigsim.needs.flash import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
+from rigsim.needs.effects import (
+    EFFECTS_BY_SIZE,
+    EffectSelection,
+    Noise,
+    SceneEffects,
+    merge_selections,
+)
+from rigsim.needs.flash import (
+    INTERREFLECTION_EFFECT,
+    LATERAL_EFFECT,
+    LENS_EFFECT,
+    SPECTRAL_EFFECT,
+    WRINKLE_SHADOW_EFFECT,
+)
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import facing_depths, lens_spread
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash import truth as flash_truth
 from rigsim.scenes.flash.image import Look, Picture
-from rigsim.scenes.flash.stage import stage_of
+from rigsim.scenes.flash.stage import flash_geometry
 from rigsim.sensor import Sensor, expose, sensor_of
-from rigsim.subject import Subject, landmarks
+from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.targets import Target
 
 METER_LEVEL: Final = 0.8
@@ -46,7 +63,7 @@ METER_LEVEL: Final = 0.8
 FLAT_LEVEL: Final = 0.9
 """Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
 
-POWER_DEVIATION: Final = 0.002
+POP_ENERGY_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy from pop to pop."""
 
 
@@ -82,7 +99,7 @@ class FlashScene:
     subject
         A face or a target.
     state
-        State of the face, see `rigsim.subject.perfusion.STATES`: its blood, and its expression
+        State of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its expression
         where the state is one; targets have none.
     movement
         Whether the face moves and wrinkles with the state; else it stays as it is given. A subject
@@ -107,12 +124,12 @@ class FlashScene:
     def __init__(
         self,
         rig: Rig,
-        subject: Subject | Target,
+        subject: SimulatedSubject | Target,
         *,
         state: str = "neutral",
         movement: bool = True,
         sensor: Sensor | None = None,
-        films: Films | None = None,
+        films: Polarizers | None = None,
         seed: int = 0,
         effects: SceneEffects = EFFECTS_BY_SIZE,
         power: float = 1.0,
@@ -128,13 +145,13 @@ class FlashScene:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if not 0.0 < power <= 1.0:
             raise SceneError(f"power: got {power}, expected above 0 to 1")
-        if movement and isinstance(subject, Subject) and subject.pose is None:
+        if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
             subject = subject.posed(state)
         self.rig = rig
         self.subject = subject
         self.state = state
         self.movement = movement
-        self.films = films_of(rig) if films is None else films
+        self.films = draw_polarizers(rig) if films is None else films
         self.seed = seed
         self.subpixels = subpixels
         self._illuminant = rig.lights[0].illuminant
@@ -143,13 +160,13 @@ class FlashScene:
         }
         self._weights = _light_weights(rig)
         self._choice = choice
-        self._stage = stage_of(subject, choice)
+        self._stage = flash_geometry(subject, choice)
         self._caster = self._stage.caster
-        self._glow: dict[str, SkinGlow] = {}
+        self._glow: dict[str, SubsurfaceRadiance] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
         self._spreads: dict[str, Mapping[str, Float32Array]] = {}
-        self.needs: SceneNeeds = strictest(
+        self.needs: EffectSelection = merge_selections(
             [
                 flash_needs.flash_needs(
                     rig,
@@ -169,10 +186,10 @@ class FlashScene:
             ]
         )
         """What is built, what is not, and why."""
-        self.lateral = self.needs.builds(LATERAL)
-        self.interreflections = self.needs.builds(BOUNCES)
-        self.optics = self.needs.builds(LENS)
-        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self.lateral = self.needs.builds(LATERAL_EFFECT)
+        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
+        self.optics = self.needs.builds(LENS_EFFECT)
+        summed = flash_needs.last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
         self._last_bounce = summed if effects.last_bounce is None else effects.last_bounce
         self._step = effects.spectral_step
 
@@ -255,7 +272,7 @@ class FlashScene:
         for pop in pops:
             if not 0.0 <= pop.power <= 1.0:
                 raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
-            energy = pop.power * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            energy = pop.power * (1.0 + POP_ENERGY_DEVIATION * rng.standard_normal())
             image = self.radiance(pop.polarizer, pop.analyser_deg, view_name=view.name)
             light += np.float32(energy) * image
         sensor = self._sensors[view.name]
@@ -288,7 +305,7 @@ class FlashScene:
             ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
             ``hair``: part covered by hair (brows, lashes);
             ``mask``: bool, pixels wholly on skin, whose light comes from skin within
-            `rigsim.scenes.flash.truth.LENS_LIMIT`.
+            `rigsim.scenes.flash.truth.MAX_FOREIGN_LIGHT`.
 
             All are of the face as it has moved. For a state other than "neutral" there are also
             ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
@@ -302,7 +319,7 @@ class FlashScene:
         SceneError
             A target stands there; only faces have these maps.
         """
-        if not isinstance(self.subject, Subject):
+        if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
         view = self._view(view_name)
         picture = self._picture(view)
@@ -337,7 +354,7 @@ class FlashScene:
         SceneError
             A target stands there.
         """
-        if not isinstance(self.subject, Subject):
+        if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"landmarks: got the target {self.subject.name!r}, expected a face")
         view = self._view(view_name)
         points = self.subject.surface_landmarks()
@@ -378,8 +395,8 @@ class FlashScene:
             extinction=self.films.analyser_extinction,
         )
 
-    def _skin_glow(self, view: View) -> SkinGlow:
-        if not isinstance(self.subject, Subject):
+    def _skin_glow(self, view: View) -> SubsurfaceRadiance:
+        if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"skin: got the target {self.subject.name!r}, expected a face")
         camera = view.spectral_sensitivity
         if camera not in self._glow:
@@ -391,20 +408,20 @@ class FlashScene:
                 illuminant=self._illuminant,
                 lateral_transport=self.lateral,
                 bounce=self._stage.exchange() if self.interreflections else None,
-                spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                spectral=self.interreflections and self.needs.builds(SPECTRAL_EFFECT),
                 step=self._spectral_step(self.subject, view),
                 enough=self._last_bounce,
             )
         return self._glow[camera]
 
-    def _spectral_step(self, subject: Subject, view: View) -> int:
+    def _spectral_step(self, subject: SimulatedSubject, view: View) -> int:
         if self._step is not None:
             return self._step
-        bounces = self.needs[BOUNCES]
+        bounces = self.needs[INTERREFLECTION_EFFECT]
         return flash_needs.spectral_step(subject, self.state, view, self._illuminant, bounces)[0]
 
-    def _surface_light(self, subject: Subject) -> SurfaceLight:
-        wrinkled = self.needs.builds(WRINKLES)
+    def _surface_light(self, subject: SimulatedSubject) -> SurfaceLight:
+        wrinkled = self.needs.builds(WRINKLE_SHADOW_EFFECT)
         key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
         known = self._stage.light
         if key not in known:
@@ -421,7 +438,7 @@ class FlashScene:
     def _blurred(self, view: View, picture: Picture) -> Mapping[str, Float32Array]:
         """Return the maps that are blurred as the light is; nothing but the truth needs them."""
         subject = self.subject
-        if not self.lateral or not isinstance(subject, Subject):
+        if not self.lateral or not isinstance(subject, SimulatedSubject):
             return flash_truth.unblurred_maps(picture)
         if view.name not in self._blurs:
             look = Look(self.rig, view, self.films, self._weights, self.subpixels)
@@ -429,7 +446,7 @@ class FlashScene:
             self._blurs[view.name] = seen.maps
         return self._blurs[view.name]
 
-    def _spread(self, view: View, subject: Subject) -> Mapping[str, Float32Array]:
+    def _spread(self, view: View, subject: SimulatedSubject) -> Mapping[str, Float32Array]:
         """Return the textures of those maps, of the face as it has moved."""
         if view.name not in self._spreads:
             look = Look(self.rig, view, self.films, self._weights, self.subpixels)
@@ -441,10 +458,10 @@ class FlashScene:
     ) -> dict[str, NDArray[np.generic]]:
         """Return the fractions of this state as seen on the face at rest."""
         subject = self.subject
-        if not isinstance(subject, Subject) or subject.rest is None:
+        if not isinstance(subject, SimulatedSubject) or subject.rest is None:
             return flash_truth.unmoved_maps(moved)
         rest = subject.rest
-        caster = stage_of(rest, self._choice).caster
+        caster = flash_geometry(rest, self._choice).caster
         spread = self._spread(view, subject) if self.lateral else None
         look = self._look(view, rest.mesh)
         return flash_truth.maps_at_rest(look, caster, rest, self.state, spread)
@@ -459,7 +476,7 @@ class FlashScene:
     def _picture(self, view: View) -> Picture:
         if view.name not in self._pictures:
             look = self._look(view, self.subject.mesh)
-            if isinstance(self.subject, Subject):
+            if isinstance(self.subject, SimulatedSubject):
                 picture = look.at_skin(
                     self._caster, self.subject, self.state, self._skin_glow(view)
                 )

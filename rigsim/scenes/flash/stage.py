@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 from weakref import WeakValueDictionary
 
 from rigsim.geometry.mesh import Mesh
-from rigsim.light.interreflection import SkinBounce, bounce_on
+from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.light.subsurface_radiance import SurfaceLight
 from rigsim.needs.effect_sizes import exchange_share
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
-class Stage:
+class FlashGeometry:
     """One geometry, and what has been traced on it."""
 
     held: tuple[Mesh, object]
@@ -26,7 +26,7 @@ class Stage:
     """Light on the face, by what it comes from."""
     hollows: dict[str, float] = field(default_factory=dict)
     """`exchange_share` of the mesh, once it was asked for."""
-    bounce: dict[str, SkinBounce] = field(default_factory=dict)
+    bounce: dict[str, Interreflection] = field(default_factory=dict)
     """How light goes from skin to skin, once a scene needed it."""
 
     def share(self) -> float:
@@ -35,17 +35,19 @@ class Stage:
             self.hollows["share"] = exchange_share(self.caster)
         return self.hollows["share"]
 
-    def exchange(self) -> SkinBounce:
+    def exchange(self) -> Interreflection:
         """Return how light goes from skin to skin."""
         if not self.bounce:
-            self.bounce["skin"] = bounce_on(self.caster)
+            self.bounce["skin"] = interreflection_for(self.caster)
         return self.bounce["skin"]
 
 
-_stages: WeakValueDictionary[tuple[object, ...], Stage] = WeakValueDictionary()
+_stages: WeakValueDictionary[tuple[object, ...], FlashGeometry] = WeakValueDictionary()
 
 
-def stage_of(subject: Subject | Target, choice: VariantChoice | None) -> Stage:
+def flash_geometry(
+    subject: SimulatedSubject | Target, choice: VariantChoice | None
+) -> FlashGeometry:
     """Return the stage of a geometry; the same as long as any scene holds it.
 
     Parameters
@@ -55,10 +57,10 @@ def stage_of(subject: Subject | Target, choice: VariantChoice | None) -> Stage:
     choice
         Mitsuba variant to trace with; None chooses.
     """
-    normal = subject.normal if isinstance(subject, Subject) else None
+    normal = subject.normal if isinstance(subject, SimulatedSubject) else None
     key = (id(subject.mesh), id(normal), choice)
     stage = _stages.get(key)
     if stage is None:
-        stage = Stage((subject.mesh, normal), Caster(subject.mesh, choice=choice))
+        stage = FlashGeometry((subject.mesh, normal), Caster(subject.mesh, choice=choice))
         _stages[key] = stage
     return stage

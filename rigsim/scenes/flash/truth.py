@@ -12,21 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.arrays import BoolArray, Float32Array
+from rigsim.population.population import MAX_SKIN_HAIR
 from rigsim.render import Caster
 from rigsim.scenes.flash.image import Look, Picture
-from rigsim.subject import Subject
+from rigsim.subject import SimulatedSubject
 
-HAIR_LIMIT: Final = 0.02
-"""Pixels with more hair than this part are not skin."""
-
-LENS_LIMIT: Final = 0.01
+MAX_FOREIGN_LIGHT: Final = 0.01
 """Pixels that get more of their light than this from off the skin, by the lens, are not skin."""
 
-SPREAD: Final = ("reflectance", "melanin", "hemoglobin")
+BLURRED_MAPS: Final = ("reflectance", "melanin", "hemoglobin")
 """Maps that the spreading of light in the skin blurs."""
 
-FRACTIONS: Final = ("melanin", "hemoglobin")
-SPREAD_FRACTIONS: Final = ("melanin_blurred", "hemoglobin_blurred")
+VOLUME_FRACTIONS: Final = ("melanin", "hemoglobin")
+BLURRED_FRACTIONS: Final = ("melanin_blurred", "hemoglobin_blurred")
 
 
 def maps_of(
@@ -57,7 +55,9 @@ def maps_of(
     return maps
 
 
-def unblurred_maps(picture: Picture, names: Sequence[str] = SPREAD) -> dict[str, Float32Array]:
+def unblurred_maps(
+    picture: Picture, names: Sequence[str] = BLURRED_MAPS
+) -> dict[str, Float32Array]:
     """Return maps of a face in which light does not spread, under the names of blurred ones."""
     return {f"{name}_blurred": picture.maps[name] for name in names}
 
@@ -65,7 +65,7 @@ def unblurred_maps(picture: Picture, names: Sequence[str] = SPREAD) -> dict[str,
 def maps_at_rest(
     look: Look,
     caster: Caster,
-    rest: Subject,
+    rest: SimulatedSubject,
     state: str,
     spread: Mapping[str, Float32Array] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
@@ -87,21 +87,23 @@ def maps_at_rest(
     """
     layers = {"melanin": rest.melanin, "hemoglobin": rest.hemoglobin(state), "hair": rest.hair}
     if spread is not None:
-        layers |= {name: spread[name] for name in SPREAD_FRACTIONS}
+        layers |= {name: spread[name] for name in BLURRED_FRACTIONS}
     picture = look.at_maps(caster, rest, layers)
     seen = dict(picture.maps)
     if spread is None:
-        seen |= unblurred_maps(picture, FRACTIONS)
-    maps = {f"{name}_at_rest": seen[name] for name in (*FRACTIONS, *SPREAD_FRACTIONS)}
+        seen |= unblurred_maps(picture, VOLUME_FRACTIONS)
+    maps = {f"{name}_at_rest": seen[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS)}
     return {**maps, "mask_at_rest": whole_skin(picture)}
 
 
 def unmoved_maps(maps: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
     """Return the same maps of a face that has not moved, from those of `maps_of`."""
-    return {f"{name}_at_rest": maps[name] for name in (*FRACTIONS, *SPREAD_FRACTIONS, "mask")}
+    return {
+        f"{name}_at_rest": maps[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS, "mask")
+    }
 
 
 def whole_skin(picture: Picture) -> BoolArray:
     """Return the pixels, (H, W), that are wholly on skin, and get light from there alone."""
-    whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - LENS_LIMIT)
-    return whole & (picture.maps["hair"] < HAIR_LIMIT)
+    whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - MAX_FOREIGN_LIGHT)
+    return whole & (picture.maps["hair"] < MAX_SKIN_HAIR)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from capture.rig import load_rig
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.as_built.polarizers import Films
+from rigsim.as_built.polarizers import Polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.lobe_moments import led_moments
@@ -32,10 +32,10 @@ from rigsim.tissue.skin_layers import ETA
 from rigsim.world.taped_skin import GripState
 
 NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
-NO_FILM: Final = Films(1.0 + 1e-9, math.inf, 0.0)
+NO_FILM: Final = Polarizers(1.0 + 1e-9, math.inf, 0.0)
 """Films that let everything through; the analyser's other half is the other state's."""
 
-ALBEDO: Final = 0.2
+PATCH_ALBEDO: Final = 0.2
 MESH_MARGIN_PX: Final = 64
 LIFT_MM: Final = 1e-4
 """How far shadow rays begin above the surface; they begin at corners of its triangles."""
@@ -60,7 +60,7 @@ def plain_skin(size_mm: float, *, alpha: float = 0.25, seed: int = 0) -> MicroSk
     skin = make_micro_skin("cheek", size_mm=size_mm, seed=seed)
     even = np.ones_like(skin.height_um)
     return dataclasses.replace(
-        skin, albedo=np.float32(ALBEDO) * even, alpha=np.float32(alpha) * even
+        skin, albedo=np.float32(PATCH_ALBEDO) * even, alpha=np.float32(alpha) * even
     )
 
 
@@ -143,7 +143,7 @@ def traced(
     to_camera = eye - points
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     leaves = shading.exit_stokes(normals, to_camera, eta=ETA, image_right=surface.image_right)
-    leaves = leaves[:, 0] * ALBEDO * shading.interior_scale(ETA) / math.pi
+    leaves = leaves[:, 0] * PATCH_ALBEDO * shading.interior_scale(ETA) / math.pi
     start = points + LIFT_MM * normals
     total, lost = np.zeros((len(points), 4)), np.zeros(len(points))
     flat = np.column_stack([points[:, :2], np.zeros(len(points))])
@@ -180,7 +180,7 @@ def describe(
     full strength, so that light of many bounces is too; a depth of 2 is direct light.
     """
     view = scene.rig.views[0]
-    r_d = ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
+    r_d = PATCH_ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
     inside = {
         "type": "plastic",
         "int_ior": ETA,

@@ -20,17 +20,16 @@ from capture.rig import load_rig
 from rigsim.arrays import Float64Array
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.reference import NEUTRAL
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import Pose
 from rigsim.skin_patch.stretch import SurfaceSample
-from rigsim.world.taped_skin import GripState
 
 LONG_UM: Final = 240.0
 """Period of waves without lens and pixels that give the scale of the others."""
 
 FIELD_PX: Final = 96
-NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +59,12 @@ class Waves:
             (self.slope * np.cos(1e3 * k * x)).astype(np.float32),
             level,
             np.full(x.shape, self.albedo, np.float32),
-            np.full(x.shape, ALPHA, np.float32),
+            np.full(x.shape, WAVE_ALPHA, np.float32),
             np.ones(x.shape, np.bool_),
         )
 
 
-ALPHA: Final = 0.25
+WAVE_ALPHA: Final = 0.25
 """Roughness of the waves."""
 
 
@@ -91,13 +90,13 @@ class WavyScene(GradientScene):
         view = self.rig.views[0]
         x, y = sample_grid(view, subpixels=subpixels, border_px=border_px)
         pose = Pose(*jump_mm, 0.0)
-        return stand(self.waves, grip, pose, x, y, eye_mm=view.distance_mm, alpha=ALPHA)
+        return stand(self.waves, grip, pose, x, y, eye_mm=view.distance_mm, alpha=WAVE_ALPHA)
 
 
 def wavy_scene(*, optics: bool = True) -> WavyScene:
     """Return the gradient rig with waves, as drawn, two samples along a pixel's side."""
     skin = make_micro_skin("cheek", size_mm=0.1)  # gives the pigment that spreads light
-    even = np.full_like(skin.height_um, ALPHA)
+    even = np.full_like(skin.height_um, WAVE_ALPHA)
     rig = load_rig("gradient").cropped(FIELD_PX)
     return WavyScene(
         rig, dataclasses.replace(skin, alpha=even), effects=SceneEffects(optics=optics), subpixels=2

@@ -4,8 +4,8 @@ Every state of the skin is pictured once, as Stokes vectors of the light's four 
 lens; patterns and positions of the analyser are sums of these twelve images.
 
 The unit of light is fixed by the rig alone: a perfect white diffuser in the patch's place that
-faces the camera gives `METER_RATE_PER_S` full scales per second under all LEDs at level 1, behind
-the parallel analyser as behind the crossed one.
+faces the camera gives `GRADIENT_METER_RATE_PER_S` full scales per second under all LEDs at level 1,
+behind the parallel analyser as behind the crossed one.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy as np
 from capture.rig import Rig, RigError
 from rigsim import shading
 from rigsim.arrays import Float32Array, UInt16Array
-from rigsim.as_built.polarizers import Films, films_of
-from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
+from rigsim.as_built.polarizers import Polarizers, draw_polarizers
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
 from rigsim.light.lobe_moments import Surface
-from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects, SceneNeeds
-from rigsim.needs.flash import BOUNCES, LATERAL, SHADOWS
-from rigsim.needs.gradient import OPTICS, gradient_needs
+from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, Noise, SceneEffects
+from rigsim.needs.flash import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
+from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
 from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
@@ -40,20 +40,20 @@ from rigsim.tissue.skin_layers import ETA
 
 TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
-METER_RATE_PER_S: Final = 100.0
+GRADIENT_METER_RATE_PER_S: Final = 100.0
 """Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
 full scale."""
 
 FLAT_REFLECTANCE: Final = 0.3
 """Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
 
-POWER_DEVIATION: Final = 0.001
+PATTERN_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of the LEDs' common energy from pattern to pattern."""
 
 DRIFT_MARGIN_PX: Final = 8
 """Pixels around the picture that may drift into it."""
 
-KEPT_BYTES: Final = 2**29
+KEPT_IMAGE_BYTES: Final = 2**29
 """Pictures of states that are kept; one at least."""
 
 
@@ -125,7 +125,7 @@ class GradientScene:
         subject: MicroSkin | TargetName,
         *,
         compensation: Literal["volume", "none"] | float = "volume",
-        films: Films | None = None,
+        films: Polarizers | None = None,
         sphere: BuiltSphere | None = None,
         motion: PatchMotion | None = None,
         sensor: Sensor | None = None,
@@ -145,34 +145,37 @@ class GradientScene:
         if sectors < 4 or sectors % 4:
             raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
         self.rig, self.subject, self.compensation = rig, subject, compensation
-        self.films = films_of(rig) if films is None else films
-        self.sphere = as_drawn(rig) if sphere is None else sphere
+        self.films = draw_polarizers(rig) if films is None else films
+        self.sphere = nominal_sphere(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
         self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
         # behind two ideal films, one of which the unit of radiance holds already
-        white = float(diffuser_radiance(as_drawn(rig), np.zeros(1), np.zeros(1))[0, 0])
+        white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
         # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
-        self.unit = METER_RATE_PER_S / (0.5 * white)
+        self.unit = GRADIENT_METER_RATE_PER_S / (0.5 * white)
         self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
         self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
         self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
-        self.needs: SceneNeeds = gradient_needs(
+        self.needs: EffectSelection = gradient_needs(
             rig,
             subject,
             self.sphere,
             self.lens,
             noise=Noise.of(self._sensor),
-            white=math.inf if on_s is None else METER_RATE_PER_S * on_s,
+            white=math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s,
             moving=motion is not None,
             effects=effects,
         )
         """What is built, what is not, and why."""
-        self.shadows, self.optics = self.needs.builds(SHADOWS), self.needs.builds(OPTICS)
-        self.lateral = self.needs.builds(LATERAL)
-        self.interreflections = self.needs.builds(BOUNCES)
+        self.shadows, self.optics = (
+            self.needs.builds(SHADOW_EFFECT),
+            self.needs.builds(OPTICS_EFFECT),
+        )
+        self.lateral = self.needs.builds(LATERAL_EFFECT)
+        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -318,7 +321,7 @@ class GradientScene:
         light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
         for pop in pops:
             energy = full_power_s(pop, f"pattern {pop.pattern!r}")
-            energy *= 1.0 + POWER_DEVIATION * rng.standard_normal()
+            energy *= 1.0 + PATTERN_POWER_DEVIATION * rng.standard_normal()
             if energy > 0.0 and any(_weights(pop.pattern)):
                 light += np.float32(energy) * self.radiance(
                     pop.pattern,
@@ -444,7 +447,7 @@ class GradientScene:
             else:
                 picture = self._target(shares)
             picture *= np.float32(self.unit)
-            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_BYTES:
+            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_IMAGE_BYTES:
                 self._pictures.popitem(last=False)
             self._pictures[key] = picture
         self._pictures.move_to_end(key)

@@ -22,7 +22,7 @@ from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
 from rigsim.fiber.probe_profile import Profile, Profiles
 from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
-from rigsim.needs.effects import Noise, SceneNeeds
+from rigsim.needs.effects import EffectSelection, Noise
 from rigsim.needs.probe import probe_needs
 from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     pass
 
 
-METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
+PROBE_METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
 """Full scales per second in a spot's middle per R_f in 1/mm^2."""
 
 DARK_E_PER_S: Final = 0.3
@@ -47,14 +47,14 @@ HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
 ROOM_R_F_PER_MM2: Final = 1e-3
 """What the room's light on a head in the air is worth in reflectance at full level."""
 
-LONGEST_S: Final = 30.0
+MAX_USUAL_EXPOSURE_S: Final = 30.0
 """The longest of the usual exposures, s."""
 
-CAP: Final = "cap"
+CAP_SITE: Final = "cap"
 """Site at which the head's fibres look into the dark."""
 
-VIGNETTING: Final = 0.1
-PHOTONS: Final = 200_000
+LENS_VIGNETTING: Final = 0.1
+PHOTONS_PER_ANGLE: Final = 200_000
 """Photons for each site and angle."""
 
 
@@ -94,7 +94,7 @@ class ProbeScene:
         build: ProbeBuild | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
-        photons: int = PHOTONS,
+        photons: int = PHOTONS_PER_ANGLE,
     ) -> None:
         if rig.probe is None or len(rig.views) != 1:
             raise SceneError(f"rig {rig.name!r}: expected a contact probe and one view")
@@ -105,7 +105,7 @@ class ProbeScene:
                 f"build: got {len(self.build.gain)} fibres, expected {len(rig.probe.fibres)}"
             )
         self._view = rig.views[0]
-        dark = {"dark_e_per_s": DARK_E_PER_S, "vignetting": VIGNETTING}
+        dark = {"dark_e_per_s": DARK_E_PER_S, "vignetting": LENS_VIGNETTING}
         self._sensor = sensor_of(self._view, **dark) if sensor is None else sensor
         self.profiles = Profiles(rig, tissue, photons=photons, seed=seed)
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
@@ -114,12 +114,12 @@ class ProbeScene:
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
         """What hot pixels add to the dark current at `DARK_C`, electrons/s, shape (H, W)."""
         full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
-        self.needs: SceneNeeds = probe_needs(
+        self.needs: EffectSelection = probe_needs(
             rig,
             tissue,
             self.build,
             noise=Noise.of(self._sensor),
-            hot=float(self.hot_e_per_s.max()) * LONGEST_S / full_e,
+            hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
         )
         """What is built, what is not, and why."""
 
@@ -144,7 +144,7 @@ class ProbeScene:
         SceneError
             The tissue has no such site.
         """
-        if not head.placed or head.site in ("", CAP):
+        if not head.placed or head.site in ("", CAP_SITE):
             return None
         try:
             return self.profiles.profile(head.site, head.angle_deg, head.suction_mbar)
@@ -189,7 +189,7 @@ class ProbeScene:
             open_share[:] = self.build.cover_leak
             open_share[fibre] = 1.0
         taken = (open_share * self.build.gain)[:, None] * reflectance_per_mm2
-        return np.asarray(METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
+        return np.asarray(PROBE_METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
 
     def image(self, fibre_light: Float64Array) -> Float32Array:
         """Return the light on the sensor, shape (H, W, 3), of what comes out of the fibres."""
@@ -238,7 +238,7 @@ class ProbeScene:
             energy = full_power_s(pop, "the source")
             energy *= 1.0 + self.build.ripple * float(rng.standard_normal())
             total += max(energy, 0.0) * self.fibre_light(head, fibre=pop.fibre)
-        if (not head.placed and head.site != CAP) or not head.site:
+        if (not head.placed and head.site != CAP_SITE) or not head.site:
             room = np.full((len(self.build.gain), 3), ROOM_R_F_PER_MM2)
             total += exposure_s * self.through_fibres(room)
         light = self.image(total)

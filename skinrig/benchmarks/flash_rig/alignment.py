@@ -13,7 +13,7 @@ from model.color_table import ColorTable
 from model.facial_color import HemoglobinRig
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
-from rigsim.subject import Subject, make_subject
+from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -99,7 +99,7 @@ def oval(side: int) -> BoolArray:
 
 
 def moved_face(
-    face: Subject,
+    face: SimulatedSubject,
     displacement_px: Float64Array,
     *,
     state: str = "smile",
@@ -117,7 +117,7 @@ def moved_face(
     displacement_px
         (N, N, 2): where each pixel goes. It must not fold.
     state
-        Of `rigsim.subject.perfusion.STATES`.
+        Of `rigsim.subject.perfusion.STATE_NAMES`.
     noise
         Relative standard deviation of each channel of each pixel.
     landmarks, landmark_noise_px
@@ -191,7 +191,7 @@ def spread_points(mask: BoolArray, count: int) -> NDArray[np.intp]:
     return places[chosen]
 
 
-def face_of(preset: str, side: int, *, seed: int = 0) -> Subject:
+def face_of(preset: str, side: int, *, seed: int = 0) -> SimulatedSubject:
     """Return a simulated face with a texture of so many pixels a side."""
     return make_subject(preset, seed=seed, size=side)
 

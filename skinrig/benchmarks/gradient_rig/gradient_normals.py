@@ -15,7 +15,7 @@ from capture.rig import Rig, load_rig
 from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from reconstruction.normal_maps import NormalMaps
-from rigsim.as_built.sphere import BuiltSphere, as_drawn
+from rigsim.as_built.sphere import BuiltSphere, nominal_sphere
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -92,7 +92,7 @@ def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
     if smooth:
         height = gaussian_filter(skin.height_um, SMOOTH_PX, mode="wrap").astype(np.float32)
         skin = replace(skin, height_um=height)
-    sphere = as_drawn(rig)
+    sphere = nominal_sphere(rig)
     scene = GradientScene(rig, skin, sphere=sphere)
     images = {
         (name, polarizer): EXPOSURE_S

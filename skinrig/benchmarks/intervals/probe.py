@@ -110,10 +110,10 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
     >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
     True
     """
-    from rigsim.fiber.probe_tissue import AS_MADE, phantom_certificate
+    from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
 
     paper = dict(phantom_certificate())
-    for name, made in zip(COEFFICIENTS, AS_MADE, strict=True):
+    for name, made in zip(COEFFICIENTS, PHANTOM_DEVIATIONS, strict=True):
         unsure = float(paper["uncertainty"][name])
         factor = (1.0 + made * unsure) / (1.0 + unsure * float(rng.standard_normal()))
         paper[f"{name}_per_mm"] = [factor * value for value in paper[f"{name}_per_mm"]]

@@ -19,7 +19,7 @@ def render(*, toy: bool) -> StageBenchmark:
     from rigsim.render import Caster
     from rigsim.render.variant import choose_variant
     from rigsim.scenes.flash.polarizer_reference import (
-        ANALYSER_DEG,
+        ANALYZER_AXIS_DEG,
         closed_forms,
         mitsuba_image,
         polarizer_reference,
@@ -41,7 +41,7 @@ def render(*, toy: bool) -> StageBenchmark:
         def by_mitsuba(samples: int = samples) -> dict[str, Float32Array]:
             return {
                 name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
-                for k, name in enumerate(ANALYSER_DEG)
+                for k, name in enumerate(ANALYZER_AXIS_DEG)
             }
 
         timing = measure(by_closed_forms, memory=None)

@@ -143,7 +143,7 @@ def flash_face(
     """
     from capture.rig import load_rig
     from rigsim.needs.effects import Noise, SceneEffects
-    from rigsim.needs.flash import FINER
+    from rigsim.needs.flash import WAVELENGTH_STEP_EFFECT
     from rigsim.scenes.flash.scene import FlashScene
     from rigsim.subject import make_subject
 
@@ -159,7 +159,7 @@ def flash_face(
         return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
 
     scene.radiance()  # compiles, and traces what all scenes of this face share
-    coarser = 2 if scene.needs.builds(FINER) else None
+    coarser = 2 if scene.needs.builds(WAVELENGTH_STEP_EFFECT) else None
     yield from compare(
         "flash",
         name,
@@ -281,7 +281,7 @@ def _plainer(
     """
     from model import spectra
     from rigsim.needs.effects import Noise
-    from rigsim.needs.flash import BANDS, PIGMENT, RELIEF
+    from rigsim.needs.flash import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT
 
     face, noise = scene.subject, Noise.of(scene.sensor())
     begin = time.process_time()
@@ -290,8 +290,8 @@ def _plainer(
     covered = face.atlas.covered
     even = np.full_like(face.melanin, np.median(face.melanin[covered]))
     for name, plain in (
-        (RELIEF, dataclasses.replace(face, normal=face.atlas.normal)),
-        (PIGMENT, dataclasses.replace(face, melanin=even)),
+        (RELIEF_EFFECT, dataclasses.replace(face, normal=face.atlas.normal)),
+        (PIGMENT_EFFECT, dataclasses.replace(face, melanin=even)),
     ):
         begin = time.process_time()
         lack = look(plain)
@@ -304,7 +304,7 @@ def _plainer(
     one = Pictures(have.light.mean(axis=-1, keepdims=True) * gray)
     spent = time.process_time() - begin
     # a band alone would be a third of the sums over colors, which are not timed apart
-    yield changed(rig, preset, scene.needs[BANDS], have, one, noise, (spent, spent))
+    yield changed(rig, preset, scene.needs[BAND_EFFECT], have, one, noise, (spent, spent))
 
 
 def changed(
@@ -354,7 +354,7 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
 def flat_targets() -> Iterator[Omission]:
     """Show that targets neither shade nor light themselves: rays between their own points."""
     from capture.rig import load_rig
-    from rigsim.light.interreflection import SkinBounce
+    from rigsim.light.interreflection import Interreflection
     from rigsim.needs.effect_sizes import is_flat
     from rigsim.needs.effects import Noise
     from rigsim.render import Caster, visibility
@@ -376,7 +376,7 @@ def flat_targets() -> Iterator[Omission]:
         flat = is_flat(caster.mesh)  # all that leaving it out costs
         told_s = max(time.process_time() - begin, 1e-6)
         begin = time.process_time()
-        bounce = SkinBounce(caster, patches=24)
+        bounce = Interreflection(caster, patches=24)
         got = float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
         seconds = time.process_time() - begin
         points, normals = (part[0] for part in bounce.surface())

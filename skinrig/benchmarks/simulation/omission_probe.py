@@ -17,7 +17,7 @@ def gray_tissue() -> Iterator[Omission]:
     from capture.rig import load_rig
     from rigsim.fiber.probe_tissue import HomogeneousTissue
     from rigsim.needs.effects import Noise
-    from rigsim.needs.probe import COLOR
+    from rigsim.needs.probe import COLOR_EFFECT
     from rigsim.scenes.probe.scene import ProbeScene
     from rigsim.world.suction import HeadState
 
@@ -40,15 +40,15 @@ def gray_tissue() -> Iterator[Omission]:
     brightest = np.float32(pictures[0].light.max())
     noise = Noise.of(scene.sensor())
     have, lack = (Pictures(part.light / brightest) for part in pictures)
-    effect = scene.needs[COLOR]
+    effect = scene.needs[COLOR_EFFECT]
     yield changed("probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1]))
     yield from _probe_build(scene, head, noise)
 
 
 def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     """Compare the probe as built with one without cross-talk, wings, or dark current."""
-    from rigsim.needs.probe import CROSSTALK, DARK, WINGS
-    from rigsim.scenes.probe.scene import LONGEST_S, ProbeScene
+    from rigsim.needs.probe import CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
+    from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
 
     profile = scene.profile(head)
     build = scene.build
@@ -61,8 +61,8 @@ def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     have, with_s = picture(scene)
     unit = np.float32(have.light.max())
     plain = {
-        CROSSTALK: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
-        WINGS: dataclasses.replace(build, wings=0.0),
+        CROSSTALK_EFFECT: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
+        WINGS_EFFECT: dataclasses.replace(build, wings=0.0),
     }
     for name, without in plain.items():
         lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
@@ -78,10 +78,16 @@ def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
     begin = time.process_time()
-    hot = np.asarray(scene.hot_e_per_s * LONGEST_S / full_e, np.float32)
+    hot = np.asarray(scene.hot_e_per_s * MAX_USUAL_EXPOSURE_S / full_e, np.float32)
     middle = time.process_time()
     none = np.zeros_like(hot)
     spent_s = middle - begin, time.process_time() - middle
     yield changed(
-        "probe", "gray medium", scene.needs[DARK], Pictures(hot), Pictures(none), noise, spent_s
+        "probe",
+        "gray medium",
+        scene.needs[DARK_CURRENT_EFFECT],
+        Pictures(hot),
+        Pictures(none),
+        noise,
+        spent_s,
     )

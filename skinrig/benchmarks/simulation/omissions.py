@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rigsim.needs.flash import LATERAL
+from rigsim.needs.flash import LATERAL_EFFECT
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
 
 BOUND = 0.1
-"""Of a pixel's noise: what may be left out. Not `rigsim.needs.effects.ENOUGH` itself, so that a
-rule that was loosened shows here."""
+"""Of a pixel's noise: what may be left out. Not `rigsim.needs.effects.NEGLIGIBLE_NOISE_RATIO`
+itself, so that a rule that was loosened shows here."""
 
 NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
@@ -90,7 +90,7 @@ def omissions(*, toy: bool) -> StageBenchmark:
 
 def _other_shadows(one: Omission) -> bool:
     """Return whether switching an effect changes more than the effect."""
-    return one.rig == "dome" and one.effect == LATERAL
+    return one.rig == "dome" and one.effect == LATERAL_EFFECT
 
 
 def _cases(toy: bool) -> Iterator[Omission]:

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
-from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
+from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
+from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
@@ -43,7 +43,9 @@ def stretched(*, toy: bool) -> StageBenchmark:
             _variance(deform(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
             for s in skins
         ]
-        for tolerance in (0.1, TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, TOLERANCE, 1e-3):
+        for tolerance in (
+            (0.1, FORCE_TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, FORCE_TOLERANCE, 1e-3)
+        ):
 
             def run(stretch: float = stretch, tolerance: float = tolerance) -> list[StretchedSkin]:
                 return [
@@ -81,7 +83,7 @@ def stretched(*, toy: bool) -> StageBenchmark:
 
 def _limits() -> tuple[Limit, ...]:
     limits = []
-    for site in SITES:
+    for site in SITE_NAMES:
         skin = make_micro_skin(site, seed=1, size_mm=2.8)
         begin = time.process_time()
         states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in STATES}

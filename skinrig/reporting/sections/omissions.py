@@ -11,7 +11,7 @@ from skinrig.reporting import page
 from skinrig.simulating.leaving_out import may_be_left_out
 
 VERDICT_ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
-"""In which verdicts are listed, see `rigsim.needs.effects.MEANING`."""
+"""In which verdicts are listed, see `rigsim.needs.effects.VERDICT_MEANINGS`."""
 
 VERDICT_WORDS = {
     "asked": "left out as asked",

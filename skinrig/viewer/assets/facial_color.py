@@ -21,7 +21,7 @@ from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 if TYPE_CHECKING:
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
 
 
 TABLE_NODES: Final = 128
@@ -97,13 +97,13 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     return simulated(subject, source.skin)
 
 
-def simulated(person: Subject, skin: FineSkin) -> FaceColor:
+def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
     """Return the chromophores of a simulated person, with a rig of all of its states."""
-    from rigsim.subject.perfusion import STATES
+    from rigsim.subject.perfusion import STATE_NAMES
 
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),
-        {name: person.hemoglobin(name) for name in STATES if name != NEUTRAL},
+        {name: person.hemoglobin(name) for name in STATE_NAMES if name != NEUTRAL},
         radius_px=RADIUS_PER_SIZE * person.size,
         valid=person.atlas.covered,
         stored_size=min(RIG_PX, person.size),

@@ -17,13 +17,13 @@ from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 
 if TYPE_CHECKING:
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
     from skinrig.viewer.scene import SceneSource
 
 MELANIN_MAP = "melanin"
 
 
-def placed(source: SceneSource, subject: Subject) -> FaceColor:
+def placed(source: SceneSource, subject: SimulatedSubject) -> FaceColor:
     """Return the measured chromophores and rig on the texture of the scene's mesh.
 
     Parameters

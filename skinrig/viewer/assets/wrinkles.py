@@ -20,7 +20,7 @@ from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 if TYPE_CHECKING:
-    from rigsim.subject import Subject
+    from rigsim.subject import SimulatedSubject
 
 
 MAP_PX: Final = 512
@@ -57,7 +57,7 @@ def _model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
     return found, "simulated: fitted to the person's own expressions"
 
 
-def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
+def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     """Return wrinkles fitted to the expressions of a simulated person.
 
     Parameters
@@ -70,13 +70,13 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     from reconstruction.wrinkles.fit import fit
     from reconstruction.wrinkles.zones import amplitudes, fit_zones
     from rigsim.subject import make_subject
-    from rigsim.subject.expressions import EXPRESSIONS
+    from rigsim.subject.expressions import EXPRESSION_STRENGTHS
 
     rest = subject if subject.rest is None else subject.rest
     if rest.size != size:
         rest = make_subject(rest.preset, seed=rest.seed, size=size, mesh=rest.mesh)
     neutral = rest.tangent_normal()
-    posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSIONS}
+    posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSION_STRENGTHS}
     few = min(MASK_PX, size)
     zones = fit_zones(
         amplitudes(neutral, posed, size=(few, few)),

@@ -13,7 +13,7 @@ from capture.rig import load_rig
 from rigsim.fiber import probe_tissue
 from rigsim.fiber.probe_profile import Profiles, fibres_of
 from rigsim.fiber.probe_tissue import (
-    PHANTOM,
+    PHANTOM_BLOCK,
     FibrousTissue,
     HomogeneousTissue,
     SkinTissue,
@@ -129,7 +129,7 @@ def test_the_block_is_off_its_certificate_by_less_than_two_uncertainties():
     paper = phantom_certificate()
     exact = make_phantom(paper, deviations=(0.0, 0.0))
     for name, key in (("sigma_a_per_mm", "sigma_a"), ("sigma_s_prime_per_mm", "sigma_s_prime")):
-        ratio = np.array(getattr(PHANTOM, name)) / np.array(getattr(exact, name))
+        ratio = np.array(getattr(PHANTOM_BLOCK, name)) / np.array(getattr(exact, name))
         assert 0.0 < abs(ratio - 1.0).max() < 2.0 * paper["uncertainty"][key]
 
 
@@ -137,11 +137,11 @@ def test_the_certificate_is_one_that_a_calibration_reads(tmp_path):
     path = tmp_path / "phantom.json"
     path.write_text(json.dumps(phantom_certificate()), encoding="utf-8")
     read = read_certificate(path)
-    sigma_a, scattering = read.at(PHANTOM.wavelength_nm)
+    sigma_a, scattering = read.at(PHANTOM_BLOCK.wavelength_nm)
     exact = make_phantom(phantom_certificate(), deviations=(0.0, 0.0))
     np.testing.assert_allclose(exact.sigma_a_per_mm, sigma_a)
     np.testing.assert_allclose(exact.sigma_s_prime_per_mm, scattering)
-    assert (read.g, read.eta) == (PHANTOM.g, PHANTOM.eta)
+    assert (read.g, read.eta) == (PHANTOM_BLOCK.g, PHANTOM_BLOCK.eta)
 
 
 def test_smoothing_lowers_noise_and_leaves_a_bump_of_photons_noise_only():

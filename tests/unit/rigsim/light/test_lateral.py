@@ -5,7 +5,7 @@ import pytest
 
 from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.lateral import LateralError, line_spread_mm, spread_light
+from rigsim.light.lateral import LateralError, line_spread_mm, scatter_laterally
 
 SIZE = 256
 
@@ -26,7 +26,7 @@ def point(channels: int = 1) -> np.ndarray:
 def test_a_point_spreads_to_a_gaussian_of_the_stated_width_in_mm_both_ways(sigma_mm):
     """The texture is twice as fine along v: the width in mm must not depend on it."""
     atlas = plate(64.0, 32.0)
-    out = spread_light(point(), atlas, [sigma_mm], [[1.0]])[..., 0]
+    out = scatter_laterally(point(), atlas, [sigma_mm], [[1.0]])[..., 0]
     step = np.arange(SIZE) - SIZE // 2
     for axis, texel_mm in ((0, 64.0 / SIZE), (1, 32.0 / SIZE)):
         profile = out.sum(axis=axis)
@@ -40,11 +40,11 @@ def test_light_is_conserved_and_an_even_field_stays_even():
     rng = np.random.default_rng(12345)
     field = rng.uniform(0.0, 1.0, (SIZE, SIZE, 3)).astype(np.float32)
     before = field.copy()
-    out = spread_light(field, atlas, sigmas, weights)
+    out = scatter_laterally(field, atlas, sigmas, weights)
     np.testing.assert_allclose(out.sum(axis=(0, 1)), field.sum(axis=(0, 1)), rtol=1e-4)
     np.testing.assert_array_equal(field, before)
     assert out.min() >= 0.0
-    even = spread_light(np.ones_like(field), atlas, sigmas, weights)
+    even = scatter_laterally(np.ones_like(field), atlas, sigmas, weights)
     np.testing.assert_allclose(even, 1.0, rtol=1e-4)
 
 
@@ -63,20 +63,22 @@ def test_light_is_conserved_on_a_stretched_texture():
     )
     along_u, along_v = atlas.texel_mm()
     area = (along_u * along_v)[..., None]
-    out = spread_light(point(), atlas, [3.0], [[1.0]])
+    out = scatter_laterally(point(), atlas, [3.0], [[1.0]])
     assert float((out * area).sum()) == pytest.approx(float((point() * area).sum()), rel=1e-3)
     np.testing.assert_allclose(
-        spread_light(np.ones((SIZE, SIZE, 1), np.float32), atlas, [3.0], [[1.0]]), 1.0, rtol=1e-3
+        scatter_laterally(np.ones((SIZE, SIZE, 1), np.float32), atlas, [3.0], [[1.0]]),
+        1.0,
+        rtol=1e-3,
     )
 
 
 def test_channels_spread_by_their_own_weights():
-    out = spread_light(point(2), plate(64.0, 64.0), [0.5, 4.0], [[1.0, 0.0], [0.0, 1.0]])
+    out = scatter_laterally(point(2), plate(64.0, 64.0), [0.5, 4.0], [[1.0, 0.0], [0.0, 1.0]])
     assert out[SIZE // 2, SIZE // 2, 0] > 10.0 * out[SIZE // 2, SIZE // 2, 1]
 
 
 def test_kernels_far_below_a_texel_leave_the_field_alone():
-    out = spread_light(point(), plate(256.0, 256.0), [0.05], [[1.0]])
+    out = scatter_laterally(point(), plate(256.0, 256.0), [0.05], [[1.0]])
     np.testing.assert_array_equal(out, point())
 
 
@@ -94,4 +96,4 @@ def test_the_edge_width_of_a_gaussian_is_2_56_sigma():
 )
 def test_wrong_kernels_are_named(sigmas, weights, word):
     with pytest.raises(LateralError, match=word):
-        spread_light(point(), plate(10.0, 10.0), sigmas, weights)
+        scatter_laterally(point(), plate(10.0, 10.0), sigmas, weights)

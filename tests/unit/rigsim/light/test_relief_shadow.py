@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.light.relief_shadow import DIRECTIONS, SOFT_RAD, ReliefShadow
+from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, SOFT_RAD, ReliefShadow
 from rigsim.needs.effects import SceneEffects
-from rigsim.needs.flash import WRINKLES
+from rigsim.needs.flash import WRINKLE_SHADOW_EFFECT
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
@@ -84,7 +84,7 @@ def test_level_skin_and_lights_above_all_slopes_are_never_hidden():
     steep_deg = math.degrees(math.atan(0.5) + 1.1 * SOFT_RAD)
     assert seen_from(level(ramp), 0.0, steep_deg).min() == 1.0
     assert seen_from(level(ramp), 0.0, 10.0).min() == 0.0
-    assert DIRECTIONS % 4 == 0
+    assert HORIZON_DIRECTIONS % 4 == 0
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
     lit = DomeScene(rig, face, state="surprise", effects=flat, choice=EMBREE).radiance(view)
     scene = DomeScene(rig, face, state="surprise", effects=plain, choice=EMBREE)
     shaded = scene.radiance(view)
-    assert scene.needs[WRINKLES].verdict == "built"
+    assert scene.needs[WRINKLE_SHADOW_EFFECT].verdict == "built"
     assert (shaded <= lit + 1e-6 * lit.max()).all()
     assert (lit - shaded).max() > 0.02 * lit.max()
     compiled = DomeScene(rig, face, state="surprise", effects=plain)
@@ -114,7 +114,7 @@ def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
 def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
     rig = load_rig("flash").resized(64)
     rest = FlashScene(rig, face, choice=EMBREE)
-    assert rest.needs[WRINKLES].verdict == "unmodeled"
+    assert rest.needs[WRINKLE_SHADOW_EFFECT].verdict == "unmodeled"
     moved, plain = (
         FlashScene(
             rig,
@@ -125,7 +125,7 @@ def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
         )
         for on in (None, False)
     )
-    assert moved.needs[WRINKLES].verdict == "built"
-    assert plain.needs[WRINKLES].verdict == "asked"
+    assert moved.needs[WRINKLE_SHADOW_EFFECT].verdict == "built"
+    assert plain.needs[WRINKLE_SHADOW_EFFECT].verdict == "asked"
     assert (moved.radiance() <= plain.radiance() + 1e-6).all()
     assert (moved.radiance() < plain.radiance() - 1e-5).any()

@@ -9,12 +9,20 @@ import pytest
 from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_subject
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.interreflection_color import STEPS, step_error
-from rigsim.light.lateral import spread_light
+from rigsim.light.interreflection_color import WAVELENGTH_STEPS, step_error
+from rigsim.light.lateral import scatter_laterally
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs import effect_sizes
 from rigsim.needs import flash as flash_needs
-from rigsim.needs.effects import ENOUGH, Effect, NeedsError, Noise, SceneEffects, SceneNeeds, decide
+from rigsim.needs.effects import (
+    NEGLIGIBLE_NOISE_RATIO,
+    Effect,
+    EffectSelection,
+    NeedsError,
+    Noise,
+    SceneEffects,
+    decide,
+)
 from rigsim.render.caster import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
@@ -53,13 +61,13 @@ def test_the_noise_is_that_of_exposures(rng):
 
 def test_a_record_may_not_call_negligible_what_is_not():
     with pytest.raises(NeedsError, match="build it"):
-        Effect("bounces", "negligible", "flat", ENOUGH)
+        Effect("bounces", "negligible", "flat", NEGLIGIBLE_NOISE_RATIO)
     with pytest.raises(NeedsError, match="expected one of built"):
         Effect("bounces", "maybe", "flat")
     with pytest.raises(NeedsError, match="bounces twice"):
-        SceneNeeds((Effect("bounces", "built", "a"), Effect("bounces", "absent", "b")))
-    assert decide("b", ENOUGH, None, switch="", because="x").built
-    assert not decide("b", 0.999 * ENOUGH, None, switch="", because="x").built
+        EffectSelection((Effect("bounces", "built", "a"), Effect("bounces", "absent", "b")))
+    assert decide("b", NEGLIGIBLE_NOISE_RATIO, None, switch="", because="x").built
+    assert not decide("b", 0.999 * NEGLIGIBLE_NOISE_RATIO, None, switch="", because="x").built
 
 
 @pytest.mark.parametrize("texels", [3, 15])
@@ -76,7 +84,7 @@ def test_light_lost_at_an_edge_is_what_spreading_moves_across_it(texels):
     texel_mm = float(np.median(np.diff(row)))
     edge = float(row[len(row) // 2]) - 0.5 * texel_mm
     lit = ((x >= edge) & atlas.covered).astype(np.float32)[..., None]
-    spread = spread_light(lit, atlas, [0.8], [[1.0]])[..., 0]
+    spread = scatter_laterally(lit, atlas, [0.8], [[1.0]])[..., 0]
     inside = atlas.covered & (x >= edge) & (x < edge + texels * texel_mm)
     inside &= np.abs(atlas.position_mm[..., 1] - 20.0) < 10.0
     lost = 1.0 - float(spread[inside].mean())
@@ -133,9 +141,9 @@ def flash():
 
 def test_pale_skin_needs_what_the_darkest_does_not(flash, faces):
     pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "darkest"))
-    assert pale.builds(flash_needs.SPECTRAL)
-    assert dark[flash_needs.SPECTRAL].verdict == "negligible"
-    sizes = [needs[flash_needs.BOUNCES].over_noise for needs in (pale, dark)]
+    assert pale.builds(flash_needs.SPECTRAL_EFFECT)
+    assert dark[flash_needs.SPECTRAL_EFFECT].verdict == "negligible"
+    sizes = [needs[flash_needs.INTERREFLECTION_EFFECT].over_noise for needs in (pale, dark)]
     assert sizes[0] > 20.0 * sizes[1]
 
 
@@ -144,24 +152,24 @@ def test_a_noisier_sensor_needs_less(flash, faces):
     noisy = dataclasses.replace(sensor, read_noise_e=1e4)
     sharp = FlashScene(flash, faces["darkest"], sensor=sensor).needs
     coarse = FlashScene(flash, faces["darkest"], sensor=noisy).needs
-    for name in (flash_needs.BOUNCES, flash_needs.LATERAL):
+    for name in (flash_needs.INTERREFLECTION_EFFECT, flash_needs.LATERAL_EFFECT):
         assert sharp.builds(name)
         assert coarse[name].verdict == "negligible"
-    assert coarse[flash_needs.SPECTRAL].reason.startswith("there is no such light")
+    assert coarse[flash_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
 
 
 def test_what_is_asked_for_is_done_and_said(flash, faces):
     asked = FlashScene(
         flash, faces["II"], effects=SceneEffects(lateral=False, interreflections=False)
     )
-    for name in (flash_needs.BOUNCES, flash_needs.LATERAL):
+    for name in (flash_needs.INTERREFLECTION_EFFECT, flash_needs.LATERAL_EFFECT):
         effect = asked.needs[name]
         assert effect.verdict == "asked"
         assert f"{effect.switch}=False asks for it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
     forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
-    assert forced.needs[flash_needs.SPECTRAL].verdict == "built"
-    assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL].reason
+    assert forced.needs[flash_needs.SPECTRAL_EFFECT].verdict == "built"
+    assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL_EFFECT].reason
 
 
 def grazing(rig, angle_deg=88.0):
@@ -211,16 +219,16 @@ def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
     face = faces["II"]
     scene = FlashScene(flash, face)
     noise, view = Noise.of(scene.sensor()), flash.views[0]
-    effect = scene.needs[flash_needs.FINER]
+    effect = scene.needs[flash_needs.WAVELENGTH_STEP_EFFECT]
     assert effect.verdict == "built"
     assert "each 20 nm would not be enough" in effect.reason
     fine = scene.radiance()
     sensor = dataclasses.replace(scene.sensor(), read_noise_e=2e3)
-    coarse = FlashScene(flash, face, sensor=sensor).needs[flash_needs.FINER]
+    coarse = FlashScene(flash, face, sensor=sensor).needs[flash_needs.WAVELENGTH_STEP_EFFECT]
     assert coarse.verdict == "negligible"
-    bounces = scene.needs[flash_needs.BOUNCES].over_noise
+    bounces = scene.needs[flash_needs.INTERREFLECTION_EFFECT].over_noise
     changes = []
-    for step in STEPS:
+    for step in WAVELENGTH_STEPS:
         error = step_error(face, "neutral", view.spectral_sensitivity, "D55", step)
         lack = FlashScene(flash, face, effects=SceneEffects(spectral_step=step)).radiance()
         changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
@@ -236,23 +244,26 @@ def test_of_two_cameras_the_one_that_tells_more_decides(flash, faces):
         FlashScene(dataclasses.replace(flash, views=views), faces["darkest"]).needs
         for views in ((dull,), (dull, keen), (keen, dull))
     )
-    assert alone[flash_needs.BOUNCES].verdict == "negligible"
+    assert alone[flash_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
     for needs in (both, swapped):
-        assert needs.builds(flash_needs.BOUNCES)
-        assert needs[flash_needs.LATERAL].over_noise > alone[flash_needs.LATERAL].over_noise
+        assert needs.builds(flash_needs.INTERREFLECTION_EFFECT)
+        assert (
+            needs[flash_needs.LATERAL_EFFECT].over_noise
+            > alone[flash_needs.LATERAL_EFFECT].over_noise
+        )
 
 
 def test_flat_targets_need_neither_shadows_nor_bounces(flash):
     dome = load_rig("dome").resized(64).subset(views=["C02"])
     for scene in (FlashScene(flash, make_target("chart")), DomeScene(dome, make_target("white"))):
-        assert scene.needs[flash_needs.BOUNCES].verdict == "negligible"
-        assert scene.needs[flash_needs.LATERAL].verdict == "absent"
+        assert scene.needs[flash_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
+        assert scene.needs[flash_needs.LATERAL_EFFECT].verdict == "absent"
 
 
 def test_films_alone_ask_for_polarization(flash, faces):
-    assert FlashScene(flash, faces["II"]).needs.builds(flash_needs.POLARIZATION)
+    assert FlashScene(flash, faces["II"]).needs.builds(flash_needs.POLARIZATION_EFFECT)
     dome = load_rig("dome").resized(64).subset(views=["C02"])
-    assert DomeScene(dome, faces["II"]).needs[flash_needs.POLARIZATION].verdict == "absent"
+    assert DomeScene(dome, faces["II"]).needs[flash_needs.POLARIZATION_EFFECT].verdict == "absent"
 
 
 def test_gray_tissue_is_traced_once_and_skin_color_by_color():

@@ -9,7 +9,7 @@ import pytest
 from rigsim.light import surface_brdf
 from rigsim.light.surface_brdf import Coating, SurfaceError
 from rigsim.population.conditions import (
-    CONDITIONS,
+    CONDITION_NAMES,
     ConditionError,
     coated,
     conditioned,
@@ -106,7 +106,7 @@ def test_grains_alone_follow_the_closed_form_of_a_thick_layer():
             assert sent > 0.5 * w * (1.0 - c * math.log1p(1.0 / c))
 
 
-@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("condition", CONDITION_NAMES)
 def test_nothing_of_a_condition_is_the_surface_itself(condition, face, bare):
     assert conditioned(bare, condition, 0.0) is bare
     assert coated(face, bare, {condition: 0.0}) is bare
@@ -125,7 +125,7 @@ def test_films_shine_more_in_the_mirror_direction_and_powder_and_cold_less(face,
     before = gloss(bare, light, view, points)
     now = {
         name: gloss(conditioned_surface(face, CAMERA, LIGHT, {name: 1.0}), light, view, points)
-        for name in CONDITIONS
+        for name in CONDITION_NAMES
     }
     assert now["cold"] < before < now["hot"] < now["sweat"]
     assert now["lotion"] > 1.5 * before
@@ -177,7 +177,7 @@ def test_one_film_over_another_covers_what_it_left(bare):
 
 def test_the_darkest_face_under_everything_stays_in_range(face):
     dark = make_subject("darkest", seed=1, size=64)
-    surface = conditioned_surface(dark, CAMERA, LIGHT, dict.fromkeys(CONDITIONS, 1.0))
+    surface = conditioned_surface(dark, CAMERA, LIGHT, dict.fromkeys(CONDITION_NAMES, 1.0))
     packed = surface.packed()
     assert np.isfinite(packed).all()
     assert packed.min() >= 0.0

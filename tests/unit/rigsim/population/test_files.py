@@ -8,10 +8,10 @@ import pytest
 from model.store import write_exr
 from rigsim.fiber.probe_tissue import SkinTissue, TissueError
 from rigsim.population import files as subject_file
-from rigsim.population.files import named, read, record
+from rigsim.population.files import load_subject, read, record
 from rigsim.population.textures import SubjectFileError, texture
 from rigsim.subject import pigment
-from rigsim.subject.perfusion import STATES
+from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.person import make_subject
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
@@ -28,11 +28,11 @@ def person(tmp_path):
 
 
 def test_a_file_that_says_nothing_is_the_usual_preset(person):
-    assert read(person("")) == named("III")
+    assert read(person("")) == load_subject("III")
 
 
 def test_a_preset_by_its_name_is_the_face_of_that_preset():
-    by_name, made = named("V").face(seed=3, size=64), make_subject("V", seed=3, size=64)
+    by_name, made = load_subject("V").face(seed=3, size=64), make_subject("V", seed=3, size=64)
     np.testing.assert_array_equal(by_name.melanin, made.melanin)
     np.testing.assert_array_equal(by_name.hemoglobin("anger"), made.hemoglobin("anger"))
 
@@ -78,7 +78,7 @@ def test_textures_are_what_the_face_is_made_of(person, tmp_path, rng, ending):
     face = read(person(text)).face(seed=1, size=64)
     np.testing.assert_array_equal(face.melanin, own["melanin_map"])
     np.testing.assert_allclose(face.hemoglobin(), own["hemoglobin_map"], rtol=1e-5, atol=1e-9)
-    assert all(np.isfinite(face.hemoglobin(state)).all() for state in STATES)
+    assert all(np.isfinite(face.hemoglobin(state)).all() for state in STATE_NAMES)
     finer = read(person(text)).face(seed=1, size=128)
     inner = finer.melanin[1:-1, 1:-1]  # bilinear: a row is a quarter on from the first of the file
     down = 0.75 * own["melanin_map"][:-1] + 0.25 * own["melanin_map"][1:]
@@ -89,7 +89,7 @@ def test_the_patch_and_the_tissue_are_of_the_same_person(person):
     ann = read(person("melanin = 0.1\nblood = 1.5"))
     patch, plain = (
         ann.patch("cheek", seed=1, size_mm=0.3),
-        named("V").patch("cheek", seed=1, size_mm=0.3),
+        load_subject("V").patch("cheek", seed=1, size_mm=0.3),
     )
     assert patch.melanin_fraction == 0.1
     assert plain.melanin_fraction == pigment.MELANIN_PRESETS["V"]
@@ -232,7 +232,7 @@ def test_a_file_of_another_schema_or_of_none_is_refused(tmp_path):
 @pytest.mark.parametrize("text", ["VII", "ann", "none.toml"])
 def test_what_is_neither_a_preset_nor_a_file_is_refused(text):
     with pytest.raises(SubjectFileError, match=r"no such file|or a file NAME\.toml"):
-        subject_file.named(text)
+        subject_file.load_subject(text)
 
 
 def test_a_mesh_is_named_once(person, tmp_path):

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from rigsim.population import population
-from rigsim.population.population import GROUPS, Member, PopulationError, shifted, table_1
+from rigsim.population.population import (
+    POPULATION_GROUPS,
+    Member,
+    PopulationError,
+    shifted,
+    table_1,
+)
 from rigsim.subject import face_regions
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
@@ -16,12 +22,12 @@ PEOPLE = table_1()
 
 def test_the_groups_have_the_papers_numbers_and_ages():
     counts = Counter(p.group for p in PEOPLE)
-    assert [counts[g.name] for g in GROUPS] == [50, 5, 6, 20, 4, 2]
-    for group in GROUPS:
+    assert [counts[g.name] for g in POPULATION_GROUPS] == [50, 5, 6, 20, 4, 2]
+    for group in POPULATION_GROUPS:
         ages = [p.age_years for p in PEOPLE if p.group == group.name]
         assert (min(ages), max(ages)) == group.age_years
     worn = [p for p in PEOPLE if p.conditions]
-    assert {p.group for p in worn} == {g.name for g in GROUPS if g.wears}
+    assert {p.group for p in worn} == {g.name for g in POPULATION_GROUPS if g.wears}
     assert len(worn) == 8
     assert len({p.name for p in PEOPLE}) == len({p.seed for p in PEOPLE}) == 87
 
@@ -105,7 +111,7 @@ def test_a_shift_of_lotion_reaches_the_surface(rng):
     [
         ({"melanin": 0.5}, "melanin of P01: got 0.5"),
         ({"beard": -0.1}, "beard of P01"),
-        ({"head": population.HEADS}, "head of P01"),
+        ({"head": population.HEAD_SHAPES}, "head of P01"),
         ({"melanin": float("nan")}, "melanin of P01"),
         ({"applied": (("lotion", 0.5), ("lotion", 0.6))}, "twice"),
         ({"applied": (("mud", 0.5),)}, "mud"),
@@ -126,7 +132,7 @@ def test_faces_and_shifts_out_of_range_are_refused(rng):
 
 
 def test_the_palest_and_the_darkest_member_can_be_drawn():
-    low, high = population.MELANIN_RANGE
+    low, high = population.POPULATION_MELANIN_RANGE
     for melanin in (low, high):
         person: Member = dataclasses.replace(PEOPLE[1], melanin=melanin, age_years=90.0)
         skin, mask = person.r_d(64, CAMERA, LIGHT)

@@ -33,12 +33,12 @@ def test_a_file_that_is_no_library_ends_the_probe_not_this_process(tmp_path):
 
 
 @pytest.mark.skipif(
-    not any(0 < variant.major_version(path) < variant.OLDEST_LLVM for path in INSTALLED),
+    not any(0 < variant.major_version(path) < variant.MIN_LLVM_VERSION for path in INSTALLED),
     reason="no old LLVM library on this machine",
 )
 def test_a_real_old_library_is_refused_by_the_probe_too():
     for path in INSTALLED:
-        if 0 < variant.major_version(path) < variant.OLDEST_LLVM:
+        if 0 < variant.major_version(path) < variant.MIN_LLVM_VERSION:
             assert not variant.probe_library(path).usable
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rigsim.geometry.polygon_net import polygon_net
-from rigsim.skin_patch.microrelief import SITES, MicroSkin, MicroSkinError, make_micro_skin
+from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, MicroSkinError, make_micro_skin
 
 
 def slopes(skin: MicroSkin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -13,7 +13,7 @@ def slopes(skin: MicroSkin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return by_column, -by_row
 
 
-@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize("site", SITE_NAMES)
 @pytest.mark.parametrize("seed", [0, 5])
 def test_facets_of_every_site_are_tilted_by_11_to_20_degrees(site: str, seed: int) -> None:
     x, y = slopes(make_micro_skin(site, seed=seed, size_mm=3.0))
@@ -22,7 +22,7 @@ def test_facets_of_every_site_are_tilted_by_11_to_20_degrees(site: str, seed: in
 
 def test_sites_differ_in_depth_and_direction() -> None:
     deep, across = {}, {}
-    for site in SITES:
+    for site in SITE_NAMES:
         skins = [make_micro_skin(site, seed=seed, size_mm=3.0) for seed in range(3)]
         deep[site] = np.mean([skin.height_um.std() for skin in skins])
         across[site] = np.mean([slopes(s)[1].var() / slopes(s)[0].var() for s in skins])

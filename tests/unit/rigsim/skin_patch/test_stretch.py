@@ -10,7 +10,7 @@ from rigsim.skin_patch.equilibrium import (
     find_equilibrium,
     surface_rise,
 )
-from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
+from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import (
     Compensation,
     StretchedSkin,
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 SERIES = (0.73, 0.8, 0.9, 1.0, 1.12, 1.28)
 
 
-ONE_NOW = ["cheek", *(pytest.param(s, marks=pytest.mark.long) for s in SITES if s != "cheek")]
+ONE_NOW = ["cheek", *(pytest.param(s, marks=pytest.mark.long) for s in SITE_NAMES if s != "cheek")]
 """Every site, all but one in the long tests."""
 
 
@@ -273,7 +273,7 @@ def test_stretching_smooths_and_compressing_roughens_along_the_jaws(site: str) -
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize("site", SITE_NAMES)
 @pytest.mark.parametrize("seed", [2, 3, 4])
 @pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0])
 @pytest.mark.parametrize("compensation", ["volume", "none"])

@@ -12,15 +12,15 @@ from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.subject import face_regions, relief
 from rigsim.subject.expression_wrinkles import (
-    FURROW,
+    GROOVE_NARROWING,
     WrinkleLines,
     Wrinkles,
     depth_of,
     raise_wrinkles,
     wrinkle_lines,
 )
-from rigsim.subject.person import Subject, make_subject
-from rigsim.subject.wrinkle_zones import ZONES
+from rigsim.subject.person import SimulatedSubject, make_subject
+from rigsim.subject.wrinkle_zones import WRINKLE_ZONES
 
 SIZE = 320
 PLATE = 256
@@ -28,12 +28,12 @@ PLATE = 256
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=SIZE)
 
 
 @pytest.fixture(scope="module")
-def posed(face: Subject) -> Callable[..., Subject]:
+def posed(face: SimulatedSubject) -> Callable[..., SimulatedSubject]:
     return cache(face.posed)
 
 
@@ -128,8 +128,8 @@ def test_in_the_middle_of_a_zone_the_whole_excess_is_taken():
 def test_the_depth_of_a_wave_gives_its_length():
     """A wave of known depth, measured with a ruler of a thousandth of its length."""
     phase = np.linspace(-math.pi, math.pi, 20_001)
-    bell = np.exp(FURROW * (np.cos(phase) - 1.0))
-    shape = -bell / (1.0 - math.exp(-2.0 * FURROW))
+    bell = np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))
+    shape = -bell / (1.0 - math.exp(-2.0 * GROOVE_NARROWING))
     for excess in (0.003, 0.05, 0.3):
         depth = float(depth_of(excess))
         line = np.hypot(np.diff(phase) / (2.0 * math.pi), np.diff(depth * shape)).sum()
@@ -138,10 +138,10 @@ def test_the_depth_of_a_wave_gives_its_length():
 
 
 def test_waves_are_as_long_as_a_stiff_layer_on_a_soft_one_makes_them():
-    length = {zone.name: zone.wavelength_mm for zone in ZONES}
+    length = {zone.name: zone.wavelength_mm for zone in WRINKLE_ZONES}
     assert 6.0 < length["forehead"] < 9.0
     assert 2.0 < length["crow's feet"] < 3.5
-    thickness = {zone.name: zone.thickness_mm for zone in ZONES}
+    thickness = {zone.name: zone.thickness_mm for zone in WRINKLE_ZONES}
     ratio = length["forehead"] / length["crow's feet"]
     assert ratio == pytest.approx(thickness["forehead"] / thickness["crow's feet"])
 

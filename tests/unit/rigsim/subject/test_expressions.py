@@ -8,13 +8,13 @@ import pytest
 from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, centered, load_mesh
 from rigsim.subject import expressions, face_regions
 from rigsim.subject.expressions import (
-    EXPRESSIONS,
+    EXPRESSION_STRENGTHS,
     ExpressionError,
     displacement_mm,
     principal_stretches,
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
-from rigsim.subject.perfusion import STATES
+from rigsim.subject.perfusion import STATE_NAMES
 
 SCANNED_HEAD = Path(__file__).parents[5] / "shared" / "data" / "ict_face.npz"
 
@@ -74,12 +74,12 @@ def test_states_of_the_whole_body_and_rest_do_not_move_the_face(head):
     for state in ("neutral", "exercise", "alcohol"):
         assert not displacement_mm(head, state).any()
     assert not displacement_mm(head, "smile", amount=0.0).any()
-    assert {state for state in STATES if expressions.moves(state)} == set(EXPRESSIONS)
+    assert {state for state in STATE_NAMES if expressions.moves(state)} == set(EXPRESSION_STRENGTHS)
 
 
 def test_the_back_of_the_head_stays(head):
     back = head.vertices_mm[:, 2] < -85.0
-    for state in EXPRESSIONS:
+    for state in EXPRESSION_STRENGTHS:
         assert np.abs(displacement_mm(head, state, amount=1.5)[back]).max() < 0.3
 
 
@@ -95,7 +95,7 @@ def test_persons_have_strengths_of_their_own_and_are_not_quite_symmetric(head):
     )
 
 
-@pytest.mark.parametrize("state", sorted(EXPRESSIONS))
+@pytest.mark.parametrize("state", sorted(EXPRESSION_STRENGTHS))
 def test_no_triangle_folds_and_stretch_is_bounded_even_in_an_extreme(head, state):
     """Bounds: between 0.6 and 1.65 of the length in a full expression, 0.42 and 2 in an extreme."""
     for amount, low, high in ((1.0, 0.6, 1.65), (1.5, 0.42, 2.0)):
@@ -165,7 +165,7 @@ def test_a_mesh_moves_by_its_own_shapes_where_it_has_them(head):
 
 def test_blend_shapes_for_export_are_the_full_expressions(head):
     shapes = expressions.blend_shapes(head, seed=2)
-    assert set(shapes) == set(EXPRESSIONS)
+    assert set(shapes) == set(EXPRESSION_STRENGTHS)
     np.testing.assert_array_equal(shapes["fear"], displacement_mm(head, "fear", seed=2))
 
 
@@ -196,7 +196,7 @@ def test_a_head_with_blend_shapes_smiles_and_opens_its_mouth():
     assert way[0] > 2.0
     assert way[1] > 2.0
     assert at(mesh, "surprise", "chin")[1] < -3.0
-    for state in EXPRESSIONS:
+    for state in EXPRESSION_STRENGTHS:
         moved = mesh.vertices_mm + displacement_mm(mesh, state)
         stretch, folded = principal_stretches(mesh.vertices_mm, moved, mesh.faces)
         assert folded.mean() < 1e-3

@@ -11,7 +11,7 @@ from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import face_regions, landmarks
 from rigsim.subject.expressions import displacement_mm
-from rigsim.subject.person import Subject, make_subject
+from rigsim.subject.person import SimulatedSubject, make_subject
 from skinrig.simulating.flash_truth import landmarks_at_superpixels, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.
@@ -25,12 +25,12 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=128)
 
 
 @pytest.fixture(scope="module")
-def scenes(rig: Rig, face: Subject) -> dict[str, FlashScene]:
+def scenes(rig: Rig, face: SimulatedSubject) -> dict[str, FlashScene]:
     return {
         state: FlashScene(
             rig,

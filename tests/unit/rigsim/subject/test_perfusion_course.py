@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigsim.scenes.flash.course import LEVELS, parabola_weights
+from rigsim.scenes.flash.course import BLOOD_LEVELS, parabola_weights
 from rigsim.subject.perfusion import StateError
 from rigsim.subject.perfusion_course import CourseError, EventCourse, PromptedCourse, with_blood
 from rigsim.subject.person import make_subject
@@ -76,7 +76,7 @@ def test_partial_blood_lies_between_rest_and_the_state_and_ends_at_both():
 
 def test_the_parabola_is_exact_for_blood_that_goes_with_the_radius_squared():
     level = 0.37
-    values = [(1 + 0.3 * node) ** 2 for node in LEVELS]
+    values = [(1 + 0.3 * node) ** 2 for node in BLOOD_LEVELS]
     assert np.dot(parabola_weights(level), values) == pytest.approx((1 + 0.3 * level) ** 2)
     assert sum(parabola_weights(level)) == pytest.approx(1.0)
 

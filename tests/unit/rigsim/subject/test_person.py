@@ -9,20 +9,20 @@ from scipy import stats
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import Mesh, MeshError, MeshFileError, build_mesh, load_mesh
 from rigsim.subject import face_regions, relief
-from rigsim.subject.perfusion import STATES, StateError
-from rigsim.subject.person import PRESETS, Subject, SubjectError, make_subject
+from rigsim.subject.perfusion import STATE_NAMES, StateError
+from rigsim.subject.person import PRESET_NAMES, SimulatedSubject, SubjectError, make_subject
 from rigsim.subject.pigment import MELANIN_PRESETS
 
 SIZE = 256
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=SIZE)
 
 
 @pytest.fixture(scope="module")
-def regions(face: Subject) -> dict[str, np.ndarray]:
+def regions(face: SimulatedSubject) -> dict[str, np.ndarray]:
     return face_regions.region_masks(face_regions.on_mean_head(face.atlas.position_mm, face.mesh))
 
 
@@ -37,14 +37,14 @@ def test_the_same_seed_makes_the_same_face_and_another_seed_another(face):
     assert np.abs(face.mesh.vertices_mm - other.mesh.vertices_mm).max() > 0.5
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_every_preset_stays_inside_the_ranges_of_the_skin_model(preset):
     face = make_subject(preset, seed=1, size=96)
     assert 0.0005 < face.melanin.min()
     assert face.melanin.max() < 0.5
     typical = float(np.median(face.melanin))
     assert typical == pytest.approx(MELANIN_PRESETS[preset], rel=0.35)
-    for state in STATES:
+    for state in STATE_NAMES:
         blood = face.hemoglobin(state)
         assert 0.001 < blood.min()
         assert blood.max() < 0.32
@@ -53,7 +53,7 @@ def test_every_preset_stays_inside_the_ranges_of_the_skin_model(preset):
 
 
 def test_the_presets_span_the_stated_range_in_order():
-    values = [MELANIN_PRESETS[name] for name in PRESETS]
+    values = [MELANIN_PRESETS[name] for name in PRESET_NAMES]
     assert values == sorted(values)
     assert (values[0], values[-1]) == (0.005, 0.45)
 
@@ -108,7 +108,7 @@ def test_states_change_the_blood_where_they_should_and_nothing_else(face, region
         return float(face.hemoglobin(state)[inside].mean() / neutral[inside].mean())
 
     everywhere = np.ones_like(neutral, bool)
-    overall = {s: face.hemoglobin(s)[everywhere].mean() / neutral.mean() for s in STATES}
+    overall = {s: face.hemoglobin(s)[everywhere].mean() / neutral.mean() for s in STATE_NAMES}
     assert overall["neutral"] == 1.0
     assert overall["anger"] > 1.1 > 0.9 > overall["fear"]
     assert overall["exercise"] > 1.15

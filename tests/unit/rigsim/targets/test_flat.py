@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigsim.targets.flat import TARGETS, TargetError, make_target, patch_centers_mm
+from rigsim.targets.flat import TARGET_NAMES, TargetError, make_target, patch_centers_mm
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 
@@ -39,7 +39,7 @@ def test_patches_are_evenly_spaced_from_the_top_left():
     np.testing.assert_allclose(centers.mean(axis=(0, 1)), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", TARGET_NAMES)
 def test_every_target_faces_the_camera_and_reflects_no_more_than_it_gets(name):
     target = make_target(name)
     np.testing.assert_allclose(target.mesh.normals, [[0.0, 0.0, 1.0]] * 4)

@@ -164,7 +164,7 @@ def test_table_was_made_with_the_optics_of_today(table):
         np.testing.assert_allclose(table.provenance[name], now, rtol=1e-12)
     now = [skin_layers.epidermis_scattering_per_mm(nm) for nm in table.wavelength_nm]
     np.testing.assert_allclose(table.provenance["epidermis_scattering_per_mm"], now, rtol=1e-12)
-    assert table.provenance["g"] == skin_layers.ANISOTROPY
+    assert table.provenance["g"] == skin_layers.SKIN_ANISOTROPY
     assert table.provenance["eta"] == skin_layers.ETA
     assert table.provenance["epidermis_mm"] == skin_layers.EPIDERMIS_MM
     assert table.provenance["epidermal_blood_share"] == skin_layers.EPIDERMAL_BLOOD_SHARE

@@ -84,7 +84,7 @@ def test_points_without_anything_diffuse_are_fitted_by_lobes_alone(skin, basis):
 
 
 def test_the_darkest_person_has_a_surface_too(basis):
-    dark = dataclasses.replace(PERSON, melanin=population.MELANIN_RANGE[1])
+    dark = dataclasses.replace(PERSON, melanin=population.POPULATION_MELANIN_RANGE[1])
     rng = np.random.default_rng(4)
     data = brdf_space_datasets.dataset_b(60, members=(dark,), rng=rng)
     assert len(data.weights) + data.lost == 60

@@ -8,7 +8,7 @@ import pytest
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, transmitted
-from rigsim.geometry.atlas import spread, unwrap
+from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.geometry import GeometryError, own_mesh, parse_mesh, read_mesh
@@ -64,7 +64,7 @@ def matt():
 def model_on(mesh, basis, *, r_d=(1.0, 1.0, 1.0), weight=1.0, size=32):
     atlas = unwrap(mesh, size)
     shape = (size, size)
-    layers = spread(
+    layers = dilate_texture(
         np.concatenate([atlas.position_mm, atlas.normal], -1), atlas.covered, steps=size
     )
     normals = layers[..., 3:] / np.linalg.norm(layers[..., 3:], axis=-1, keepdims=True)

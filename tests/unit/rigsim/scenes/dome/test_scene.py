@@ -10,7 +10,7 @@ import pytest
 from capture.rig import Rig, load_rig
 from rigsim.as_built.dome import BuiltDome, Tolerances, bend, build
 from rigsim.light import olat
-from rigsim.light.led_light import METER_RATE_PER_S
+from rigsim.light.led_light import DOME_METER_RATE_PER_S
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
@@ -91,7 +91,7 @@ def test_white_tile_gets_what_intensity_lobe_cosine_and_distance_say(rig, white)
 def test_white_reference_facing_the_meter_led_gets_the_meter_rate(white):
     image = white.radiance("C", [0])[0]
     middle = image[image.shape[0] // 2, image.shape[1] // 2]
-    assert middle.max() == pytest.approx(0.99 * METER_RATE_PER_S, rel=1e-3)
+    assert middle.max() == pytest.approx(0.99 * DOME_METER_RATE_PER_S, rel=1e-3)
     np.testing.assert_allclose(middle / middle.max(), white.white_rgb(), rtol=1e-5)
 
 

@@ -7,7 +7,13 @@ import pytest
 from capture.rig import load_rig
 from rigsim.as_built.dome import Tolerances, bend, build, image_of, pixel_corner_rays, unbend
 from rigsim.light.led_light import white_intensity
-from rigsim.scenes.dome.targets import PLACES, TargetError, TargetScene, plate_normals, target_scene
+from rigsim.scenes.dome.targets import (
+    TARGET_POSES,
+    TargetError,
+    TargetScene,
+    plate_normals,
+    target_scene,
+)
 from rigsim.sensor import vignetting_map
 from rigsim.targets import mirror_ball, printed_plate
 
@@ -145,7 +151,7 @@ def test_the_light_of_an_led_in_a_ball_is_conserved():
     magnification = 1.0 / (1.0 + 2.0 * d / 50.0)
     area_px = np.pi * (10.0 * magnification * view.focal_px / np.linalg.norm(eye - point)) ** 2
     strength = white_intensity(RIG.lights[frontal], view)[1]
-    expected = mirror_ball.REFLECTANCE * strength / 10.0**2 * area_px
+    expected = mirror_ball.CHROMIUM_REFLECTANCE * strength / 10.0**2 * area_px
     # the image lies half a radius behind the surface and the angle is not quite 0
     assert flux == pytest.approx(expected, rel=0.15)
 
@@ -197,4 +203,4 @@ def test_targets_that_do_not_exist_are_refused():
         scene.exposure("C07", pops=[Pulse(0, 1.5, 0, 1)], exposure_s=1.0, seed=0)
     with pytest.raises(TargetError, match="no view 'C00'"):
         scene.light("C00", lit(0))
-    assert len(plate_normals()) == PLACES["white"]
+    assert len(plate_normals()) == TARGET_POSES["white"]

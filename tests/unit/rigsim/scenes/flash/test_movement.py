@@ -10,7 +10,7 @@ from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
-from rigsim.subject.person import Subject, make_subject
+from rigsim.subject.person import SimulatedSubject, make_subject
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.flash_truth import truth_of
 
@@ -24,32 +24,34 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=160)
 
 
-def scene_of(rig: Rig, face: Subject, state: str, lateral: bool = False, **kwargs) -> FlashScene:
+def scene_of(
+    rig: Rig, face: SimulatedSubject, state: str, lateral: bool = False, **kwargs
+) -> FlashScene:
     effects = SceneEffects(lateral=lateral, interreflections=False)
     return FlashScene(rig, face, state=state, effects=effects, **({"choice": EMBREE} | kwargs))
 
 
 @pytest.fixture(scope="module")
-def rest(rig: Rig, face: Subject) -> FlashScene:
+def rest(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "neutral")
 
 
 @pytest.fixture(scope="module")
-def smile(rig: Rig, face: Subject) -> FlashScene:
+def smile(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "smile")
 
 
 @pytest.fixture(scope="module")
-def tired(rig: Rig, face: Subject) -> FlashScene:
+def tired(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "exercise")
 
 
 @pytest.fixture(scope="module")
-def still(rig: Rig, face: Subject) -> FlashScene:
+def still(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "smile", movement=False)
 
 

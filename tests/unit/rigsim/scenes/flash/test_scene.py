@@ -9,13 +9,13 @@ import pytest
 
 from capture.calibration.color.chart import find_chart
 from capture.rig import Rig, load_rig
-from rigsim.as_built.polarizers import IDEAL, FilmError, Films, films_of
+from rigsim.as_built.polarizers import IDEAL_POLARIZERS, PolarizerError, Polarizers, draw_polarizers
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import FLAT_LEVEL, METER_LEVEL, FlashScene
 from rigsim.sensor import sensor_of
-from rigsim.subject.person import Subject, make_subject
+from rigsim.subject.person import SimulatedSubject, make_subject
 from rigsim.targets.flat import make_target, patch_centers_mm
 
 # Embree traces the rays, so these tests need no Mitsuba.
@@ -39,7 +39,7 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=256)
 
 
@@ -52,17 +52,17 @@ def scene_of(rig: Rig, subject, *, lateral=None, optics=None, **kwargs) -> Flash
 
 
 @pytest.fixture(scope="module")
-def ideal(rig: Rig, face: Subject) -> FlashScene:
-    return scene_of(rig, face, films=IDEAL, lateral=False, optics=False)
+def ideal(rig: Rig, face: SimulatedSubject) -> FlashScene:
+    return scene_of(rig, face, films=IDEAL_POLARIZERS, lateral=False, optics=False)
 
 
 @pytest.fixture(scope="module")
-def real(rig: Rig, face: Subject) -> FlashScene:
+def real(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, subpixels=2)
 
 
 def test_a_white_tile_gives_the_metered_level_behind_parallel_and_crossed_films(rig):
-    scene = scene_of(rig, make_target("white"), films=IDEAL)
+    scene = scene_of(rig, make_target("white"), films=IDEAL_POLARIZERS)
     crossed, parallel = scene.radiance("crossed"), scene.radiance("parallel")
     middle = crossed[rig.views[0].height_px // 2, WIDTH // 2]
     np.testing.assert_allclose(middle, 0.99 * scene.white_rgb(), rtol=1e-3)
@@ -71,7 +71,7 @@ def test_a_white_tile_gives_the_metered_level_behind_parallel_and_crossed_films(
 
 
 def test_light_on_the_tile_falls_with_cosine_and_inverse_square(rig):
-    scene = scene_of(rig, make_target("white"), films=IDEAL)
+    scene = scene_of(rig, make_target("white"), films=IDEAL_POLARIZERS)
     view = rig.views[0]
     image = scene.radiance("crossed")[..., 1] / (0.99 * scene.white_rgb()[1])
     step_mm = view.distance_mm / view.focal_px
@@ -155,7 +155,7 @@ def test_images_behind_crossed_analysers_add_up_to_a_constant(real):
 
 
 def test_the_metal_target_goes_dark_behind_the_crossed_analyser_as_the_films_say(rig):
-    films = Films(light_extinction=2000.0, analyser_extinction=3000.0, analyser_zero_deg=1.0)
+    films = Polarizers(light_extinction=2000.0, analyser_extinction=3000.0, analyser_zero_deg=1.0)
     scene = scene_of(rig, make_target("malus"), films=films)
     middle = np.s_[rig.views[0].height_px // 2, WIDTH // 2]
     angles = np.arange(0.0, 181.0, 15.0)
@@ -191,7 +191,7 @@ def test_exposures_scale_with_the_power_of_the_pops_and_add_up(rig, face):
         sensor_of(rig.views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0),
         read_noise_e=0.0,
     )
-    scene = scene_of(rig, make_target("white"), sensor=quiet, films=IDEAL)
+    scene = scene_of(rig, make_target("white"), sensor=quiet, films=IDEAL_POLARIZERS)
 
     def mean(*pops: Fired) -> float:
         frame = scene.exposure("cam", pops=pops, exposure_s=0.01, seed=3)
@@ -223,7 +223,7 @@ def test_the_same_seed_gives_the_same_frame_and_another_seed_another(real):
 
 
 def test_exercise_reddens_the_cheeks_and_leaves_the_melanin(rig, face, ideal):
-    tired = scene_of(rig, face, state="exercise", films=IDEAL, lateral=False)
+    tired = scene_of(rig, face, state="exercise", films=IDEAL_POLARIZERS, lateral=False)
     before, after = ideal.truth(), tired.truth()
     np.testing.assert_array_equal(before["melanin"], after["melanin"])
     x, y = before["position_mm"][..., 0], before["position_mm"][..., 1]
@@ -266,12 +266,12 @@ def test_truth_is_finite_and_normals_are_unit_vectors_towards_the_camera(real):
 
 
 def test_the_films_of_a_rig_follow_from_its_serial_number(rig):
-    films = films_of(rig)
-    assert films == films_of(rig)
+    films = draw_polarizers(rig)
+    assert films == draw_polarizers(rig)
     assert 1500.0 <= films.light_extinction <= 6000.0
     assert abs(films.analyser_zero_deg) <= 1.2
     view = dataclasses.replace(rig.views[0], serial="SR-0002")
-    assert films_of(dataclasses.replace(rig, views=(view,))) != films
+    assert draw_polarizers(dataclasses.replace(rig, views=(view,))) != films
 
 
 def test_what_is_left_out_is_said_with_its_reason(real, ideal, rig):
@@ -291,9 +291,9 @@ def test_wrong_wishes_are_named(rig, face, real):
         scene_of(rig, make_target("white")).truth()
     with pytest.raises(SceneError, match="no view 'cam2'"):
         real.radiance("crossed", view_name="cam2")
-    with pytest.raises(FilmError, match="polarizer: got 'cross'"):
+    with pytest.raises(PolarizerError, match="polarizer: got 'cross'"):
         real.radiance("cross")
     with pytest.raises(SceneError, match=r"power of pop 't1': got 1\.5"):
         real.exposure("cam", pops=(Fired(power=1.5),), exposure_s=0.0, seed=0)
-    with pytest.raises(FilmError, match=r"light_extinction: got 1\.0"):
-        Films(1.0, 2.0, 0.0)
+    with pytest.raises(PolarizerError, match=r"light_extinction: got 1\.0"):
+        Polarizers(1.0, 2.0, 0.0)

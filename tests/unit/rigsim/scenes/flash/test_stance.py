@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
-from rigsim.as_built.polarizers import IDEAL
+from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.depth_of_field import facing_depths
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
-from rigsim.subject.person import Subject, SubjectError, make_subject
+from rigsim.subject.person import SimulatedSubject, SubjectError, make_subject
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192
 NEARER_MM = 50.0
-PLAIN = {"choice": EMBREE, "films": IDEAL}
+PLAIN = {"choice": EMBREE, "films": IDEAL_POLARIZERS}
 
 
-def scene_of(rig: Rig, face: Subject, *, optics: bool) -> FlashScene:
+def scene_of(rig: Rig, face: SimulatedSubject, *, optics: bool) -> FlashScene:
     effects = SceneEffects(lateral=False, interreflections=False, optics=optics)
     return FlashScene(rig, face, effects=effects, **PLAIN)
 
@@ -29,17 +29,19 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def face() -> Subject:
+def face() -> SimulatedSubject:
     return make_subject("II", seed=4, size=160)
 
 
 @pytest.fixture(scope="module")
-def nearer(face: Subject) -> Subject:
+def nearer(face: SimulatedSubject) -> SimulatedSubject:
     return face.moved_by((0.0, 0.0, NEARER_MM))
 
 
 @pytest.fixture(scope="module")
-def places(rig: Rig, face: Subject, nearer: Subject) -> tuple[FlashScene, FlashScene]:
+def places(
+    rig: Rig, face: SimulatedSubject, nearer: SimulatedSubject
+) -> tuple[FlashScene, FlashScene]:
     here, there = (scene_of(rig, one, optics=False) for one in (face, nearer))
     return here, there
 

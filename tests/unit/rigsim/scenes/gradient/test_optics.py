@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.as_built.sphere import SphereError, as_drawn, build_sphere
+from rigsim.as_built.sphere import SphereError, build_sphere, nominal_sphere
 from rigsim.light.lobe_moments import MomentError, Surface, build_table, direct_moments, ripple
 from rigsim.light.self_shadow import HorizonError, horizon_tangent
 from rigsim.render.lens_blur import BlurError, Lens, blur, lens_of
@@ -24,7 +24,7 @@ def rig():
 
 @pytest.fixture(scope="module")
 def sphere(rig):
-    return as_drawn(rig)
+    return nominal_sphere(rig)
 
 
 def surface(rig, alpha):

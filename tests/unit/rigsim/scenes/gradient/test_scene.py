@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.as_built.polarizers import IDEAL
+from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.gradient.resolution import Waves, wavy_scene
-from rigsim.scenes.gradient.scene import FLAT_REFLECTANCE, METER_RATE_PER_S, GradientScene
+from rigsim.scenes.gradient.scene import FLAT_REFLECTANCE, GRADIENT_METER_RATE_PER_S, GradientScene
 from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.sensor import fixed_pattern
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -58,10 +58,10 @@ def scene(rig, skin):
 
 def test_a_diffuser_gets_its_part_of_the_meter_rate_behind_either_analyser(rig):
     """Tolerance: the corner of the field, and what the sphere as drawn is off its unit (none)."""
-    flat = GradientScene(rig, "flat", films=IDEAL)
+    flat = GradientScene(rig, "flat", films=IDEAL_POLARIZERS)
     for reading in (0.0, 90.0, 37.0):
         image = flat.radiance("full", analyser_deg=reading)
-        np.testing.assert_allclose(image, FLAT_REFLECTANCE * METER_RATE_PER_S, rtol=1e-4)
+        np.testing.assert_allclose(image, FLAT_REFLECTANCE * GRADIENT_METER_RATE_PER_S, rtol=1e-4)
 
 
 def test_every_pattern_is_the_sum_of_its_leds(rig, flat_skin):
@@ -103,7 +103,7 @@ def test_slopes_towards_the_right_and_the_top_are_bright_under_x_and_y(scene):
 def test_crossed_polarizers_remove_the_surface_reflection_of_a_flat_patch(rig, flat_skin):
     """Black skin, ideal films: what is left in the middle is what is off the central view."""
     black = dataclasses.replace(flat_skin, albedo=np.zeros_like(flat_skin.albedo))
-    scene = GradientScene(rig, black, films=IDEAL, table_size=33)
+    scene = GradientScene(rig, black, films=IDEAL_POLARIZERS, table_size=33)
     moments = scene.moments(NEUTRAL)
     leak = moments["crossed"][0] / moments["parallel"][0]
     assert leak.max() < 0.02

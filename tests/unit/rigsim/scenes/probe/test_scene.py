@@ -20,7 +20,7 @@ from rigsim.as_built.probe import (
 from rigsim.boxes.probe import SourceLight
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.probe.scene import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene
+from rigsim.scenes.probe.scene import DARK_E_PER_S, PROBE_METER_RATE_PER_S, ProbeScene
 from rigsim.world.suction import HeadState
 
 RIG = load_rig("probe")
@@ -126,7 +126,7 @@ def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
     )
     reflectance = noiseless.profile(CHEEK).reflectance_per_mm2
     taken = noiseless.build.crosstalk @ (noiseless.build.gain[:, None] * reflectance)
-    light = METER_RATE_PER_S * exposure_s * taken * noiseless.white
+    light = PROBE_METER_RATE_PER_S * exposure_s * taken * noiseless.white
     images = unit_images(noiseless.build, VIEW)
     x, y = noiseless.build.spot_px[2].round().astype(int)
     box = np.s_[y - 16 : y + 16, x - 16 : x + 16]
@@ -193,7 +193,7 @@ def test_covered_fibres_pass_a_hundred_thousandth(scene):
     assert share[0] == pytest.approx(1.0, rel=2e-3)
     leak = scene.build.crosstalk[1, 0] * scene.build.gain[0]
     reflectance = scene.profile(CHEEK).reflectance_per_mm2[:, 1]
-    assert masked[1, 1] / (METER_RATE_PER_S * scene.white[1]) == pytest.approx(
+    assert masked[1, 1] / (PROBE_METER_RATE_PER_S * scene.white[1]) == pytest.approx(
         leak * reflectance[0] + 1e-5 * scene.build.gain[1] * reflectance[1], rel=1e-3
     )
 

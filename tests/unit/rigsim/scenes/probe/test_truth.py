@@ -11,8 +11,8 @@ import pytest
 
 from capture.rig import load_rig
 from model import store
-from rigsim.fiber.homogeneous_fit import FAINTEST_PER_MM2, FitError, nearest_medium
-from rigsim.fiber.probe_tissue import PHANTOM, HomogeneousTissue
+from rigsim.fiber.homogeneous_fit import MIN_REFLECTANCE_PER_MM2, FitError, nearest_medium
+from rigsim.fiber.probe_tissue import PHANTOM_BLOCK, HomogeneousTissue
 from rigsim.fiber.profile import Fibres, fibre_profile
 from rigsim.fiber.white_fiber import WhiteFibre, WhiteFibreError
 from rigsim.scenes.probe.scene import ProbeScene, Probing
@@ -56,7 +56,7 @@ def test_the_nearest_medium_of_a_homogeneous_one_is_itself(sigma_a, scattering):
     assert fit.sigma_tr_per_mm == pytest.approx(true, rel=0.02)
     assert abs(math.log(fit.sigma_a_per_mm / sigma_a)) < 0.1
     assert fit.residual == pytest.approx(noise, rel=0.6)
-    assert fit.fibres == int((value >= FAINTEST_PER_MM2).sum())
+    assert fit.fibres == int((value >= MIN_REFLECTANCE_PER_MM2).sum())
 
 
 def test_the_fit_finds_out_a_wrong_medium():
@@ -104,9 +104,9 @@ def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
 
 
 def test_the_truth_of_a_spectral_medium_lies_between_its_wavelengths():
-    scene = ProbeScene(RIG, PHANTOM, photons=1)
+    scene = ProbeScene(RIG, PHANTOM_BLOCK, photons=1)
     (entry,) = ground_truth(scene, [Probing("phantom", 0, 0.0, 60.0)]).parameters["profiles"]
-    sigma_a = np.array(PHANTOM.sigma_a_per_mm)
+    sigma_a = np.array(PHANTOM_BLOCK.sigma_a_per_mm)
     for value in entry["sigma_a_per_mm"]:
         assert 0.98 * sigma_a.min() < value < 1.02 * sigma_a.max()
     assert max(entry["fit_residual"]) < 0.02
