@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
+from skinrig.appearances.contents import versions
 
 DYNAMIC_KIND = "dynamic"
 FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
@@ -117,7 +117,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
         source="simulated" if "simulated" in sources else "measured",
         parameters={"kind": DYNAMIC_KIND, "parts": parts},
         inputs={**inputs, **{f"{name}: {key}": value for key, value in part.inputs.items()}},
-        versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+        versions=versions(),
         left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
         files={**files, **part.files},
         seed=seed,

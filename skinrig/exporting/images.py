@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.drawing import png
-from skinrig.exporting.options import FIRST_TILE, Delivery
+from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -69,6 +69,21 @@ class Image:
     high: float | None = None
     valid: BoolArray | None = None
     filler: tuple[float, ...] | None = None
+
+    @staticmethod
+    def of_normals(
+        name: str,
+        normals: FloatArray,
+        delivery: Delivery,
+        what: str,
+        *,
+        valid: BoolArray | None = None,
+        filler: tuple[float, ...] | None = None,
+    ) -> Image:
+        """Return a map of normals, +Y up, with the green that is asked for."""
+        flip = np.array([1.0, NORMAL_Y[delivery.normal_y], 1.0], np.float32)
+        ranges: dict[str, Any] = {"low": -1.0, "high": 1.0, "valid": valid, "filler": filler}
+        return Image(name=name, values=normals * flip, unit="1", what=what, **ranges)
 
     def on_empty_tile(self) -> Image:
         """Return the image of a tile where nothing was measured, of one value."""
@@ -135,6 +150,11 @@ class ImageFolder:
             (self.root / names[-1]).write_bytes(png.encode(codes, quick=True))
             self._record(names[-1], one, told)
         return names[0]
+
+    def both(self, image: Image) -> str:
+        """Write a float EXR and a 16-bit PNG a tile; return the first PNG's name."""
+        self.exr(image)
+        return self.png(image)
 
     def _by_tile(self, image: Image) -> list[tuple[int, Image]]:
         empty = [(tile, image.on_empty_tile()) for tile in self.tiles[1:]]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
+from skinrig.appearances.contents import jointly_valid
 from skinrig.exporting.images import (
     CAMERA_SPACE,
     DATA_SPACE,
@@ -102,7 +104,7 @@ def _document(
     return {
         "schema": SCHEMA,
         "orientation": IMAGE_ORIENTATION,
-        "normal_y": "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)",
+        "normal_y": delivery.green,
         "udim": "none" if delivery.udim == "none" else "tile 1001",
         "rig_frame": "mm, +x right, +y up, +z towards the main camera",
         "files": dict(sorted(files.items())),
@@ -148,33 +150,20 @@ def _is_normals(name: str, one: SkinMap) -> bool:
 def _errors(name: str, one: SkinMap, out: ImageFolder) -> None:
     if one.stderr is not None:
         unit = "rad" if _is_normals(name, one) else one.unit
+        what = f"standard error of {name}, 68 %"
         out.exr(
-            Image(
-                name=f"{name}.stderr",
-                values=one.stderr,
-                unit=unit,
-                what=f"standard error of {name}, 68 %",
-                valid=one.valid,
-            )
+            Image(name=f"{name}.stderr", values=one.stderr, unit=unit, what=what, valid=one.valid)
         )
-    valid = np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
-    out.exr(
-        Image(
-            name=f"{name}.valid",
-            values=valid.astype(np.float32),
-            unit="1",
-            what=f"1 where {name} means something, else 0",
-        )
-    )
+    mask = jointly_valid(one).astype(np.float32)
+    what = f"1 where {name} means something, else 0"
+    out.exr(Image(name=f"{name}.valid", values=mask, unit="1", what=what))
 
 
 def _packed(appearance: SkinAppearance) -> Image | None:
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:
         return None
-    valid = np.ones(melanin.values.shape, bool)
-    for one in (melanin, blood):
-        valid &= True if one.valid is None else one.valid
+    valid = jointly_valid(melanin, blood)
     layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
     what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
     return Image(
@@ -186,17 +175,7 @@ def _packed_png(packed: Image, out: ImageFolder) -> None:
     """Write the pack with the ranges of its channels: values times 2 and 4, blue 0."""
     scale = np.array([2.0, 4.0, 1.0], np.float32)
     what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
-    out.png(
-        Image(
-            name=packed.name,
-            values=packed.values * scale,
-            unit="1",
-            what=what,
-            low=0.0,
-            high=1.0,
-            valid=packed.valid,
-        )
-    )
+    out.png(replace(packed, values=packed.values * scale, what=what, low=0.0, high=1.0))
 
 
 def _tangent_normals(
@@ -219,19 +198,9 @@ def _tangent_normals(
     except GeometryError as error:
         return None, str(error)
     axes, covered = FramedMesh.of(mesh).texel_frames(height)
-    y = NORMAL_Y[delivery.normal_y]
     valid = covered if one.valid is None else covered & one.valid
     turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
-    turned = turned * np.array([1.0, y, 1.0], np.float32)
-    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
-    image = Image(
-        name="normal_tangent",
-        values=turned,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        valid=valid,
-        what=f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules), {green}",
-    )
-    out.exr(image)
-    return out.png(image), ""
+    what = f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules)"
+    what = f"{what}, {delivery.green}"
+    image = Image.of_normals("normal_tangent", turned, delivery, what, valid=valid)
+    return out.both(image), ""

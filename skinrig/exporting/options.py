@@ -72,6 +72,11 @@ class Delivery:
             if not _NAME_PATTERN.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names joined by commas")
 
+    @property
+    def green(self) -> str:
+        """What growing green of a normal map means, for people."""
+        return "+Y (OpenGL)" if NORMAL_Y[self.normal_y] > 0 else "-Y (DirectX)"
+
     def unit_or(self, default: str) -> str:
         """Return the scene unit, or a format's own where none is asked for."""
         return default if self.unit is None else self.unit

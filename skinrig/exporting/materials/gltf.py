@@ -1,8 +1,7 @@
 """A mesh with its material and blend shapes as one binary glTF 2.0 file.
 
-Written by hand: JSON, and a binary chunk of accessors and PNG images. Lengths are metres and
-texture coordinates grow downwards, as the standard has it. glTF has no place for subsurface light:
-sigma_tr goes into ``extras``.
+Lengths are metres and texture coordinates grow downwards, as the standard has it. glTF has no place
+for subsurface light: sigma_tr goes into ``extras``.
 
 References
 ----------
@@ -11,14 +10,13 @@ glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_spe
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pygltflib
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
@@ -33,57 +31,43 @@ from skinrig.exporting.sealing import write_json
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
-MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-FLOAT, UNSIGNED_INT = 5126, 5125
-VERTICES, INDICES = 34962, 34963
-"""What a view of the buffer is for."""
 
 
 @dataclass(slots=True)
-class _Buffer:
-    """The binary chunk while it grows, and what refers to it."""
+class _Binary:
+    """The binary chunk of a file while it grows."""
 
+    file: pygltflib.GLTF2
     data: bytearray = field(default_factory=bytearray)
-    views: list[dict[str, Any]] = field(default_factory=list)
-    accessors: list[dict[str, Any]] = field(default_factory=list)
 
     def view(self, content: bytes, target: int | None = None) -> int:
         self.data += b"\0" * (-len(self.data) % 4)
-        entry: dict[str, Any] = {
-            "buffer": 0,
-            "byteOffset": len(self.data),
-            "byteLength": len(content),
-        }
-        if target is not None:
-            entry["target"] = target
-        self.data += content
-        self.views.append(entry)
-        return len(self.views) - 1
-
-    def vectors(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        rows = np.ascontiguousarray(values, "<f4")
-        entry: dict[str, Any] = {
-            "bufferView": self.view(rows.tobytes(), VERTICES),
-            "componentType": FLOAT,
-            "count": len(rows),
-            "type": f"VEC{rows.shape[1]}",
-        }
-        if bounds:
-            entry["min"], entry["max"] = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
-        self.accessors.append(entry)
-        return len(self.accessors) - 1
-
-    def indices(self, faces: NDArray[Any]) -> int:
-        flat = np.ascontiguousarray(faces.reshape(-1), "<u4")
-        self.accessors.append(
-            {
-                "bufferView": self.view(flat.tobytes(), INDICES),
-                "componentType": UNSIGNED_INT,
-                "count": len(flat),
-                "type": "SCALAR",
-            }
+        self.file.bufferViews.append(
+            pygltflib.BufferView(
+                buffer=0, byteOffset=len(self.data), byteLength=len(content), target=target
+            )
         )
-        return len(self.accessors) - 1
+        self.data += content
+        return len(self.file.bufferViews) - 1
+
+    def accessor(self, values: NDArray[Any], *, bounds: bool = False) -> int:
+        """Add rows of vectors as floats, or a row of integers as indices; return the number."""
+        vectors = values.ndim == 2
+        rows = np.ascontiguousarray(values, "<f4" if vectors else "<u4")
+        self.file.accessors.append(
+            pygltflib.Accessor(
+                bufferView=self.view(
+                    rows.tobytes(),
+                    pygltflib.ARRAY_BUFFER if vectors else pygltflib.ELEMENT_ARRAY_BUFFER,
+                ),
+                componentType=pygltflib.FLOAT if vectors else pygltflib.UNSIGNED_INT,
+                count=len(rows),
+                type=f"VEC{rows.shape[1]}" if vectors else pygltflib.SCALAR,
+                min=rows.min(axis=0).tolist() if bounds else None,
+                max=rows.max(axis=0).tolist() if bounds else None,
+            )
+        )
+        return len(self.file.accessors) - 1
 
 
 def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -168,79 +152,71 @@ def content(material: Material) -> bytes:
     material
         In mm.
     """
-    mesh, buffer = material.mesh, _Buffer()
-    attributes = {
-        "POSITION": buffer.vectors(mesh.vertices_mm * M_PER_MM, bounds=True),
-        "NORMAL": buffer.vectors(mesh.normals),
+    mesh = material.mesh
+    file = pygltflib.GLTF2(
+        asset=pygltflib.Asset(generator=f"skinrig {version('skinrig')}"),
+        scene=0,
+        scenes=[pygltflib.Scene(nodes=[0])],
+        nodes=[pygltflib.Node(mesh=0, name="skin")],
+        materials=[_material(material)],
+        samplers=[
+            pygltflib.Sampler(
+                magFilter=pygltflib.LINEAR,
+                minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
+                wrapS=pygltflib.CLAMP_TO_EDGE,
+                wrapT=pygltflib.CLAMP_TO_EDGE,
+            )
+        ],
+        extensionsUsed=["KHR_materials_ior", "KHR_materials_specular"],
+    )
+    binary = _Binary(file)
+    attributes = pygltflib.Attributes(
+        POSITION=binary.accessor(mesh.vertices_mm * M_PER_MM, bounds=True),
+        NORMAL=binary.accessor(mesh.normals),
         # v grows downwards here: the third axis keeps its meaning, along falling v
-        "TANGENT": buffer.vectors(mesh.tangents),
-        "TEXCOORD_0": buffer.vectors(np.column_stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]])),
-    }
+        TANGENT=binary.accessor(mesh.tangents),
+        TEXCOORD_0=binary.accessor(np.column_stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]])),
+    )
     targets = [
-        {"POSITION": buffer.vectors(moved * M_PER_MM, bounds=True)}
+        pygltflib.Attributes(POSITION=binary.accessor(moved * M_PER_MM, bounds=True))
         for moved in material.shapes.values()
     ]
-    primitive: dict[str, Any] = {
-        "attributes": attributes,
-        "indices": buffer.indices(mesh.faces),
-        "material": 0,
-        "mode": 4,
-    }
-    shape: dict[str, Any] = {"name": "skin", "primitives": [primitive]}
-    if targets:
-        primitive["targets"] = targets
-        shape["weights"] = [0.0] * len(targets)
-        shape["extras"] = {"targetNames": list(material.shapes)}
-    images = [
-        {"name": name, "mimeType": "image/png", "bufferView": buffer.view(data)}
-        for name, data in _pictures(material)
-    ]
-    document = {
-        "asset": {"version": "2.0", "generator": f"skinrig {version('skinrig')}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "skin", "mesh": 0}],
-        "meshes": [shape],
-        "materials": [_material(material)],
-        "textures": [{"source": k, "sampler": 0} for k in range(len(images))],
-        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": images,
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.data) + -len(buffer.data) % 4}],
-        "extensionsUsed": ["KHR_materials_ior", "KHR_materials_specular"],
-    }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
-    total = 12 + 8 + len(text) + 8 + len(binary)
-    return b"".join(
-        [
-            struct.pack("<III", MAGIC, 2, total),
-            struct.pack("<II", len(text), JSON_CHUNK),
-            text,
-            struct.pack("<II", len(binary), BINARY_CHUNK),
-            binary,
-        ]
+    indices = binary.accessor(mesh.faces.reshape(-1))
+    surface = pygltflib.Primitive(
+        attributes=attributes, indices=indices, material=0, targets=targets
     )
+    extras = {"targetNames": list(material.shapes)} if targets else {}
+    file.meshes = [
+        pygltflib.Mesh(
+            primitives=[surface], weights=[0.0] * len(targets), name="skin", extras=extras
+        )
+    ]
+    for source, (name, data) in enumerate(_pictures(material)):
+        file.images.append(
+            pygltflib.Image(mimeType="image/png", bufferView=binary.view(data), name=name)
+        )
+        file.textures.append(pygltflib.Texture(sampler=0, source=source))
+    binary.data += b"\0" * (-len(binary.data) % 4)
+    file.buffers = [pygltflib.Buffer(byteLength=len(binary.data))]
+    file.set_binary_blob(bytes(binary.data))
+    return b"".join(file.save_to_bytes())
 
 
-def _material(material: Material) -> dict[str, Any]:
-    return {
-        "name": "Skin",
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
-            "metallicRoughnessTexture": {"index": 1},
-        },
-        "normalTexture": {"index": 2, "scale": 1.0},
-        "extensions": {
+def _material(material: Material) -> pygltflib.Material:
+    return pygltflib.Material(
+        name="Skin",
+        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
+            baseColorTexture=pygltflib.TextureInfo(index=0),
+            metallicFactor=0.0,
+            metallicRoughnessTexture=pygltflib.TextureInfo(index=1),
+        ),
+        normalTexture=pygltflib.NormalMaterialTexture(index=2),
+        extensions={
             "KHR_materials_ior": {"ior": float(material.eta)},
             "KHR_materials_specular": {"specularFactor": 1.0, "specularTexture": {"index": 3}},
         },
-        "extras": {"subsurface": material.sigma_tr()},
-    }
+        extras={"subsurface": material.sigma_tr()},
+    )
 
 
 def _pictures(material: Material) -> list[tuple[str, bytes]]:

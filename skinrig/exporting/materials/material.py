@@ -10,13 +10,14 @@ import numpy as np
 
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
+from skinrig.appearances.contents import assumed_by
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError
 from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
-from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
+from skinrig.exporting.options import FIRST_TILE, Delivery
 from skinrig.exporting.sealing import ExportError
 
 COLOR_NOTE: Final = (
@@ -197,9 +198,7 @@ class Material:
 
     def all_assumed(self, appearance: SkinAppearance) -> list[str]:
         """Return what was assumed by the maps and by the model, each once."""
-        told = appearance.parameters.get("assumed", [])
-        before = [str(text) for text in told] if isinstance(told, list | tuple) else []
-        return list(dict.fromkeys([*before, *self.assumed]))
+        return list(dict.fromkeys([*assumed_by(appearance), *self.assumed]))
 
     def figures(self) -> dict[str, Any]:
         """Return how well the material stands for the model, as JSON values."""
@@ -225,20 +224,10 @@ class Material:
             Direction of the normals' green.
         """
         if name == "normal":
-            y = NORMAL_Y[delivery.normal_y]
-            flipped = self.normals * np.array([1.0, y, 1.0], np.float32)
-            green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
-            what = f"tangent space of the mesh's vertex frames, {green}, x and y and z in -1 to 1"
-            return Image(
-                name=name,
-                values=flipped,
-                unit="1",
-                what=what,
-                low=-1.0,
-                high=1.0,
-                valid=self.valid,
-                filler=(0.0, 0.0, 1.0),
-            )
+            what = f"tangent space of the mesh's vertex frames, {delivery.green}"
+            what = f"{what}, x and y and z in -1 to 1"
+            up = (0.0, 0.0, 1.0)
+            return Image.of_normals(name, self.normals, delivery, what, valid=self.valid, filler=up)
         simple: dict[str, tuple[Float32Array, str, str, float, float]] = {
             "base_color": (self.base_color, "1", SRGB_SPACE, 0.0, 1.0),
             "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),

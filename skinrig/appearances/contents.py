@@ -1,0 +1,45 @@
+"""What several readers take from an appearance: valid texels, assumptions, digest, versions."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from model import store
+from model.skin import SkinAppearance, SkinMap
+from skinrig.arrays import BoolArray
+
+
+def jointly_valid(*maps: SkinMap) -> BoolArray:
+    """Return the texels that are valid in all of some maps of one size, (H, W).
+
+    Examples
+    --------
+    >>> whole = SkinMap(np.zeros((1, 2), np.float32), "1")
+    >>> half = SkinMap(whole.values, "1", valid=np.array([[True, False]]))
+    >>> jointly_valid(whole, half).tolist()
+    [[True, False]]
+    """
+    good = np.ones(maps[0].values.shape[:2], np.bool_)
+    for one in maps:
+        good &= True if one.valid is None else one.valid
+    return good
+
+
+def assumed_by(appearance: SkinAppearance) -> list[str]:
+    """Return what an appearance takes for granted, a text each."""
+    texts = appearance.parameters.get("assumed", ())
+    return [str(text) for text in texts] if isinstance(texts, list | tuple) else []
+
+
+def document_digest(folder: Path) -> str:
+    """Return the SHA-256 of an APPEARANCE/ folder's document."""
+    return hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes maps, by distribution."""
+    return {name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")}
