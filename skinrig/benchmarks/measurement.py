@@ -14,7 +14,7 @@ from skinrig.benchmarks import resident_memory
 
 Made = TypeVar("Made")
 
-TRACED_S = 0.1
+MAX_TRACED_CALL_S = 0.1
 """Calls that are quicker are run once more for their memory, asked or not."""
 
 
@@ -72,7 +72,7 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = 
             start = time.perf_counter()
             call()
             seconds.append(time.perf_counter() - start)
-    traced = memory is not None and (memory or min(seconds) < TRACED_S)
+    traced = memory is not None and (memory or min(seconds) < MAX_TRACED_CALL_S)
     return Timing(
         seconds=float(np.median(seconds)),
         spread_s=(min(seconds), max(seconds)),

@@ -12,7 +12,7 @@ from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-EXPOSURE_S = 0.03
+TRACKING_EXPOSURE_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,10 +110,12 @@ def simulate(
     scene = DomeScene(rig, subject, motion=motion, interreflections=False, subsurface=False)
     frames = []
     for t in times_s:
-        pops = [LedPulse(k, 1.0, t, t + EXPOSURE_S) for k in range(len(rig.lights))]
+        pops = [LedPulse(k, 1.0, t, t + TRACKING_EXPOSURE_S) for k in range(len(rig.lights))]
         row = []
         for view in rig.views:
-            cfa = scene.exposure(view.name, pops=pops, exposure_s=EXPOSURE_S, seed=round(100 * t))
+            cfa = scene.exposure(
+                view.name, pops=pops, exposure_s=TRACKING_EXPOSURE_S, seed=round(100 * t)
+            )
             x = np.asarray(cfa, np.float64) - view.black_level
             row.append((x[::2, ::2] + x[::2, 1::2] + x[1::2, ::2] + x[1::2, 1::2]) / 4)
         frames.append(row)

@@ -19,15 +19,15 @@ from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
-NOISE_RAD = np.radians(1.5)
+NORMAL_NOISE_RAD = np.radians(1.5)
 """Root mean square angle of the normals' noise."""
-RELIEF_UM = 12.0
-CORES = 2
+RELIEF_RMS_UM = 12.0
+LIMIT_CORES = 2
 """Cores of the limits; processor time does not see who else keeps them busy."""
-SECONDS = 1.5
-BROKEN_SECONDS = 1.0
-RESIDUAL = 1e-5
-ERROR = 0.05
+MAX_INTEGRATION_S = 1.5
+MAX_BILATERAL_S = 1.0
+MAX_RELATIVE_RESIDUAL = 1e-5
+MAX_RELATIVE_RMS = 0.05
 
 
 def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
@@ -49,7 +49,7 @@ def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float6
     ridged = -np.abs(smooth / smooth.std())
     waves = fft.rfft2(ridged - ridged.mean()) * np.exp(-((theta / high) ** 2))
     waves[0, 0] = 0.0
-    waves *= RELIEF_UM / fft.irfft2(waves, (side, side)).std()
+    waves *= RELIEF_RMS_UM / fft.irfft2(waves, (side, side)).std()
     waves[1, 1] += 0.25 * side * side * 60.0  # the bulge
     # no derivative of the highest wave of an even number
     odd_x = np.where(theta_x >= np.pi - 1e-9, 0.0, theta_x)
@@ -109,7 +109,7 @@ def integration(*, toy: bool) -> StageBenchmark:
     rng = np.random.default_rng(0)
     side = 64 if toy else 512
     truth, clean = relief(side, rng=rng)
-    noisy = clean + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
+    noisy = clean + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
     whole = np.ones((side, side), bool)
     disc = _disc(side)
     points: list[Point] = []
@@ -143,7 +143,7 @@ def integration(*, toy: bool) -> StageBenchmark:
     def ours(valid: BoolArray, **options: object) -> Callable[[Float64Array], NDArray]:
         return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
 
-    for name, normals, sigma in (("none", clean, 0.0), ("1.5 deg", noisy, NOISE_RAD)):
+    for name, normals, sigma in (("none", clean, 0.0), ("1.5 deg", noisy, NORMAL_NOISE_RAD)):
         base: dict[str, str | int | float] = {"noise": name}
         for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
             settings = Settings(tolerance=tolerance)
@@ -171,17 +171,17 @@ def integration(*, toy: bool) -> StageBenchmark:
         )
     add(
         {"noise": "1.5 deg", "method": "multigrid", "mask": "disc", "denoise": 1},
-        ours(disc, stderr_rad=NOISE_RAD, denoise=1.0),
+        ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0),
         noisy,
         disc,
-        NOISE_RAD,
+        NORMAL_NOISE_RAD,
     )
     add(
         {"noise": "1.5 deg", "method": "bilateral", "mask": "disc"},
         lambda n: integrate_broken(n, pixel=PIXEL_UM, valid=disc).height,
         noisy,
         disc,
-        NOISE_RAD,
+        NORMAL_NOISE_RAD,
     )
     add(
         {"noise": "none", "method": "sparse direct", "mask": "disc"},
@@ -203,7 +203,7 @@ def integration(*, toy: bool) -> StageBenchmark:
             Limit(
                 "RMS error over RMS relief after high-pass, noise of 1.5 degrees",
                 float(np.std(error[disc]) / np.std(kept[disc])),
-                ERROR,
+                MAX_RELATIVE_RMS,
                 "<=",
             ),
             *_full_size(rng),
@@ -211,7 +211,7 @@ def integration(*, toy: bool) -> StageBenchmark:
     return StageBenchmark(
         "normal-integration",
         "RMS error of height after a high-pass of 1 mm, um",
-        f"the relief itself ({RELIEF_UM:g} um RMS), whose normals are exact",
+        f"the relief itself ({RELIEF_RMS_UM:g} um RMS), whose normals are exact",
         0.0,
         tuple(points),
         limits,
@@ -240,7 +240,7 @@ def _tiles(error: FloatArray, valid: BoolArray) -> list[tuple[FloatArray, BoolAr
 def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
     _, normals = relief(2048, rng=rng)
-    noisy = (normals + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
+    noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
         np.float32
     )
     disc = _disc(2048)
@@ -272,18 +272,21 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     return (
         Limit(
             "processor seconds on each of 2 cores, 2048 x 2048 with a mask",
-            min(spent) / CORES,
-            SECONDS,
+            min(spent) / LIMIT_CORES,
+            MAX_INTEGRATION_S,
             "<=",
             "s",
         ),
         Limit(
-            "relative residual of the same, in float64", found.convergence.residual, RESIDUAL, "<="
+            "relative residual of the same, in float64",
+            found.convergence.residual,
+            MAX_RELATIVE_RESIDUAL,
+            "<=",
         ),
         Limit(
             "processor seconds on each of 2 cores, bilateral, 1024 x 1024",
-            min(broken) / CORES,
-            BROKEN_SECONDS,
+            min(broken) / LIMIT_CORES,
+            MAX_BILATERAL_S,
             "<=",
             "s",
         ),

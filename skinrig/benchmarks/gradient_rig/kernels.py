@@ -22,13 +22,13 @@ from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import mean_error
 
 PIXEL_UM = 6.0
-STRETCH = 0.88
-CORES = 2
+STRETCH_RATIO = 0.88
+LIMIT_CORES = 2
 """Cores of the limits; processor time does not see who else keeps them busy."""
-HIERARCHICAL_S = 15.0
-TIMES_FASTER = 100.0
-FULL_SIDE = 2000
-PEER_CANDIDATES = 3
+MAX_SEARCH_S = 15.0
+MIN_SPEEDUP_OVER_NUMPY = 100.0
+FULL_SIDE_PX = 2000
+N_PEER_CANDIDATES = 3
 """Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
 
 
@@ -66,7 +66,7 @@ def numpy_distance(
     """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
-    dx /= STRETCH
+    dx /= STRETCH_RATIO
     w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     edges = np.linspace(-1.0, 1.0, 65)
     counts = np.histogram2d((dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
@@ -97,7 +97,7 @@ def search(*, toy: bool) -> StageBenchmark:
     side = 64 if toy else 256
     height = relief(side, rng=rng)
     target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
     alphas, sigmas = (ALPHAS[::50], SIGMAS_UM[::20]) if toy else (ALPHAS, SIGMAS_UM)
 
@@ -107,7 +107,7 @@ def search(*, toy: bool) -> StageBenchmark:
         return kernel_fit.fit_kernel(
             height[:part, :part],
             target,
-            stretch=STRETCH,
+            stretch=STRETCH_RATIO,
             axis="x",
             pixel_um=PIXEL_UM,
             search=way,
@@ -117,7 +117,7 @@ def search(*, toy: bool) -> StageBenchmark:
         )
 
     best = fit("exhaustive", side, 2)
-    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     points = []
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
@@ -157,16 +157,16 @@ def search(*, toy: bool) -> StageBenchmark:
 
 def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
-    height = relief(FULL_SIDE, rng=rng)
+    height = relief(FULL_SIDE_PX, rng=rng)
     target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
-    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     few = SIGMAS_UM[[10, 60, 150]]
     ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHAS, few))
     ours_s *= SIGMAS_UM.size / few.size
-    tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:PEER_CANDIDATES]
+    tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
     peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
     peer_s *= ALPHAS.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
@@ -185,25 +185,25 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         if made == "a kernel":
             moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
             target = normal_histogram.histogram(
-                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
             )
 
         def run(target: Float64Array = target) -> kernel_outcome.KernelFit:
             return kernel_fit.fit_kernel(
-                height, target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM
+                height, target, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM
             )
 
-        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / CORES)
+        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES)
     found = run()
     return (
         Limit(
             "processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
             default_s[0],
-            HIERARCHICAL_S,
+            MAX_SEARCH_S,
             "<=",
             "s",
         ),
-        Limit("the same, relief made by a kernel", default_s[1], HIERARCHICAL_S, "<=", "s"),
+        Limit("the same, relief made by a kernel", default_s[1], MAX_SEARCH_S, "<=", "s"),
         Limit(
             "steps of alpha from the kernel that made the relief",
             abs(found.alpha + 0.63) / 0.01,
@@ -219,8 +219,8 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         ),
         Limit(
             "times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
-            peer_s / (ours_s / CORES),
-            TIMES_FASTER,
+            peer_s / (ours_s / LIMIT_CORES),
+            MIN_SPEEDUP_OVER_NUMPY,
             ">=",
         ),
         Limit("difference of distances from NumPy's", mismatch, 1e-3, "<="),

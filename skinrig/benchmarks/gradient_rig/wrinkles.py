@@ -21,7 +21,7 @@ from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
 
-CENTRES = (
+ZONE_CENTERS_UV = (
     (0.3, 0.12),
     (0.7, 0.12),
     (0.3, 0.3),
@@ -31,20 +31,23 @@ CENTRES = (
     (0.5, 0.65),
     (0.5, 0.88),
 )
-REACH = 0.12
-PERIODS = 16
+ZONE_RADIUS_UV = 0.12
+FURROWS_PER_FACE = 16
 """Furrows over the height of the face, if it had them everywhere."""
-STEEPEST = 0.6
-FULL_SIDE = 2048
-TIMES_FASTER = 5.0
-NOISE_RAD = 0.02
+MAX_SLOPE = 0.6
+FULL_SIDE_PX = 2048
+MIN_SPEEDUP_OVER_NUMPY = 5.0
+NORMAL_NOISE_RAD = 0.02
 
 
 def zone_masks(side: int) -> Float64Array:
     """Return eight soft zones on a face's texture, (8, side, side), with sums of at most 1."""
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     masks = np.stack(
-        [np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / (0.5 * REACH) ** 2) for a, b in CENTRES]
+        [
+            np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / (0.5 * ZONE_RADIUS_UV) ** 2)
+            for a, b in ZONE_CENTERS_UV
+        ]
     )
     return np.asarray(masks / np.maximum(masks.sum(axis=0), 1.0))
 
@@ -72,7 +75,7 @@ def furrowed_face(
     """
     y = (np.mgrid[:side, :side][0] + 0.5) / side
     bend = gaussian_filter(rng.standard_normal((side, side)), side / 20, mode="wrap")
-    phase = 2 * np.pi * PERIODS * (y + 0.012 * bend / bend.std())
+    phase = 2 * np.pi * FURROWS_PER_FACE * (y + 0.012 * bend / bend.std())
     grain = gaussian_filter(rng.standard_normal((side, side)), 1.5, mode="wrap")
     masks = zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
@@ -84,7 +87,7 @@ def furrowed_face(
 
     rows = {name: JIMENEZ2011.row(name) for name in JIMENEZ2011.rows}
     deep = {name: furrows(row) for name, row in rows.items()}
-    scale = STEEPEST / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
+    scale = MAX_SLOPE / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
 
     def normals(height: Float64Array) -> Float64Array:
         dy, dx = np.gradient(scale * height)
@@ -208,11 +211,11 @@ def fitting(*, toy: bool) -> StageBenchmark:
 def summing(*, toy: bool) -> StageBenchmark:
     """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
     rng = np.random.default_rng(1)
-    side, coarse, mask_side = (256, 32, 8) if toy else (FULL_SIDE, 256, 64)
+    side, coarse, mask_side = (256, 32, 8) if toy else (FULL_SIDE_PX, 256, 64)
     base = gaussian_filter(rng.standard_normal((side, side, 2)), (1, 1, 0)).astype(np.float32)
     base *= 0.1 / base.std()
     wrinkle = gaussian_filter(rng.standard_normal((coarse, coarse, 2)), (2, 2, 0))
-    wrinkle *= STEEPEST / np.abs(wrinkle).max()
+    wrinkle *= MAX_SLOPE / np.abs(wrinkle).max()
     masks = zone_masks(mask_side)
     row = np.full(8, 0.5)
     truth = numpy_combine(base, wrinkle, masks, row)
@@ -249,7 +252,7 @@ def summing(*, toy: bool) -> StageBenchmark:
             Limit(
                 "times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
                 peer_s / own_s,
-                TIMES_FASTER,
+                MIN_SPEEDUP_OVER_NUMPY,
                 ">=",
             ),
             Limit("the same, than OpenCV and NumPy", library_s / own_s, 2.0, ">="),
@@ -363,7 +366,7 @@ def weighing(*, toy: bool) -> StageBenchmark:
         layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
         neutral = wrinkle_texels.derivatives_of(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
-        for noise in (0.005, NOISE_RAD) if toy else (0.005, NOISE_RAD, 0.08):
+        for noise in (0.005, NORMAL_NOISE_RAD) if toy else (0.005, NORMAL_NOISE_RAD, 0.08):
             stderr = np.full((side, side), noise)
             bound = _bound(layer, clean, stderr)
             misses = []

@@ -158,7 +158,7 @@ def truth_of(done: Simulated) -> Path:
     return done.truth
 
 
-def forget(folder: Path, done: Simulated) -> None:
+def delete_trial_outputs(folder: Path, done: Simulated) -> None:
     """Take a subject's folders away: the next one's have their names."""
     for place in (done.session, folder / "maps", folder / "moving"):
         shutil.rmtree(place, ignore_errors=True)

@@ -11,7 +11,7 @@ from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchma
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
-USUAL_SIZE = 64
+BAND_TABLE_SIZE = 64
 """Of the table that errors by band are of."""
 
 
@@ -96,7 +96,7 @@ def table(*, toy: bool) -> StageBenchmark:
             points.append(
                 Point({"size": size, "between nodes": between}, timing, worst, _largest(difference))
             )
-            if (size, between) == (USUAL_SIZE, "spline"):
+            if (size, between) == (BAND_TABLE_SIZE, "spline"):
                 by_band = {
                     band: BandError(float(some.max()), _largest(some))
                     for band in MELANIN_BANDS

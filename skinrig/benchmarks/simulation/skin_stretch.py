@@ -12,11 +12,11 @@ from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
-STATES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
+CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
-PATCH_STATES_S = 15.0
+MAX_PATCH_STATES_S = 15.0
 """Processor seconds allowed for eight states of a patch for 384 px of 6 um."""
-FIELD_STATE_S = 60.0
+MAX_FIELD_STATE_S = 60.0
 """Processor seconds allowed for one state of the camera's whole field."""
 
 
@@ -84,14 +84,14 @@ def _limits() -> tuple[Limit, ...]:
     for site in SITES:
         skin = make_micro_skin(site, seed=1, size_mm=2.8)
         begin = time.process_time()
-        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in STATES}
+        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
         spent = time.process_time() - begin
-        variance = np.array([_variance(states[r], 1.2) for r in STATES])
+        variance = np.array([_variance(states[r], 1.2) for r in CALIPER_STRETCHES])
         limits.append(
             Limit(
                 f"processor seconds for 8 states of 2.8 mm, {site}",
                 spent,
-                PATCH_STATES_S,
+                MAX_PATCH_STATES_S,
                 "<=",
                 "s",
             )
@@ -99,7 +99,10 @@ def _limits() -> tuple[Limit, ...]:
         flatter = float((np.diff(variance) < 0.0).sum())
         limits.append(
             Limit(
-                f"steps of r along which slopes flatten, {site}", flatter, len(STATES) - 1.0, ">="
+                f"steps of r along which slopes flatten, {site}",
+                flatter,
+                len(CALIPER_STRETCHES) - 1.0,
+                ">=",
             )
         )
         strain = max(abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
@@ -113,7 +116,7 @@ def _limits() -> tuple[Limit, ...]:
         Limit(
             "processor seconds for one state of 12.3 mm",
             time.process_time() - begin,
-            FIELD_STATE_S,
+            MAX_FIELD_STATE_S,
             "<=",
             "s",
         )

@@ -247,7 +247,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[str]:
 
 def _by_band(pair: Pair) -> str:
     """Return differences of chromophores by band of the melanin that both find on average."""
-    from skinrig.evaluating.flash import BANDS
+    from skinrig.evaluating.flash import MELANIN_RANGES
 
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
@@ -259,7 +259,7 @@ def _by_band(pair: Pair) -> str:
     for one in pair.differences:
         if one.sigmas is None or one.difference.shape != level.shape:
             continue
-        for low, high in BANDS:
+        for low, high in MELANIN_RANGES:
             inside = (level >= low) & (level < high) & ~np.isnan(one.difference)
             inside &= ~np.isnan(one.sigmas)
             if np.count_nonzero(inside) < 20:

@@ -13,7 +13,7 @@ from skinrig.applying.expression import colors, hemoglobin_rig
 from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
-from skinrig.evaluating.flash import BANDS
+from skinrig.evaluating.flash import MELANIN_RANGES
 from skinrig.reporting import map_images as map_pictures
 from skinrig.reporting import page
 from skinrig.reporting.map_names import melanin_band
@@ -176,14 +176,14 @@ def _errors(
 ) -> str:
     if not states:
         return ""
-    by_rig = [row for row in states if row.way == evaluation.WAYS[1]]
+    by_rig = [row for row in states if row.way == evaluation.METHODS[1]]
     for row in by_rig:
         worst = _worst(row.state, banded)
         checks.append(
             page.Check(
                 f"{name}: blood of {row.state} by the rig, median error",
                 100 * row.median_relative,
-                100 * evaluation.LEVEL_LIMIT,
+                100 * evaluation.MAX_LEVEL_ERROR,
                 "<=",
                 "%",
                 coverage=row.coverage,
@@ -248,7 +248,7 @@ def _errors(
             )
             for label in labels
         ]
-        for way in evaluation.WAYS
+        for way in evaluation.METHODS
     }
     plot = figures.bars("median error of a state's blood", labels, series, unit="%")
     return body + f"<div class='plots'>{plot}</div>"
@@ -285,7 +285,7 @@ def errors_by_band(
         good = blend.valid & (true.values > 0)
         if true.valid is not None:
             good = good & true.valid
-        for low, high in BANDS:
+        for low, high in MELANIN_RANGES:
             inside = good & (melanin.values >= low) & (melanin.values < high)
             if np.count_nonzero(inside) < LEAST_PIXELS:
                 continue

@@ -46,7 +46,7 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
             page.Check(
                 f"{name}: histogram distance after the kernel over that before, worst state",
                 worst["distance"] / worst["distance_before"],
-                evaluation.DISTANCE_LIMIT,
+                evaluation.MAX_HISTOGRAM_DISTANCE,
                 "<=",
                 "",
                 worst=state_words(worst["name"]),

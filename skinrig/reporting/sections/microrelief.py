@@ -165,7 +165,7 @@ def _relief_errors(
             page.Check(
                 f"{name}: specular normals at the lens's resolution, mean error",
                 row.mean_deg,
-                evaluation.NORMAL_LIMIT_DEG,
+                evaluation.MAX_NORMAL_ERROR_DEG,
                 "<=",
                 "°",
                 state_words(row.state),
@@ -249,7 +249,7 @@ def _strain(
             page.Check(
                 f"{name}: stretch of the skin, largest error",
                 abs(worst.error),
-                evaluation.STRAIN_LIMIT,
+                evaluation.MAX_STRAIN_ERROR,
                 "<=",
                 "",
                 worst=state_words(worst.state),
