@@ -11,13 +11,19 @@ from threadpoolctl import threadpool_limits
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 MAX_FIT_S = 3.0
 MIN_SPEEDUP_OVER_IRLS = 100.0
-FIT_CORES = 2
-"""Cores of the limit; processor time does not see who else keeps them busy."""
 SAMPLE_NOISE = 0.005
 """Standard deviation of every sample; a white pixel that faces a light is 1."""
 
@@ -215,12 +221,8 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     side = 1024
     scene = glossy_ball(side, 150, noise=SAMPLE_NOISE, rng=rng)
     estimate_normals(scene.images[:, :8, :8], scene.lights)
-    spent = []
-    for _ in range(3):
-        begin = time.process_time()
-        estimate_normals(scene.images, scene.lights)
-        spent.append(time.process_time() - begin)
-    ours_s = min(spent) / FIT_CORES
+    ours_s = processor_seconds(lambda: estimate_normals(scene.images, scene.lights), 3)
+    ours_s /= LIMIT_CORES
     places = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
     some = scene.images.reshape(150, -1)[:, places].astype(np.float64)
     begin = time.process_time()
@@ -242,7 +244,7 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         ),
         Limit(
             "times less processor time than NumPy IRLS-L1, 300 pixels extrapolated",
-            peer_s / (FIT_CORES * ours_s),
+            peer_s / (LIMIT_CORES * ours_s),
             MIN_SPEEDUP_OVER_IRLS,
             ">=",
         ),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,16 @@ from reconstruction.lumitexels import Surface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
-from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    Timing,
+    compare,
+)
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
 
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
@@ -125,34 +134,39 @@ def filling(*, toy: bool) -> StageBenchmark:
         [np.sin(9 * x) * np.cos(7 * y), x + y, np.exp(-20 * ((x - 0.5) ** 2 + (y - 0.5) ** 2))],
         axis=-1,
     ).astype(np.float32)
-    points = []
-    for share in (0.05, 0.15, 0.35, 0.75):
-        weight = (rng.random((side, side)) < share).astype(np.float32)
-        weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
-        ways: dict[str, Callable[[], FloatArray]] = {
-            "push-pull": lambda w=weight: texture_fill.push_pull(truth, w).values,  # type: ignore[misc]
-            "nearest texel": lambda w=weight: _nearest(truth, w),  # type: ignore[misc]
-        }
-        for way, fill in ways.items():
-            timing = measure(fill, repeats=1 if toy else 3)
-            off = tiled_rms(
-                100 * (fill() - truth) / truth.std(), weight == 0, tile_px=max(side // 16, 8)
-            )
-            knobs: dict[str, str | int | float] = {"known": share, "way": way, "side": side}
-            points.append(Point(knobs, timing, off.error, off.error_interval))
-    return StageBenchmark(
-        "texture-fill",
-        "RMS error of filled texels, % of the texture's deviation",
-        "the smooth texture the texels were taken from",
-        0.0,
-        tuple(points),
-        condition=("known",),
-        interval_of="tiles of the texture",
-        no_bands="filling of any map: errors go with its values",
+
+    def cases() -> Iterator[Case[FloatArray]]:
+        for share in (0.05, 0.15, 0.35, 0.75):
+            weight = (rng.random((side, side)) < share).astype(np.float32)
+            weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
+
+            def error(filled: FloatArray, unknown: BoolArray = weight == 0) -> BandError:
+                off = 100 * (filled - truth) / truth.std()
+                return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
+
+            for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
+                knobs: dict[str, str | float] = {"known": share, "way": way, "side": side}
+                yield Case(knobs, partial(fill, truth, weight), error)
+
+    return compare(
+        StageBenchmark(
+            "texture-fill",
+            "RMS error of filled texels, % of the texture's deviation",
+            "the smooth texture the texels were taken from",
+            condition=("known",),
+            interval_of="tiles of the texture",
+            no_bands="filling of any map: errors go with its values",
+        ),
+        cases(),
+        repeats=1 if toy else 3,
     )
 
 
-def _nearest(values: Float32Array, weight: Float32Array) -> Float32Array:
+def _push_pull(values: Float32Array, weight: Float32Array) -> FloatArray:
+    return texture_fill.push_pull(values, weight).values
+
+
+def _nearest(values: Float32Array, weight: Float32Array) -> FloatArray:
     """Return a texture whose unknown texels have the value of the nearest known one."""
     rows, columns = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
     return np.asarray(values[rows, columns])

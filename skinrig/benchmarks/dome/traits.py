@@ -18,6 +18,7 @@ from reconstruction.correspondence import common_regions
 from rigsim.population.population import Member, shifted, table_1
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
@@ -30,7 +31,6 @@ MIN_COSINE_TO_TRUTH = 0.95
 MAX_ROUND_TRIP_RATIO = 0.1
 MAX_FALSE_ALARM_RATE = 0.1
 """Share of traits without any truth that p < 0.05 may let pass: of 200, 5 % and 3.2 deviations."""
-TAN_MELANIN_FACTOR = 1.5
 N_GROUP_DRAWS = 12
 """Random choices of so many people, whose scatter is the error's."""
 N_LABEL_SHUFFLES = 200

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import cv2
@@ -12,7 +11,7 @@ from scipy import fft, ndimage
 from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, processor_seconds
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -188,8 +187,8 @@ def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
         least = [np.inf] * len(ways)
         for _ in range(N_TIMING_ROUNDS):
             for index, (cores, way) in enumerate(ways):
-                least[index] = min(least[index], _spent(way) / cores)
-        convolve_s = _spent(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
+                least[index] = min(least[index], processor_seconds(way) / cores)
+        convolve_s = processor_seconds(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits += [
@@ -249,10 +248,3 @@ def by_fft(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArra
 
     mean = convolved(h)
     return mean, np.sqrt(np.maximum(convolved(h * h) - mean * mean, 0.0))
-
-
-def _spent(call: Callable[[], object]) -> float:
-    """Return the processor time of a call, s."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start

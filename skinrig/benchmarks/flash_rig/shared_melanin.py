@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
@@ -25,7 +33,6 @@ LIGHT_CHANGE = 0.05
 """How much the light of a state differs, smoothly over the face."""
 FULL_SIDE_PX = 1024
 MAX_FULL_SIZE_S = 90.0
-LIMIT_CORES = 2
 
 
 def inversion(*, toy: bool) -> StageBenchmark:
@@ -199,19 +206,16 @@ def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Float64Array
     melanin = np.full((band, FULL_SIDE_PX), 0.02)
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
     rgb, variance = pictures(colors, melanin, blood, covariance, rng=rng)
-    seconds = []
-    for _ in range(2):
-        begin = time.process_time()
-        shared_melanin.weigh(
-            rgb,
-            colors,
-            prior=prior,
-            variance=variance,
-            model_error=covariance,
-            shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-        )
-        seconds.append(time.process_time() - begin)
-    whole = min(seconds) * FULL_SIDE_PX / band / LIMIT_CORES
+    run = partial(
+        shared_melanin.weigh,
+        rgb,
+        colors,
+        prior=prior,
+        variance=variance,
+        model_error=covariance,
+        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+    )
+    whole = processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES
     return Limit(
         "processor seconds on each of 2 cores, 7 states of 1024 x 1024, by a band of 96 rows",
         whole,

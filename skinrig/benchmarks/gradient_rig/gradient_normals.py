@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,7 +21,15 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]
@@ -41,8 +48,6 @@ MAX_CLEAN_ERROR_DEG, MAX_NOISY_ERROR_DEG, MAX_PATTERNS_S, MAX_SLOWDOWN_TO_FORMUL
     3.0,
     8.0,
 )
-LIMIT_CORES = 2
-"""Cores of the limit; processor time does not see who else keeps them busy."""
 IGNORED_BORDER_PX = 6
 """Border that is not judged: the lens brings in what is beyond it."""
 
@@ -255,16 +260,9 @@ def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
         for key, image in exposed(smooth, rng).items()
     }
     options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
-    spent = []
-    for _ in range(3):
-        begin = time.process_time()
-        from_patterns(big, **options)
-        spent.append(time.process_time() - begin)
-    begin = time.process_time()
+    ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
-        vectors_alone(big)
-    peer_s = time.process_time() - begin
-    ours_s = min(spent) / LIMIT_CORES
+        peer_s = processor_seconds(lambda: vectors_alone(big))
     return (
         *(
             Limit(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import numba
@@ -18,13 +18,21 @@ from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import mean_error
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
-LIMIT_CORES = 2
-"""Cores of the limits; processor time does not see who else keeps them busy."""
 MAX_SEARCH_S = 15.0
 MIN_SPEEDUP_OVER_NUMPY = 100.0
 FULL_SIDE_PX = 2000
@@ -79,16 +87,12 @@ def _spent(call: Callable[[], object], repeats: int = 1) -> float:
     Of two threads the one that is done first spins until the other is, which counts as its time:
     where other programs keep the cores busy that is up to as much as the work.
     """
-    seconds, threads = [], numba.get_num_threads()
+    threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        for _ in range(repeats):
-            begin = time.process_time()
-            call()
-            seconds.append(time.process_time() - begin)
+        return processor_seconds(call, repeats)
     finally:
         numba.set_num_threads(threads)
-    return min(seconds)
 
 
 def search(*, toy: bool) -> StageBenchmark:
@@ -119,7 +123,6 @@ def search(*, toy: bool) -> StageBenchmark:
     best = fit("exhaustive", side, 2)
     whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
-    points = []
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
         ("exhaustive", side, 2, 1),
         ("exhaustive", side, 2, 2 if toy else 5),
@@ -128,30 +131,28 @@ def search(*, toy: bool) -> StageBenchmark:
     ]
     if not toy:
         ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
-    for way, part, first, thin in ways:
-        timing = measure(
-            lambda way=way, part=part, first=first, thin=thin: fit(way, part, first, thin),  # type: ignore[misc]
-            repeats=1,
-            memory=False,
-        )
-        found = fit(way, part, first, thin)
+
+    def error(found: kernel_outcome.KernelFit) -> BandError:
         change = whole.change(found.sigma_um)
         there = buckets.distances((whole.along, whole.across), change, np.array([found.alpha]))
-        error = float(there[0]) - best.distance
-        knobs: dict[str, str | int | float] = {"search": way, "side": part, "every": thin}
-        if way == "hierarchical":
-            knobs["first sample"] = first
-        points.append(Point(knobs, timing, error, (error, error)))
-    limits = () if toy else _full_size(rng)
-    return StageBenchmark(
-        "kernel-fit",
-        "distance above that of the exhaustive search on all pixels",
-        "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="nothing: one search on one relief, distances computed exactly",
-        no_bands="shape alone: no color of skin enters",
+        return BandError.around(float(there[0]) - best.distance, 0.0)
+
+    def knobs(way: str, part: int, first: int, thin: int) -> dict[str, str | int | float]:
+        only = {"first sample": first} if way == "hierarchical" else {}
+        return {"search": way, "side": part, "every": thin, **only}
+
+    return compare(
+        StageBenchmark(
+            "kernel-fit",
+            "distance above that of the exhaustive search on all pixels",
+            "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
+            interval_of="nothing: one search on one relief, distances computed exactly",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        [Case(knobs(*way), partial(fit, *way), error) for way in ways],
+        repeats=1,
+        memory=False,
+        limits=None if toy else lambda _: _full_size(rng),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
 import tracemalloc
 from collections.abc import Callable
 from functools import partial
@@ -32,7 +31,14 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -47,8 +53,6 @@ JAW_CONDITIONS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
 )
 """Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
 width, and where it does not, both passes act."""
-LIMIT_CORES = 2
-"""Cores of the limits; processor time does not see who else keeps them busy."""
 MIN_SPEEDUP_OVER_NUMPY = 5.0
 MAX_RATIO_TO_STATIC = 0.6
 """The fitted kernels' error is at most so much of the error of a relief that does not change."""
@@ -311,16 +315,6 @@ def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Fl
     return height
 
 
-def _spent(call: Callable[[], object], repeats: int = 1) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _full_size() -> tuple[Limit, ...]:
     """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
     rng = np.random.default_rng(0)
@@ -331,15 +325,15 @@ def _full_size() -> tuple[Limit, ...]:
     for sampling in both:
         run = partial(convolve, height, *fields, sampling=sampling)
         run()
-        own[sampling] = _spent(run, 2) / LIMIT_CORES
+        own[sampling] = processor_seconds(run, 2) / LIMIT_CORES
     strip = height[:PEER_ROWS]
     own_strip = tuple(values[:PEER_ROWS] for values in fields)
-    peer_s = _spent(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE_PX / PEER_ROWS
+    peer_s = processor_seconds(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE_PX / PEER_ROWS
     mismatch = np.abs(
         numpy_convolve(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
     ).max()
     del fields, height
-    raster_s = _spent(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
+    raster_s = processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
     tile_s, peak_mb = _tiles_of_16k()
     return (
         Limit(
@@ -414,7 +408,7 @@ def _tiles_of_16k() -> tuple[float, float]:
             fields_at,
             finished=[number for number in range(count) if number not in chosen],
         )
-        spent = _spent(run)
+        spent = processor_seconds(run)
         tracemalloc.start()
         try:
             run()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,17 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    measure,
+    once,
+    processor_seconds,
+)
 
 ZONE_CENTERS_UV = (
     (0.3, 0.12),
@@ -142,7 +152,7 @@ def opencv_combine(
     return out
 
 
-def _error(normals: FloatArray, truth: FloatArray) -> tuple[float, tuple[float, float]]:
+def _error(normals: FloatArray, truth: FloatArray) -> BandError:
     """Return the mean angle, degrees, and its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
     cut = max(angle.shape[0] // 8, 1)
@@ -151,14 +161,13 @@ def _error(normals: FloatArray, truth: FloatArray) -> tuple[float, tuple[float, 
         for i in range(0, angle.shape[0], cut)
         for j in range(0, angle.shape[1], cut)
     ]
-    mean, scatter = float(angle.mean()), float(np.std(squares) / np.sqrt(len(squares)))
-    return mean, (mean - scatter, mean + scatter)
+    return BandError.around(float(angle.mean()), float(np.std(squares) / np.sqrt(len(squares))))
 
 
 def _mean_error(model: Any, states: dict[str, Float64Array]) -> tuple[float, tuple[float, float]]:
     errors = [_error(model.evaluate({name: 1.0}).normals, n) for name, n in states.items()]
-    mean = float(np.mean([one for one, _ in errors]))
-    low, high = (float(np.mean([both[i] for _, both in errors])) for i in (0, 1))
+    mean = float(np.mean([one.error for one in errors]))
+    low, high = (float(np.mean([one.error_interval[i] for one in errors])) for i in (0, 1))
     return mean, (low, high)
 
 
@@ -191,7 +200,7 @@ def fitting(*, toy: bool) -> StageBenchmark:
             "KB as BC5 and BC3": size.total_bytes / 1024,
         }
         points.append(Point(knobs, timing, error, interval))
-    rest = float(np.mean([_error(neutral, n)[0] for n in states.values()]))
+    rest = float(np.mean([_error(neutral, n).error for n in states.values()]))
     best = min(point.error for point in points)
     return StageBenchmark(
         "wrinkles",
@@ -238,17 +247,12 @@ def summing(*, toy: bool) -> StageBenchmark:
         "OpenCV and NumPy": lambda: opencv_combine(base, wrinkle, masks, row),
         "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
     }
-    points = []
-    for way, call in ways.items():
-        timing = measure(call, repeats=1 if way == "NumPy" else 5, memory=False)
-        error, interval = _error(call(), truth)
-        points.append(Point({"way": way, "side": side}, timing, error, interval))
-    limits: tuple[Limit, ...] = ()
-    if not toy:
-        peer_s, own_s = _spent(ways["NumPy"], 1), _spent(by_derivatives, 5)
-        library_s = _spent(ways["OpenCV and NumPy"], 5)
+
+    def limits(points: Sequence[Point]) -> tuple[Limit, ...]:
+        peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
+        library_s = processor_seconds(ways["OpenCV and NumPy"], 5)
         apart = float(np.abs(by_derivatives() - truth).max())
-        limits = (
+        return (
             Limit(
                 "times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
                 peer_s / own_s,
@@ -270,26 +274,29 @@ def summing(*, toy: bool) -> StageBenchmark:
                 "<=",
             ),
         )
-    return StageBenchmark(
-        "wrinkle-sum",
-        "mean angle to the normals of the summed relief at half weight, deg",
-        "listing 1.1 in double precision",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="squares of the face",
-        no_bands="shape alone: no color of skin enters",
+
+    cases = [
+        Case(
+            {"way": way, "side": side},
+            call,
+            lambda normals: _error(normals, truth),
+            repeats=1 if way == "NumPy" else 5,
+        )
+        for way, call in ways.items()
+    ]
+    return compare(
+        StageBenchmark(
+            "wrinkle-sum",
+            "mean angle to the normals of the summed relief at half weight, deg",
+            "listing 1.1 in double precision",
+            interval_of="squares of the face",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        cases[:3],
+        cases[3:],
+        memory=False,
+        limits=None if toy else limits,
     )
-
-
-def _spent(call: Callable[[], object], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return max(min(seconds), 1e-9)
 
 
 def storing(*, toy: bool) -> StageBenchmark:
@@ -305,7 +312,6 @@ def storing(*, toy: bool) -> StageBenchmark:
     table = fitted.layer.table
     weights = {"surprise": 1.0, "disgust": 0.6}
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
-    points = []
     encodings: tuple[tuple[Any, Any], ...] = (
         ("float32", "float32"),
         ("float16", "float16"),
@@ -313,44 +319,36 @@ def storing(*, toy: bool) -> StageBenchmark:
         ("bc5", "bc3"),
         ("bc5", "unit8"),
     )
-    for at in (64, 32) if toy else (512, 256, 128, 64):
-        small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
-        for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
-            layer = Layer(
-                wrinkle_storage.stored_map(small, maps_as),
-                wrinkle_storage.stored_masks(masks, masks_as),
-                table,
-            )
 
-            def run(layer: Layer = layer) -> FloatArray:
-                return wrinkles.combine_layers(base, [layer], weights)
-
-            timing = measure(run, repeats=3, memory=False)
-            error, interval = _error(run(), whole)
-            size = wrinkle_storage.footprint(
-                (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
-            )
-            points.append(
-                Point(
-                    {
-                        "map": at,
-                        "as": maps_as,
-                        "masks as": masks_as,
-                        "KB": round(size.total_bytes / 1024, 3),
-                    },
-                    timing,
-                    error,
-                    interval,
+    def cases() -> Iterator[Case[FloatArray]]:
+        for at in (64, 32) if toy else (512, 256, 128, 64):
+            small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
+            for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
+                layer = Layer(
+                    wrinkle_storage.stored_map(small, maps_as),
+                    wrinkle_storage.stored_masks(masks, masks_as),
+                    table,
                 )
-            )
-    return StageBenchmark(
-        "wrinkle-storage",
-        "mean angle to the normals with the map at full size in 32 bits, deg",
-        "the same wrinkles, stored without loss",
-        0.0,
-        tuple(points),
-        interval_of="squares of the face",
-        no_bands="shape alone: no color of skin enters",
+                size = wrinkle_storage.footprint(
+                    (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
+                )
+                kilobytes = round(size.total_bytes / 1024, 3)
+                yield Case(
+                    {"map": at, "as": maps_as, "masks as": masks_as, "KB": kilobytes},
+                    partial(wrinkles.combine_layers, base, [layer], weights),
+                    lambda normals: _error(normals, whole),
+                )
+
+    return compare(
+        StageBenchmark(
+            "wrinkle-storage",
+            "mean angle to the normals with the map at full size in 32 bits, deg",
+            "the same wrinkles, stored without loss",
+            interval_of="squares of the face",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        cases(),
+        memory=False,
     )
 
 

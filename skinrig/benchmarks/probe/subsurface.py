@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from math import inf
 from typing import Any
 
@@ -16,9 +14,17 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
+from skinrig.evaluating.subsurface import MAX_MEDIAN_ERROR, MAX_WORST_ERROR
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 FIBER_CORE_MM = 0.2
@@ -26,7 +32,6 @@ RELATIVE_FIBER_ERROR, RELATIVE_COMMON_ERROR = 0.012, 0.01
 """Relative errors of a calibration: of each fibre, and common to all."""
 DARK_NOISE_PER_MM2 = 1e-8
 """Noise of a reading in the dark."""
-MAX_MEDIAN_ERROR, MAX_WORST_ERROR = 0.03, 0.08
 MIN_SPEEDUP_OVER_LEAST_SQUARES = 300.0
 N_BATCH_PROFILES = 30_000
 N_PEER_FITS = 60
@@ -177,16 +182,6 @@ def _over_media(error: Float64Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _spent(call: Callable[[], Any], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _least_error(
     sigma_a: Float64Array, sigma_s: Float64Array, variance: Float64Array
 ) -> Float64Array:
@@ -275,8 +270,9 @@ def batches(*, toy: bool) -> StageBenchmark:
             above.append(float(found.chi2[n]) / (2.0 * theirs.cost) - 1.0)
             pair = np.array([found.sigma_a_per_mm[n], found.sigma_s_prime_per_mm[n]])
             apart.append(float(np.abs(np.log(pair) - theirs.x).max()))
-        theirs_s = _spent(lambda: [peer(n) for n in range(N_PEER_FITS)], 2) * count / N_PEER_FITS
-        ours_s = _spent(ours, 3)
+        theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
+        theirs_s *= count / N_PEER_FITS
+        ours_s = processor_seconds(ours, 3)
         limits = (
             Limit(
                 f"times less processor time than SciPy's loop, 30,000 fits ({N_PEER_FITS} timed)",

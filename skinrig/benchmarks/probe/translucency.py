@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -18,7 +16,14 @@ from reconstruction.anisotropy import profile_anisotropy
 from reconstruction.subsurface import translucency
 from reconstruction.subsurface.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Way = Literal["sigma_tr", "profiles"]
@@ -299,16 +304,6 @@ def sites(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _spent(call: Callable[[], object], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
     """Return how many times faster than its Gaussian process, and the largest difference."""
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -338,4 +333,4 @@ def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[fl
         float(np.abs(found.log_stderr.reshape(-1) - deviation).max()),
     )
     with threadpool_limits(1, "blas"):
-        return _spent(theirs, 2) / max(_spent(ours, 5), 1e-6), mismatch
+        return processor_seconds(theirs, 2) / max(processor_seconds(ours, 5), 1e-6), mismatch

@@ -11,7 +11,14 @@ from numba import njit
 
 from capture.rig import load_rig
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 RED_MEDIUM_PER_MM = (
@@ -22,7 +29,6 @@ MEDIUM_G = 0.8
 ETA = 1.4
 SPEED_MEDIUM = (0.05, 10.0, 0.9, 1.4)  # sigma_a, sigma_s (1/mm), g, eta
 MCML_R_D = 0.3592  # MCML's diffuse reflectance of that medium, specular left out
-LIMIT_CORES = 2
 MAX_S_TO_ONE_PERCENT = 30.0
 MIN_SPEEDUP_OVER_VOLPATH = 1000.0
 MIN_SPEEDUP_OVER_WALK = 4.0

@@ -10,7 +10,7 @@ import numpy as np
 from rigsim.skin_patch.microrelief import SITES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure_and_keep
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
@@ -50,22 +50,16 @@ def stretched(*, toy: bool) -> StageBenchmark:
                     deform(s, stretch=stretch, angle_deg=90.0, tolerance=tolerance) for s in skins
                 ]
 
-            timing = measure(run, repeats=1, memory=not toy)
-            states = run()
+            timing, states = measure_and_keep(run, repeats=1, memory=not toy)
             errors = np.array(
                 [abs(_variance(s, half) / t - 1.0) for s, t in zip(states, truth, strict=True)]
             )
             spread = float(errors.std(ddof=1) / np.sqrt(errors.size))
             error = float(errors.mean())
             evaluations = np.mean([s.convergence.evaluations for s in states])
-            points.append(
-                Point(
-                    {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)},
-                    timing,
-                    100.0 * error,
-                    (100.0 * (error - spread), 100.0 * (error + spread)),
-                )
-            )
+            knobs = {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)}
+            interval = (100.0 * (error - spread), 100.0 * (error + spread))
+            points.append(Point(knobs, timing, 100.0 * error, interval))
     return StageBenchmark(
         "skin-stretch",
         "error of the slopes' variance along the jaws, %",
