@@ -23,7 +23,12 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.bounds import cramer_rao
-from skinrig.evaluating.flash import BANDS, BOUND_FACTOR, BOUND_LIMIT, MEDIAN_LIMIT
+from skinrig.evaluating.flash import (
+    BOUND_FACTOR,
+    MAX_MEDIAN_MELANIN_ERROR,
+    MELANIN_RANGES,
+    MIN_BOUND_ERROR,
+)
 from skinrig.simulating.simulation import simulate_session
 
 PRESETS = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
@@ -71,11 +76,11 @@ def main(first: int, last: int) -> None:
     print(f"map        C_m band   which      {HEAD}")
     for key, rows in pooled.items():
         table = dict(zip(COLUMNS, np.concatenate(rows, axis=1).astype(np.float64), strict=True))
-        for low, high in BANDS:
+        for low, high in MELANIN_RANGES:
             band = (table["melanin"] >= low) & (table["melanin"] < high) & (table["true"] > 0)
             for which, part in (
                 ("all", band),
-                ("bound<10%", band & (table["bound"] < BOUND_LIMIT)),
+                ("bound<10%", band & (table["bound"] < MIN_BOUND_ERROR)),
             ):
                 print(f"{key:10} {low:.2f}-{high:.2f}  {which:10}{_row(table, part)}")
 
@@ -90,7 +95,7 @@ def _row(table: dict[str, np.ndarray], part: np.ndarray) -> str:
     away = np.abs(value - true)
     error = float(np.median(away / true))
     bound = float(np.nanmedian(table["bound"][kept]))
-    limit = MEDIAN_LIMIT if bound < BOUND_LIMIT else BOUND_FACTOR * bound
+    limit = MAX_MEDIAN_MELANIN_ERROR if bound < MIN_BOUND_ERROR else BOUND_FACTOR * bound
     covered = float(np.mean(away <= table["stderr"][kept]))
     numbers = (
         error,

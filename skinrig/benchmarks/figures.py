@@ -43,7 +43,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
     labels: list[tuple[str, float, float]] = []
     joined = [best for front in fronts if len(best := np.array(front["points"], int)) > 1]
-    named = len(fronts) <= MOST_NAMED
+    named = len(fronts) <= MAX_NAMED_FRONTS
     for number, front in enumerate(fronts):
         color = figures.SERIES_COLORS[number % len(figures.SERIES_COLORS)]
         own = np.array([_shares(p, front["condition"]) for p in points])
@@ -110,7 +110,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
             if front["knee"] is None
             else f", knee at {seconds[front['knee']]:.3g} s, error {error[front['knee']]:.3g}"
         )
-        for front in fronts[:MOST_NAMED]
+        for front in fronts[:MAX_NAMED_FRONTS]
     )
     alt = (
         f"{stage}: {document['error_name']}, {figures.span_of(error)}, against "
@@ -119,7 +119,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     return figures.finished(figure, alt)
 
 
-MOST_NAMED = 6
+MAX_NAMED_FRONTS = 6
 """Fronts that a plot has room to name; of more, only those of several points are labelled."""
 
 

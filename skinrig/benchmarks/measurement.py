@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from skinrig.benchmarks import resident_memory
 
 Made = TypeVar("Made")
 
-TRACED_S = 0.1
+LIMIT_CORES = 2
+"""Cores of limits in seconds; processor time does not count other programs on them."""
+
+MAX_TRACED_CALL_S = 0.1
 """Calls that are quicker are run once more for their memory, asked or not."""
 
 
@@ -61,25 +65,57 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = 
     >>> measure(lambda: sum(range(100)), repeats=3).seconds < 1.0
     True
     """
+    return measure_and_keep(call, repeats=repeats, memory=memory)[0]
+
+
+def measure_and_keep(
+    call: Callable[[], Made], *, repeats: int = 3, memory: bool | None = True
+) -> tuple[Timing, Made]:
+    """Time a call as `measure` does, and return what its last warm call made as well.
+
+    Examples
+    --------
+    >>> measure_and_keep(lambda: sum(range(100)))[1]
+    4950
+    """
     if repeats < 1:
         raise ValueError(f"repeats: got {repeats}, expected at least 1")
     start = time.perf_counter()
     call()
     cold = time.perf_counter() - start
-    seconds = []
+    seconds: list[float] = []
+    made: list[Made] = []
     with resident_memory.watched() as rise:
         for _ in range(repeats):
+            made.clear()
             start = time.perf_counter()
-            call()
+            made.append(call())
             seconds.append(time.perf_counter() - start)
-    traced = memory is not None and (memory or min(seconds) < TRACED_S)
-    return Timing(
+    traced = memory is not None and (memory or min(seconds) < MAX_TRACED_CALL_S)
+    timing = Timing(
         seconds=float(np.median(seconds)),
         spread_s=(min(seconds), max(seconds)),
         cold_s=cold,
         peak_memory_mb=_allocated_mb(call) if traced else rise.mb,
         memory_of="allocated" if traced else "resident",
     )
+    return timing, made[0]
+
+
+def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
+    """Return the least processor time of some calls, s.
+
+    Examples
+    --------
+    >>> 0.0 <= processor_seconds(lambda: sum(range(100)), 2) < 1.0
+    True
+    """
+    seconds = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        call()
+        seconds.append(time.process_time() - begin)
+    return min(seconds)
 
 
 def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
@@ -175,6 +211,17 @@ class BandError:
     cramer_rao_bound: float | None = None
     """Least error that any unbiased estimator could have there; None: not known."""
 
+    @classmethod
+    def around(cls, error: float, half: float, bound: float | None = None) -> BandError:
+        """Return an error whose interval reaches as far to both sides.
+
+        Examples
+        --------
+        >>> BandError.around(2.0, 0.5).error_interval
+        (1.5, 2.5)
+        """
+        return cls(error, (error - half, error + half), bound)
+
 
 @dataclass(frozen=True, slots=True)
 class StageBenchmark:
@@ -185,9 +232,9 @@ class StageBenchmark:
     """What the error is, with its unit, for the axis of the plot."""
     reference: str
     """What the error is taken against."""
-    reference_error: float
+    reference_error: float = 0.0
     """How far the reference itself may be off, in the error's unit."""
-    points: tuple[Point, ...]
+    points: tuple[Point, ...] = ()
     limits: tuple[Limit, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     """What this run did not measure, and why."""
@@ -209,3 +256,87 @@ class StageBenchmark:
         if self.reference_error == 0.0:
             return "exact: the truth that the data were made of, or errors are defined by it"
         return "how far the reference itself may be off, in the error's unit"
+
+
+@dataclass(frozen=True, slots=True)
+class Case(Generic[Made]):
+    """One setting of a stage that :func:`compare` measures."""
+
+    knobs: Mapping[str, str | int | float | bool]
+    call: Callable[[], Made]
+    error: Callable[[Made], BandError]
+    """Takes what the call made; returns its error with interval and bound."""
+    also: Callable[[Made], Mapping[str, str | int | float | bool]] | None = None
+    """Takes the same; returns what else is reported."""
+    repeats: int | None = None
+    """Warm calls; None: as many as of the stage's other cases."""
+    memory: bool | Literal["stage"] | None = "stage"
+    """As of :func:`measure`; "stage": as of the stage's other cases."""
+
+
+def compare(
+    stage: StageBenchmark,
+    ours: Iterable[Case[Any]],
+    peers: Iterable[Case[Any]] = (),
+    *,
+    repeats: int = 3,
+    memory: bool | None = True,
+    by_band: Callable[[], Mapping[str, BandError]] | None = None,
+    limits: Callable[[Sequence[Point]], Iterable[Limit]] | None = None,
+) -> StageBenchmark:
+    """Measure the cases of a stage in one run: first ours, then its peers.
+
+    Parameters
+    ----------
+    stage
+        Its description, without points.
+    ours, peers
+        Cases in the order in which they are measured; generators make each when it is its turn.
+    repeats, memory
+        Of cases without their own, see :func:`measure`.
+    by_band
+        Makes the errors by melanin band, after all cases. None: those of the description.
+    limits
+        Takes the points, ours first, and makes the limits, at the end. None: the description's.
+
+    Returns
+    -------
+    StageBenchmark
+        The description with points, bands and limits.
+
+    Examples
+    --------
+    >>> stage = StageBenchmark("sum", "difference", "the closed form")
+    >>> made = compare(
+    ...     stage,
+    ...     [Case({"n": n}, lambda n=n: sum(range(n)), lambda s: BandError(s - 45.0, (0.0, 0.0)))
+    ...      for n in (10, 11)],
+    ...     limits=lambda points: [Limit("difference", points[0].error, 0.0, "<=")],
+    ... )
+    >>> [point.error for point in made.points], made.limits[0].passed
+    ([0.0, 10.0], True)
+    """
+    points = tuple(_measured(case, repeats, memory) for case in chain(ours, peers))
+    return replace(
+        stage,
+        points=points,
+        by_band=by_band() if by_band else stage.by_band,
+        limits=tuple(limits(points)) if limits else stage.limits,
+    )
+
+
+def _measured(case: Case[Any], repeats: int, memory: bool | None) -> Point:
+    timing, made = measure_and_keep(
+        case.call,
+        repeats=case.repeats or repeats,
+        memory=memory if case.memory == "stage" else case.memory,
+    )
+    found = case.error(made)
+    return Point(
+        case.knobs,
+        timing,
+        found.error,
+        found.error_interval,
+        found.cramer_rao_bound,
+        case.also(made) if case.also else {},
+    )

@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-SPARE: Final = 1.25
+TIME_SAFETY_FACTOR: Final = 1.25
 """A stage begins if so many times what it should take is left."""
-RESERVE_S: Final = 20.0
+REPORT_RESERVE_S: Final = 20.0
 """What tables and plots take at the end."""
-SETTLED_S: Final = 10.0
+MIN_PACE_SAMPLE_S: Final = 10.0
 """Seconds of full sizes after which the pace of this machine counts as known."""
-UNKNOWN_S: Final = 120.0
+DEFAULT_STAGE_S: Final = 120.0
 """Seconds of a stage that :data:`FULL_S` lacks."""
 
 
@@ -36,7 +36,7 @@ class Pace:
     @property
     def factor(self) -> float:
         """Seconds taken over seconds told; 1 while too little was measured."""
-        return self.took_s / self.told_s if self.told_s > SETTLED_S else 1.0
+        return self.took_s / self.told_s if self.told_s > MIN_PACE_SAMPLE_S else 1.0
 
     def fits(self, told_s: float, left_s: float) -> bool:
         """Return whether a stage will end within ``left_s``, with some to spare.
@@ -48,7 +48,7 @@ class Pace:
         >>> Pace(told_s=20.0, took_s=40.0).fits(10.0, left_s=26.0)
         True
         """
-        return SPARE * self.factor * told_s <= left_s
+        return TIME_SAFETY_FACTOR * self.factor * told_s <= left_s
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -73,7 +73,7 @@ def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[t
     [('b', 1.0), ('a', 2.0), ('c', 120.0)]
     """
     return sorted(
-        ((name, seconds.get(name, UNKNOWN_S)) for name in names), key=lambda pair: pair[1]
+        ((name, seconds.get(name, DEFAULT_STAGE_S)) for name in names), key=lambda pair: pair[1]
     )
 
 

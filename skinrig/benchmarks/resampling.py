@@ -9,7 +9,7 @@ from model import metrics
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.benchmarks.measurement import BandError
 
-DRAWS = 200
+N_BOOTSTRAP_DRAWS = 200
 TILE_PX = 16
 
 
@@ -82,7 +82,7 @@ def tiled_rms(
     rows, columns = np.nonzero(where)
     _, which = np.unique(np.stack([rows, columns]) // tile_px, axis=1, return_inverse=True)
     sums, counts = np.bincount(which, squared[where]), np.bincount(which)
-    drawn = np.random.default_rng(seed).integers(len(sums), size=(DRAWS, len(sums)))
+    drawn = np.random.default_rng(seed).integers(len(sums), size=(N_BOOTSTRAP_DRAWS, len(sums)))
     roots = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
     low, high = np.percentile(roots, [16, 84])
     return BandError(float(np.sqrt(squared[where].mean())), (float(low), float(high)))

@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-STATUS = Path("/proc/self/status")
-CLEAR = Path("/proc/self/clear_refs")
-RESET_PEAK = "5"
+PROCESS_STATUS_PATH = Path("/proc/self/status")
+CLEAR_REFS_PATH = Path("/proc/self/clear_refs")
+PEAK_RESET_CODE = "5"
 """What written to `clear_refs` sets the peak to what is held now (proc(5))."""
 
 
@@ -51,7 +51,7 @@ def _reset() -> float | None:
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
     try:
-        CLEAR.write_text(RESET_PEAK, encoding="ascii")
+        CLEAR_REFS_PATH.write_text(PEAK_RESET_CODE, encoding="ascii")
     except OSError:
         return None
     return _read("VmRSS")
@@ -59,7 +59,7 @@ def _reset() -> float | None:
 
 def _read(name: str) -> float | None:
     try:
-        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        lines = PROCESS_STATUS_PATH.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
         return None
     for line in lines:

@@ -73,7 +73,7 @@ STAGES = {
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 
-INTERRUPTED = "the run ended before all of it was measured"
+INTERRUPTED_REASON = "the run ended before all of it was measured"
 """Of a stage in a document that a run left which was interrupted."""
 
 
@@ -205,7 +205,7 @@ class _Run:
         """Measure again at full size what fits into the rest of the budget."""
         pace = bench_plan.Pace()
         for name, told_s in bench_plan.quickest_first(self.done, bench_plan.FULL_S):
-            left_s = self.until_s - bench_plan.RESERVE_S - time.perf_counter()
+            left_s = self.until_s - bench_plan.REPORT_RESERVE_S - time.perf_counter()
             if not pace.fits(told_s, left_s):
                 break
             pace.add(told_s, self.measure(name, "full"))
@@ -215,7 +215,7 @@ class _Run:
         document = to_document(list(self.done.values()))
         document["toy"] = self.toy
         document["left_out"] = [list(item) for item in self.left_out]
-        document["left_out"] += [[name, INTERRUPTED] for name in self.to_do]
+        document["left_out"] += [[name, INTERRUPTED_REASON] for name in self.to_do]
         document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
         for name, made in self.done.items():
             stage = document["stages"][made.name]

@@ -11,7 +11,14 @@ from typing import Any
 
 from skinrig.console import Console
 
-_COLUMNS = ("seconds", "cold_seconds", "peak_memory_mb", "error", "cramer_rao_bound", "efficiency")
+_POINT_COLUMNS = (
+    "seconds",
+    "cold_seconds",
+    "peak_memory_mb",
+    "error",
+    "cramer_rao_bound",
+    "efficiency",
+)
 
 BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of light", "which is")
 """Of the table of errors by band: the last but one is the error over that of the lightest band."""
@@ -40,7 +47,7 @@ def show(document: Mapping[str, Any], console: Console) -> None:
                 "",
             ),
             [
-                (knobs(point), *(_cell(point[key]) for key in _COLUMNS), _place(point))
+                (knobs(point), *(_cell(point[key]) for key in _POINT_COLUMNS), _place(point))
                 for point in stage["points"]
             ],
         )
@@ -121,7 +128,7 @@ def write(document: Mapping[str, Any], out: Path) -> None:
             stage["size"],
             knobs(point),
             stage["error_name"],
-            *(point[key] for key in _COLUMNS),
+            *(point[key] for key in _POINT_COLUMNS),
             *point["error_interval"],
             point["on_front"],
             point["knee"],
@@ -129,7 +136,7 @@ def write(document: Mapping[str, Any], out: Path) -> None:
         for name, stage in document["stages"].items()
         for point in stage["points"]
     ]
-    head = ("stage", "size", "setting", "error is", *_COLUMNS, "low", "high", "front", "knee")
+    head = ("stage", "size", "setting", "error is", *_POINT_COLUMNS, "low", "high", "front", "knee")
     write_whole(out / "bench.csv", _csv(head, rows))
     write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
     for name, stage in document["stages"].items():

@@ -12,7 +12,7 @@ from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.evaluating.bounds import cramer_rao
 
-BANDS: tuple[tuple[float, float], ...] = (
+MELANIN_RANGES: tuple[tuple[float, float], ...] = (
     (0.0, 0.02),
     (0.02, 0.05),
     (0.05, 0.1),
@@ -71,8 +71,8 @@ class MapError:
         return "all" if self.band is None else f"melanin {self.band[0]:g}–{self.band[1]:g}"
 
 
-MEDIAN_LIMIT = 0.15
-BOUND_LIMIT = 0.10
+MAX_MEDIAN_MELANIN_ERROR = 0.15
+MIN_BOUND_ERROR = 0.10
 BOUND_FACTOR = 1.3
 
 
@@ -83,7 +83,7 @@ def limit(row: MapError) -> float:
     estimate's own standard error stands for the bound only where the truth cannot give it.
     """
     least = bound(row)
-    return MEDIAN_LIMIT if least < BOUND_LIMIT else BOUND_FACTOR * least
+    return MAX_MEDIAN_MELANIN_ERROR if least < MIN_BOUND_ERROR else BOUND_FACTOR * least
 
 
 def bound(row: MapError) -> float:
@@ -149,7 +149,7 @@ def compare(
                     noise=appearance.maps.get(name + NOISE_STDERR),
                     bound=bounds.get(name),
                 )
-                for band in (None, *BANDS)
+                for band in (None, *MELANIN_RANGES)
             ]
     return [row for row in rows if row.pixels >= 20]
 

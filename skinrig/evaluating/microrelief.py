@@ -20,16 +20,14 @@ from reconstruction.pipeline.gradient.stages import (
     STRAIN_FILE,
 )
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.evaluating.surface import RAYLEIGH_68
 
-NORMAL_LIMIT_DEG = 1.5
-HEIGHT_LIMIT = 0.05
+MAX_NORMAL_ERROR_DEG = 1.5
+MAX_HEIGHT_ERROR = 0.05
 """Error of the height, of the relief's own root mean square."""
-STRAIN_LIMIT = 0.005
-DISTANCE_LIMIT = 0.5
+MAX_STRAIN_ERROR = 0.005
+MAX_HISTOGRAM_DISTANCE = 0.5
 """Distance of histograms with the fitted kernel, of that with the neutral only stretched."""
-
-# of an error with the same deviation in two directions, the length that 68.27 % stay below
-RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
 
 
 @dataclass(frozen=True, slots=True)

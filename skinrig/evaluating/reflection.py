@@ -19,9 +19,9 @@ from reconstruction.pipeline.dome.stages import BASIS_FILE, weight_names
 from reconstruction.surface.estimates import transmitted
 from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
-from skinrig.evaluating.surface import NEAR_MM
+from skinrig.evaluating.surface import MAX_MATCH_DISTANCE_MM
 
-HELD_OUT_LIMIT = 0.05
+MAX_HELD_OUT_ERROR = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,5 +266,5 @@ def _texels_for(
         return np.full(len(wanted), -1, np.intp)
     tree = cKDTree(place.values.reshape(-1, 3)[texel])
     true_place = truth.maps["position"].values.reshape(-1, 3)[wanted]
-    distance, index = tree.query(true_place, distance_upper_bound=NEAR_MM)
+    distance, index = tree.query(true_place, distance_upper_bound=MAX_MATCH_DISTANCE_MM)
     return np.where(np.isfinite(distance), texel[np.minimum(index, len(texel) - 1)], -1)

@@ -13,7 +13,7 @@ from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 TEST_FILE: Final = "reflection_test.npz"
-LEAST_COSINE: Final = 0.3
+MIN_TEST_COSINE: Final = 0.3
 """Directions nearer to the horizon are not asked for: 73 degrees."""
 SPHERE_PX: Final = 96
 
@@ -45,7 +45,7 @@ def make_test(
     truth
         Its maps: "position" and "normals".
     rng
-        Draws texels and directions, evenly over the half sphere down to `LEAST_COSINE`.
+        Draws texels and directions, evenly over the half sphere down to `MIN_TEST_COSINE`.
     sites
         Places on the face, mm, whose reflection is drawn on spheres.
     points, directions
@@ -154,9 +154,9 @@ def _turned(direction: Float64Array, outward: Float64Array, normal: Float64Array
 
 
 def _around(normals: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
-    """Draw directions around normals, even in solid angle down to `LEAST_COSINE`, (S, K, 3)."""
+    """Draw directions around normals, even in solid angle down to `MIN_TEST_COSINE`, (S, K, 3)."""
     shape = (len(normals), count)
-    z = rng.uniform(LEAST_COSINE, 1.0, shape)
+    z = rng.uniform(MIN_TEST_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)
     helper = np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     side = np.cross(normals, helper)

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from model import metrics
 from skinrig.arrays import Float64Array
 
-BANDS: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
-EDGES_DEG: Final = (55.0, 41.0, 28.0, 10.0, -30.0)
+TYPOLOGY_NAMES: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
+TYPOLOGY_EDGES_DEG: Final = (55.0, 41.0, 28.0, 10.0, -30.0)
 """Angles above which each but the last begins (Chardon et al. 1991, see `model.metrics`)."""
 
 SRGB_TO_XYZ: Final = (
@@ -61,7 +61,7 @@ def bands_of(angle_deg: ArrayLike) -> NDArray[np.str_]:
     ['very light', 'intermediate', 'dark']
     """
     angle = np.asarray(angle_deg, np.float64)
-    return np.array(BANDS)[np.searchsorted(-np.array(EDGES_DEG), -angle)]
+    return np.array(TYPOLOGY_NAMES)[np.searchsorted(-np.array(TYPOLOGY_EDGES_DEG), -angle)]
 
 
 @dataclass(frozen=True, slots=True)

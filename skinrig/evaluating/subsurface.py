@@ -14,10 +14,10 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
 
-MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08
+MAX_MEDIAN_ERROR, MAX_WORST_ERROR = 0.03, 0.08
 """Relative error of sigma_tr on homogeneous media, median and worst."""
-RECOMMENDED = METHODS[0]
-SIGNAL_TO_NOISE = 10.0
+RECOMMENDED_METHOD = METHODS[0]
+MIN_SIGNAL_TO_NOISE = 10.0
 """A fibre's reading tells something of the profile from here on."""
 
 
@@ -111,7 +111,7 @@ def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[
             found, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             real = np.asarray(true["reflectance_per_mm2"], float)[:, number]
             noise = np.asarray(true["stderr"], float)[:, number]
-            good = np.asarray(one["valid"], bool) & (found > SIGNAL_TO_NOISE * stderr)
+            good = np.asarray(one["valid"], bool) & (found > MIN_SIGNAL_TO_NOISE * stderr)
             if not good.any():
                 continue
             error = np.abs(found / real - 1.0)[good]

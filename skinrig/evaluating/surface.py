@@ -12,16 +12,16 @@ from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from skinrig.arrays import BoolArray, Float64Array
 
-NEAR_MM = 3.0
+MAX_MATCH_DISTANCE_MM = 3.0
 """Farther than this from the true surface a point has no truth."""
-CHANNELS = ("red", "green", "blue")
+CHANNEL_NAMES = ("red", "green", "blue")
 NORMAL_MAPS = ("half_vector_normals", "normals", "normals_refined")
 
-NORMAL_LIMIT_DEG = 1.0
-JUDGED_PIXEL_MM = 1.1
+MAX_NORMAL_ERROR_DEG = 1.0
+MAX_EVALUATED_PIXEL_MM = 1.1
 """Size of a pixel on the face up to which the limit of normals is promised: coarser ones average
 eyelids, nostrils and lips over more than they are wide."""
-ALBEDO_LIMIT = 0.03
+MAX_ALBEDO_ERROR = 0.03
 
 # of an error with the same deviation in two directions, the length that 68.27 % stay below
 RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
@@ -89,11 +89,13 @@ class SurfaceError:
     def judged(self) -> tuple[str, float, float]:
         """What is held to a limit: its name, the value and the limit, in ``unit``."""
         if self.unit == "deg":
-            return "mean error", self.mean, NORMAL_LIMIT_DEG
-        return "median error", self.median, 100.0 * ALBEDO_LIMIT
+            return "mean error", self.mean, MAX_NORMAL_ERROR_DEG
+        return "median error", self.median, 100.0 * MAX_ALBEDO_ERROR
 
 
-def match(appearance: SkinAppearance, truth: SkinAppearance, *, near_mm: float = NEAR_MM) -> Match:
+def match(
+    appearance: SkinAppearance, truth: SkinAppearance, *, near_mm: float = MAX_MATCH_DISTANCE_MM
+) -> Match:
     """Find the true texel nearest to each texel of an estimate.
 
     Parameters
@@ -205,7 +207,7 @@ def _channels(
     values = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
     true_values = _flat(truth.maps[name])[pairs.truth][good]
     rows = []
-    for channel, color in enumerate(CHANNELS):
+    for channel, color in enumerate(CHANNEL_NAMES):
         value, true_value = values[:, channel], true_values[:, channel]
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = (value - true_value) / true_value

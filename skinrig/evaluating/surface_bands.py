@@ -10,7 +10,7 @@ from skinrig.evaluating import surface as evaluation
 
 Banded = tuple[str, str, str, int, float, float, float]
 """Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
-LEAST_POINTS = 20
+MIN_POINTS = 20
 """Of a band that is told."""
 
 
@@ -32,10 +32,10 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
         if key not in appearance.maps or (key != "r_d" and "normals" not in truth.maps):
             continue
         error = np.abs(evaluation.errors_at(key, appearance, truth, pairs))
-        for band in skin_bands.BANDS:
+        for band in skin_bands.TYPOLOGY_NAMES:
             own = error[bands == band]
             told = own[np.isfinite(own)]
-            if len(own) < LEAST_POINTS or not len(told):
+            if len(own) < MIN_POINTS or not len(told):
                 continue
             unit = "%" if key == "r_d" else "°"
             masked = 100.0 * (1.0 - len(told) / len(own))

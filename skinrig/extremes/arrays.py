@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from skinrig.extremes.expectations import (
-    INTEGERS,
-    RENDERER,
+    WHY_INTEGERS,
+    WHY_SINGLE_PRECISION,
     Case,
     Real,
     Unexpected,
@@ -22,7 +22,7 @@ from skinrig.extremes.expectations import (
     within,
 )
 
-NO_NUMBERS = (np.nan, np.inf, -np.inf)
+NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 
 
 def _ring(count: int, tilt_rad: float):  # type: ignore[no-untyped-def]
@@ -37,7 +37,7 @@ def _no_numbers_in_light(real: Real) -> str:
     from reconstruction import photometric_stereo as stereo
 
     lights = _ring(8, 0.6)
-    for bad in NO_NUMBERS:
+    for bad in NON_FINITE_VALUES:
         seen = as_real(np.tile(lights[:, 2:, None], (1, 2, 2)), real)
         seen[3, 0, 1] = bad
         seen[:, 1, 0] = bad
@@ -70,7 +70,7 @@ def _no_numbers_in_statistics(real: Real) -> str:
 
     plain = as_real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)), real)
     told = []
-    for bad in NO_NUMBERS:
+    for bad in NON_FINITE_VALUES:
         broken = plain.copy()
         broken[6, 6] = bad
         mean, deviation = facial_color.local_statistics(broken, 3.0)
@@ -82,7 +82,7 @@ def _no_numbers_in_statistics(real: Real) -> str:
 
 def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
     for word, call in calls:
-        for bad in NO_NUMBERS:
+        for bad in NON_FINITE_VALUES:
             refused(lambda call=call, bad=bad: call(bad), ValueError, word)  # type: ignore[misc]
     return f"ValueError naming it, for {len(calls)} inputs and 3 values each"
 
@@ -285,7 +285,7 @@ CASES = (
         "indices and memory",
         "the values of a small picture",
         _eight_thousand,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "brackets that miss the range",
@@ -294,7 +294,7 @@ CASES = (
         "0/0 of weights",
         "darkness within its error; saturated pixels masked",
         _missed_range,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "conditions 1 to 1e12",
@@ -311,6 +311,6 @@ CASES = (
         "the renderer draws it without a word",
         "RenderError naming the light",
         _light_in_renderer,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
 )

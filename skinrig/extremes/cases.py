@@ -19,7 +19,7 @@ from skinrig.extremes.expectations import Case, Real, Unexpected
 
 SCHEMA = "skinrig.extremes.cases/1"
 
-PRECISIONS: Mapping[str, Real] = {"float32": np.float32, "float64": np.float64}
+INPUT_PRECISIONS: Mapping[str, Real] = {"float32": np.float32, "float64": np.float64}
 """What the inputs of each case are given in."""
 
 
@@ -78,7 +78,7 @@ def all_cases() -> tuple[Case, ...]:
 def try_case(case: Case) -> Result:
     """Run a case in every precision; whatever it raises becomes its outcome."""
     outcomes: dict[str, Outcome] = {}
-    for name, real in PRECISIONS.items():
+    for name, real in INPUT_PRECISIONS.items():
         if case.one_precision and outcomes:
             outcomes[name] = next(iter(outcomes.values()))
             continue

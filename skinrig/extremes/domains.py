@@ -16,7 +16,7 @@ from skinrig.extremes.expectations import (
 )
 from skinrig.extremes.expectations import within as within_bounds
 
-NO_MEDIUM = (np.nan, np.inf, -1.0)
+INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
 
 def _far_lights(real: Real) -> str:
@@ -106,7 +106,7 @@ def _profile_beyond_numbers(real: Real) -> str:
     clean(np.stack(slopes), np.ones((3, 2), bool), what="profile and slopes")
     near(slopes.reflectance_per_mm2[1], 0.0, absolute=1e-30)
     for place, name in enumerate(("radius_mm", "sigma_a_per_mm", "sigma_s_prime_per_mm")):
-        for bad in NO_MEDIUM:
+        for bad in INVALID_COEFFICIENTS:
             values = [real(1.0), real(0.1), real(1.0)]
             values[place] = real(bad)
             refused(lambda v=values: photon_table.reflectance(*v), ValueError, name)  # type: ignore[misc]

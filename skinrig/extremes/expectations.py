@@ -38,10 +38,10 @@ class Case:
     have."""
 
 
-INTEGERS = "pictures of a sensor are integers"
+WHY_INTEGERS = "pictures of a sensor are integers"
 
 
-RENDERER = "rays are cast in the renderer's own single precision"
+WHY_SINGLE_PRECISION = "rays are cast in the renderer's own single precision"
 """Of cases whose inputs have one precision."""
 
 

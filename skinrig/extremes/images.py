@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.extremes.expectations import (
-    INTEGERS,
+    WHY_INTEGERS,
     Case,
     Real,
     Unexpected,
@@ -23,14 +23,14 @@ from skinrig.extremes.expectations import (
 if TYPE_CHECKING:
     from model.color_table import ColorTable
 
-_BRACKETS = {"gain": 0.5, "read_noise": 3.0, "black": 512.0, "white": 16383.0}
+_SENSOR_SETTINGS = {"gain": 0.5, "read_noise": 3.0, "black": 512.0, "white": 16383.0}
 EXPOSURES_S = (1.0, 0.25, 0.0625)
 
 
 def _merged(dn: NDArray[np.integer]) -> tuple[NDArray[Any], ...]:
     from capture import hdr
 
-    radiance, variance, valid = hdr.merge(dn, EXPOSURES_S, **_BRACKETS)
+    radiance, variance, valid = hdr.merge(dn, EXPOSURES_S, **_SENSOR_SETTINGS)
     clean(radiance, valid, what="radiance")
     clean(variance, valid, what="variance")
     return radiance, variance, valid
@@ -182,7 +182,7 @@ CASES = (
         "0/0 of weights",
         "not valid",
         _all_saturated,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "black frames",
@@ -191,7 +191,7 @@ CASES = (
         "weights without light",
         "radiance 0",
         _all_black,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "negative after the darks",
@@ -200,7 +200,7 @@ CASES = (
         "clamping biases the mean",
         "negative values kept, mean 0 (z, 6e-5 false alarms)",
         _below_black,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "16-bit full scale",
@@ -209,7 +209,7 @@ CASES = (
         "overflow of integers",
         "valid, exact",
         _full_scale,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "one pixel",
@@ -218,7 +218,7 @@ CASES = (
         "loops over rows",
         "a value",
         _one_by_one,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "one electron a second",
@@ -227,7 +227,7 @@ CASES = (
         "weights that follow the noise",
         "mean unbiased (z, 6e-5 false alarms)",
         _one_electron,
-        one_precision=INTEGERS,
+        one_precision=WHY_INTEGERS,
     ),
     Case(
         "skin without gloss",

@@ -18,7 +18,7 @@ from skinrig.extremes.expectations import (
     within,
 )
 
-STAGE = "light inside skin"
+STAGE_NAME = "light inside skin"
 
 
 def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
@@ -123,7 +123,7 @@ def _opaque(real: Real) -> str:
 CASES = (
     Case(
         "even light on any medium",
-        STAGE,
+        STAGE_NAME,
         "R_d 0 to 1, 1/sigma_tr 0.01 to 100 mm",
         "peaks finer than texels, tails beyond the face",
         "R_d times what entered",
@@ -131,7 +131,7 @@ CASES = (
     ),
     Case(
         "texels far wider than light spreads",
-        STAGE,
+        STAGE_NAME,
         "5 mm apart, 1/sigma_tr 0.01 mm",
         "a dipole between its samples: all light lost",
         "the local term, all light kept",
@@ -139,7 +139,7 @@ CASES = (
     ),
     Case(
         "albedo above one",
-        STAGE,
+        STAGE_NAME,
         "R_d 1.2",
         "no reduced albedo",
         "a named outlier, masked",
@@ -147,7 +147,7 @@ CASES = (
     ),
     Case(
         "albedo near one and near none",
-        STAGE,
+        STAGE_NAME,
         "R_d 1e-6 to 1 - 1e-9",
         "an infinite slope at alpha' = 1",
         "1 - alpha' falls as R_d rises",
@@ -155,7 +155,7 @@ CASES = (
     ),
     Case(
         "a single texel",
-        STAGE,
+        STAGE_NAME,
         "one source, one exit point at the same place",
         "a singular distance",
         "R_d times what entered",
@@ -163,7 +163,7 @@ CASES = (
     ),
     Case(
         "nothing valid",
-        STAGE,
+        STAGE_NAME,
         "an empty mask, no source",
         "empty sums",
         "nothing valid, nothing leaves",
@@ -171,7 +171,7 @@ CASES = (
     ),
     Case(
         "skin on skin",
-        STAGE,
+        STAGE_NAME,
         "a fold 1 um wide, one side dark",
         "light counted twice",
         "between none and the brightest",
@@ -179,7 +179,7 @@ CASES = (
     ),
     Case(
         "translucency of zero",
-        STAGE,
+        STAGE_NAME,
         "1/sigma_tr = 0",
         "division by it",
         "GatherError naming translucency_mm",

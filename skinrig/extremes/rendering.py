@@ -11,7 +11,7 @@ import numpy as np
 from capture.rig import load_rig
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
-    RENDERER,
+    WHY_SINGLE_PRECISION,
     Case,
     Real,
     Unexpected,
@@ -243,7 +243,7 @@ CASES = (
         "offsets of rays grow with the distance from the origin",
         "the same shadow",
         _shadow_off_origin,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "shadow of furrows far from the origin",
@@ -252,7 +252,7 @@ CASES = (
         "offsets of rays wider than the relief",
         "the same shadows",
         _fine_shadow_off_origin,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "light along a plane",
@@ -261,7 +261,7 @@ CASES = (
         "a flat sheet shadows itself",
         "all lit",
         _no_self_shadow,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "light on the skin",
@@ -270,7 +270,7 @@ CASES = (
         "rays shorter than their offset",
         "all lit",
         _light_on_skin,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "light on skin far from the origin",
@@ -279,7 +279,7 @@ CASES = (
         "offsets as long as the ray",
         "all lit",
         _light_near_far_skin,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "light behind the skin",
@@ -288,7 +288,7 @@ CASES = (
         "light leaks through",
         "nothing lit",
         _light_behind,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
     Case(
         "triangles without area",
@@ -353,6 +353,6 @@ CASES = (
         "the renderer makes a negative picture without a word",
         "RenderError",
         _negative_environment,
-        one_precision=RENDERER,
+        one_precision=WHY_SINGLE_PRECISION,
     ),
 )

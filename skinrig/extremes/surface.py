@@ -20,7 +20,7 @@ from skinrig.extremes.expectations import (
     within,
 )
 
-UP = np.array([0.0, 0.0, 1.0])
+UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
 def _ring(count: int, tilt_rad: float) -> Float64Array:
@@ -46,7 +46,7 @@ def _coplanar(real: Real) -> str:
 
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return refused(
-        lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
+        lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
         stereo.PhotometricStereoError,
         "plane",
         "along (0.0, -1.0, 0.0);",
@@ -56,9 +56,9 @@ def _coplanar(real: Real) -> str:
 def _collinear(real: Real) -> str:
     from reconstruction import photometric_stereo as stereo
 
-    lights = np.repeat(UP[None], 5, axis=0)
+    lights = np.repeat(UP_NORMAL[None], 5, axis=0)
     return refused(
-        lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
+        lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
         stereo.PhotometricStereoError,
         "line",
         "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)",
@@ -80,7 +80,7 @@ def _two_lights_left(real: Real) -> str:
     lights = _ring(8, 0.6)
     seen = np.zeros((8, 1, 1), bool)
     seen[:2] = True
-    found = stereo.estimate_normals(_lit(lights, UP, real), lights, valid=seen)
+    found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=seen)
     return masked(found.valid)
 
 
@@ -95,7 +95,7 @@ def _nearly_coplanar(real: Real) -> str:
     )
     lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
     rng = np.random.default_rng(2)
-    noisy = _lit(lights, UP, real) + as_real(rng.normal(0, 1e-3, (9, 1, 1)), real)
+    noisy = _lit(lights, UP_NORMAL, real) + as_real(rng.normal(0, 1e-3, (9, 1, 1)), real)
     try:
         found = stereo.estimate_normals(
             noisy, lights, variance=as_real(np.full((9, 1, 1), 1e-6), real)
@@ -104,7 +104,7 @@ def _nearly_coplanar(real: Real) -> str:
         return f"refused: {error}"
     clean(found.normals, found.valid, what="normals")
     if np.any(found.valid):
-        off = _degrees_off(found.normals[found.valid], np.broadcast_to(UP, (1, 3)))
+        off = _degrees_off(found.normals[found.valid], np.broadcast_to(UP_NORMAL, (1, 3)))
         said = float(np.degrees(found.stderr_rad[found.valid].max()))
         if off > 4 * said:
             raise Unexpected(f"{off:.2g} degrees off, but says {said:.2g}")
@@ -117,12 +117,12 @@ def _grazing(real: Real) -> str:
 
     lights = _ring(12, np.radians(89.9))
     found = stereo.estimate_normals(
-        _lit(np.vstack([lights, UP]), UP, real), np.vstack([lights, UP])
+        _lit(np.vstack([lights, UP_NORMAL]), UP_NORMAL, real), np.vstack([lights, UP_NORMAL])
     )
     clean(found.normals, found.valid, what="normals")
     if not np.all(found.valid):
         return masked(found.valid)
-    off = _degrees_off(found.normals[0], np.broadcast_to(UP, (1, 3)))
+    off = _degrees_off(found.normals[0], np.broadcast_to(UP_NORMAL, (1, 3)))
     return within(off, 0.0, 0.1, what="degrees")
 
 
@@ -131,7 +131,7 @@ def _near_light(real: Real) -> str:
 
     places = 1.0 * _ring(8, 0.6)  # a millimetre from the skin
     away = np.linalg.norm(places, axis=-1)
-    lit = np.clip(places @ UP / away, 0, None) / away**2
+    lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
     found = stereo.estimate_normals(
         as_real(lit[:, None, None], real),
         places / away[:, None],
@@ -139,14 +139,14 @@ def _near_light(real: Real) -> str:
         points_mm=np.zeros((1, 1, 3)),
     )
     masked(found.valid, share=(1.0, 1.0))
-    return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
+    return within(_degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, what="degrees")
 
 
 def _far_light(real: Real) -> str:
     from reconstruction import photometric_stereo as stereo
 
     places = 1e7 * _ring(8, 0.6)
-    lit = np.clip(_ring(8, 0.6) @ UP, 0, None) / 1e14
+    lit = np.clip(_ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
         as_real(1e14 * lit[:, None, None], real),
         _ring(8, 0.6),
@@ -155,7 +155,7 @@ def _far_light(real: Real) -> str:
         light_intensity=np.full(8, 1e14),
     )
     masked(found.valid, share=(1.0, 1.0))
-    return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
+    return within(_degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, what="degrees")
 
 
 def _scales(real: Real) -> str:
@@ -262,10 +262,10 @@ def _no_diffuse(real: Real) -> str:
     from reconstruction import diffuse_albedo
 
     lights = np.vstack([_ring(20, 0.5), _ring(20, 0.9)])
-    views = np.broadcast_to(UP, lights.shape)
+    views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(
-        as_real(samples, real), lights[None], views[None], UP[None], eta=1.4
+        as_real(samples, real), lights[None], views[None], UP_NORMAL[None], eta=1.4
     )
     clean(found.r_d, found.valid, what="R_d")
     return (

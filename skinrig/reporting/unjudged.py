@@ -160,7 +160,7 @@ def _by_band(appearance: SkinAppearance) -> Iterator[page.Block]:
         if one is None or one.stderr is None or one.values.shape != levels.shape:
             continue
         values, good = _values(one)
-        for low, high in flash.BANDS:
+        for low, high in flash.MELANIN_RANGES:
             inside = known & (levels >= low) & (levels < high)
             chosen = inside & good & (np.abs(values) > 0)
             if np.count_nonzero(chosen) < 20:

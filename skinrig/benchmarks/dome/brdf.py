@@ -27,17 +27,17 @@ from skinrig.benchmarks.measurement import (
     once,
 )
 
-ALBEDO_ERROR = 3.0
-HELD_OUT_ERROR = 5.0
-TIMES_FASTER = 10.0
-CORES = 2
+MAX_ALBEDO_ERROR_PERCENT = 3.0
+MAX_HELD_OUT_ERROR_PERCENT = 5.0
+MIN_SPEEDUP_OVER_NNLS = 10.0
+FIT_CORES = 2
 """Cores that the fit shares its points out to."""
-RESIDUAL = 0.2
+MAX_RESIDUAL_EXCESS_PERCENT = 0.2
 ETA = 1.3
-SKINS: dict[str, tuple[float, float, float]] = {
-    "light": brdf_truth.LIGHT_SKIN,
+BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
+    "light": brdf_truth.LIGHT_SKIN_ALBEDO,
     "medium": (0.315, 0.189, 0.133),
-    "dark": brdf_truth.DARK_SKIN,
+    "dark": brdf_truth.DARK_SKIN_ALBEDO,
 }
 """Mean R_d of each band of `skinrig.evaluating.skin_bands`; the middle one is the geometric mean
 of the others."""
@@ -49,7 +49,7 @@ def albedo(*, toy: bool) -> StageBenchmark:
     count = 12 if toy else 150
     points, limits = [], []
     bands: dict[str, BandError] = {}
-    for skin, r_d in SKINS.items():
+    for skin, r_d in BAND_ALBEDOS.items():
         for noise in (0.02,) if toy else (0.005, 0.02, 0.08):
             for samples in (60,) if toy else (60, 240, 900):
                 p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
@@ -93,7 +93,7 @@ def albedo(*, toy: bool) -> StageBenchmark:
                             Limit(
                                 f"median error of R_d, worst channel, {skin} skin",
                                 error,
-                                ALBEDO_ERROR,
+                                MAX_ALBEDO_ERROR_PERCENT,
                                 "<=",
                                 "%",
                             )
@@ -119,7 +119,7 @@ def surface(*, toy: bool) -> StageBenchmark:
     points = []
     error = np.nan
     for samples in (100,) if toy else (100, 300, 900):
-        p, out, given, diffuse = _given(SKINS["light"], count, samples, rng)
+        p, out, given, diffuse = _given(BAND_ALBEDOS["light"], count, samples, rng)
 
         def point(
             name: str,
@@ -159,22 +159,30 @@ def surface(*, toy: bool) -> StageBenchmark:
         points.append(point("GGX", *once(partial(_ggx, p, given))))
         points.append(point("roots of elements", *once(partial(_rooted, p, given, basis))))
     bands = {}
-    for skin, r_d in SKINS.items():
+    for skin, r_d in BAND_ALBEDOS.items():
         p, out, given, diffuse = _given(r_d, count, 100 if toy else 300, rng)
         timing, fit = once(partial(brdf_basis.fit_weights, given, basis, compress="cbrt"))
         told = _judged("", timing, _lobes(fit.weights, basis, p), p, out, diffuse, 0, rng)
         bands[skin] = BandError(told.error, told.error_interval)
     faster, excess = _beside_scipy(basis, toy=toy)
     limits = (
-        Limit("median error of all light under lights left out", error, HELD_OUT_ERROR, "<=", "%"),
+        Limit(
+            "median error of all light under lights left out",
+            error,
+            MAX_HELD_OUT_ERROR_PERCENT,
+            "<=",
+            "%",
+        ),
         Limit(
             "times faster on 2 cores than a loop of SciPy's nnls, 5,000 x 900 x 59, matrices "
             "included",
             faster,
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_NNLS,
             ">=",
         ),
-        Limit("largest residual above SciPy's", 100.0 * excess, RESIDUAL, "<=", "%"),
+        Limit(
+            "largest residual above SciPy's", 100.0 * excess, MAX_RESIDUAL_EXCESS_PERCENT, "<=", "%"
+        ),
     )
     return StageBenchmark(
         "brdf",
@@ -316,7 +324,7 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     """Return how many times faster than SciPy, and the largest relative excess of the residual."""
     rng = np.random.default_rng(1)
     different, copies, subset = (20, 1, 3) if toy else (500, 10, 200)
-    p = brdf_truth.dome(different, r_d=SKINS["light"], noise=0.02, samples=900, rng=rng)
+    p = brdf_truth.dome(different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng)
     p = dataclasses.replace(p, valid=p.valid & (p.light @ p.normals[..., None] > 0.12)[..., 0])
     s = brdf_basis.surface_samples(
         p.f, p.light, p.view, p.normals, p.r_d, eta=ETA, variance=p.variance, valid=p.valid
@@ -341,7 +349,7 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     for _ in range(1 if toy else 5):
         start = time.process_time()
         found = brdf_basis.fit_weights(many, basis, compress="none")
-        ours.append((time.process_time() - start) / CORES)
+        ours.append((time.process_time() - start) / FIT_CORES)
         start = time.process_time()
         least = [nnls(a, y)[1] for a, y in problems]
         theirs.append((time.process_time() - start) / subset * len(many.value))

@@ -13,23 +13,23 @@ from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.arrays import Float64Array, Int64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
-RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
+SPACE_RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
 NOISE_RANK: Final = 4
 """Lobes of a model of one face, whose error is to stay below what noise leaves."""
-TRIED: Final = 0.3
+HELD_OUT_POINT_FRACTION: Final = 0.3
 """Part of the points that no mixture is made of."""
 
 
 def space(*, toy: bool) -> StageBenchmark:
     """Factor the mixtures of three datasets into ever more common ones, in two ways."""
     basis = brdf_tables.default()
-    ranks = (1, 2, 4) if toy else RANKS
+    ranks = (1, 2, 4) if toy else SPACE_RANKS
     points: list[Point] = []
     steepest, excess, beyond = -np.inf, 0.0, 0.0
     for number, data in enumerate(_datasets(toy=toy)):
         rng = np.random.default_rng([number, 72])
         order = rng.permutation(len(data.weights))
-        kept = round(TRIED * len(order))
+        kept = round(HELD_OUT_POINT_FRACTION * len(order))
         tried, trained = data.weights[order[:kept]], data.weights[order[kept:]]
         whose = data.label[order[:kept]] if data.name == "dataset B" else None
         ways: tuple[Literal["shares", "brdf"], ...] = ("shares", "brdf")

@@ -9,9 +9,9 @@ import numpy as np
 
 from skinrig.arrays import BoolArray, Float64Array
 
-LIGHTS, VIEWS = 150, 16
-LIGHT_SKIN = (0.62, 0.42, 0.32)
-DARK_SKIN = (0.16, 0.085, 0.055)
+N_LIGHTS, N_VIEWS = 150, 16
+LIGHT_SKIN_ALBEDO = (0.62, 0.42, 0.32)
+DARK_SKIN_ALBEDO = (0.16, 0.085, 0.055)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,17 +63,17 @@ def dome(
         How the surface's slopes die away: "light" as exp(-(tan/m)^1.5), "heavy" as tan^-4.4.
     """
     # Lights on a spiral over the sphere, cameras on an arc in front.
-    k = np.arange(LIGHTS) + 0.5
-    y = 1.0 - 2.0 * k / LIGHTS
+    k = np.arange(N_LIGHTS) + 0.5
+    y = 1.0 - 2.0 * k / N_LIGHTS
     turn = np.pi * (1.0 + np.sqrt(5.0)) * k
     ring = np.sqrt(1.0 - y**2)
     lights = np.stack([ring * np.cos(turn), y, ring * np.sin(turn)], axis=-1)
     az, el = np.meshgrid(np.linspace(-1.1, 1.1, 8), [-0.3, 0.4])
     views = np.stack([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)], axis=-1)
     normals = _unit(rng.normal(size=(points, 3)) * [0.5, 0.5, 0.2] + [0.0, 0.0, 1.0])
-    shape = (points, VIEWS, LIGHTS, 3)
+    shape = (points, N_VIEWS, N_LIGHTS, 3)
     light = np.broadcast_to(lights, shape).reshape(points, -1, 3)
-    view = np.broadcast_to(views.reshape(VIEWS, 1, 3), shape).reshape(points, -1, 3)
+    view = np.broadcast_to(views.reshape(N_VIEWS, 1, 3), shape).reshape(points, -1, 3)
     mu_l, mu_v = np.einsum("pmc,pc->pm", light, normals), np.einsum("pmc,pc->pm", view, normals)
     valid = (mu_l > 0.12) & (mu_v > 0.25)
     # Keep the valid ones, a random choice of them, in the same number of columns for all.

@@ -20,11 +20,11 @@ from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 if TYPE_CHECKING:
     from rigsim.scenes.dome.targets import TargetScene
 
-BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
-RADIUS_MM = 50.0
-REPROJECTION_PX = 0.3
-LIGHT_MM = 2.0
-SEED = 5
+CHARUCO_BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
+SPHERE_RADIUS_MM = 50.0
+MAX_REPROJECTION_PX = 0.3
+MAX_LIGHT_DISTANCE_MM = 2.0
+DOME_SEED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +42,15 @@ def geometry(*, toy: bool) -> StageBenchmark:
 
     views = ["C03", "C07", "C11", "C14"] if toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
     rig = load_rig("dome").subset(views=views).resized(324 if toy else 650)
-    dome = build(rig, seed=SEED, tolerances=Tolerances(distortion=0.2))
-    scene = target_scene("charuco", rig, seed=SEED, dome=dome)
+    dome = build(rig, seed=DOME_SEED, tolerances=Tolerances(distortion=0.2))
+    scene = target_scene("charuco", rig, seed=DOME_SEED, dome=dome)
     counts = (5, 6, 7, 8) if toy else (6, 8, 10, 12)
     sightings: dict[tuple[str, int], Sighting] = {}
     for pose in range(counts[-1]):
         scene.show(pose)
         for name in views:
             frame = _frame(scene, name, range(0, 150, 8), 0.02, 1.0, pose)
-            found = find_board(linear_rgb(frame, demosaic="bilinear").rgb, BOARD)
+            found = find_board(linear_rgb(frame, demosaic="bilinear").rgb, CHARUCO_BOARD)
             if found is not None:
                 sightings[name, pose] = found
     start = nominal_cameras(rig)
@@ -58,7 +58,7 @@ def geometry(*, toy: bool) -> StageBenchmark:
     points, worst = [], 0.0
     for count in counts:
         seen = {key: s for key, s in sightings.items() if key[1] < count}
-        result = bundle.adjust(seen, BOARD, start)
+        result = bundle.adjust(seen, CHARUCO_BOARD, start)
         gaps, variances, projected = [], [], []
         for name, camera in result.cameras.items():
             view = dome.rig.view(name)
@@ -69,7 +69,7 @@ def geometry(*, toy: bool) -> StageBenchmark:
         worst = float(max(projected))
 
         def call(seen: dict[tuple[str, int], Sighting] = seen) -> bundle.Bundle:
-            return bundle.adjust(seen, BOARD, start)
+            return bundle.adjust(seen, CHARUCO_BOARD, start)
 
         points.append(_point({"places": count}, call, np.array(gaps), np.array(variances)))
     return StageBenchmark(
@@ -80,7 +80,11 @@ def geometry(*, toy: bool) -> StageBenchmark:
         tuple(points),
         (
             Limit(
-                "worst camera's mean reprojection of the truth", worst, REPROJECTION_PX, "<=", "px"
+                "worst camera's mean reprojection of the truth",
+                worst,
+                MAX_REPROJECTION_PX,
+                "<=",
+                "px",
             ),
         ),
         interval_of="cameras",
@@ -97,8 +101,8 @@ def lights(*, toy: bool) -> StageBenchmark:
     dome_rig = load_rig("dome")
     every = [light.name for light in dome_rig.lights][:: 30 if toy else 10]
     rig = dome_rig.subset(views=views, lights=every).resized(324 if toy else 1300)
-    dome = build(rig, seed=SEED)
-    scene = target_scene("mirror", rig, seed=SEED, dome=dome)
+    dome = build(rig, seed=DOME_SEED)
+    scene = target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
     spheres: dict[int, mirror_sphere.SpherePosition] = {}
     seen: list[mirror_lights.Highlights] = []
@@ -131,7 +135,11 @@ def lights(*, toy: bool) -> StageBenchmark:
         "the simulated dome as built, with its own cameras",
         0.0,
         tuple(points),
-        (Limit("median distance of a light from its place", last, LIGHT_MM, "<=", "mm"),),
+        (
+            Limit(
+                "median distance of a light from its place", last, MAX_LIGHT_DISTANCE_MM, "<=", "mm"
+            ),
+        ),
         interval_of="lights",
         no_bands="a calibration by targets: no skin is in the pictures",
     )
@@ -152,10 +160,10 @@ def _add_sphere(
         frame = _frame(scene, name, every, 0.06, 1.0, number)
         colors[name] = channel_levels(frame)
         image = neutral_mosaic(frame, colors[name])
-        edges = mirror_sphere.find_outline(image, camera, RADIUS_MM)
+        edges = mirror_sphere.find_outline(image, camera, SPHERE_RADIUS_MM)
         if edges is not None:
             outlines[name] = edges
-    spheres[number] = mirror_sphere.locate_sphere(outlines, cameras, RADIUS_MM)
+    spheres[number] = mirror_sphere.locate_sphere(outlines, cameras, SPHERE_RADIUS_MM)
     for name, camera in cameras.items():
         window = mirror_lights.SphereWindow.of(camera, spheres[number])
         frame = _frame(scene, name, every, 0.012, 0.002, number)

@@ -20,11 +20,11 @@ from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
 
-TAN: Final = 1.5
+TAN_MELANIN_FACTOR: Final = 1.5
 """Factor of melanin."""
-EDITED: Final = 4
+N_EDITED_FACES: Final = 4
 """Faces that are edited; the traits are learned of others."""
-ERROR, RETURN, GAIN = 10.0, 2.0, 0.5
+MAX_EDIT_ERROR_PERCENT, MAX_ROUND_TRIP_PERCENT, MAX_ERROR_RATIO_TO_NO_EDIT = 10.0, 2.0, 0.5
 """Limits, %, %, and of the error over that of no edit."""
 
 
@@ -33,7 +33,7 @@ def editing(*, toy: bool) -> StageBenchmark:
     count, size = (4, 64) if toy else (28, 192)
     # heads take long to build: one of them is enough to see that this runs
     everybody = [p for p in table_1() if not toy or p.head == 0]
-    order = np.random.default_rng(0).permutation(len(everybody))[: count + EDITED]
+    order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
     people = [dataclasses.replace(everybody[k], applied=()) for k in order]
     faces = CommonFaces.of(people, size=size, common=64 if toy else 128)
     learned, edited = people[:count], people[count:]
@@ -102,9 +102,13 @@ def editing(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit("tan, error of R_d", error, ERROR, "<=", "%"),
-            Limit("tan, error over that of no edit", error / none, GAIN, "<="),
-            Limit("tan and its opposite, what is left", returned, RETURN, "<=", "%"),
+            Limit("tan, error of R_d", error, MAX_EDIT_ERROR_PERCENT, "<=", "%"),
+            Limit(
+                "tan, error over that of no edit", error / none, MAX_ERROR_RATIO_TO_NO_EDIT, "<="
+            ),
+            Limit(
+                "tan and its opposite, what is left", returned, MAX_ROUND_TRIP_PERCENT, "<=", "%"
+            ),
             Limit("tan of amount 0, largest change", zero, 1e-5, "<="),
         ),
         interval_of="faces; by band, regions of one",
@@ -139,7 +143,7 @@ def _around(middle: float, squares: list[float]) -> tuple[float, float]:
 
 
 def _tanned(person: Member) -> Member:
-    return dataclasses.replace(person, melanin=TAN * person.melanin)
+    return dataclasses.replace(person, melanin=TAN_MELANIN_FACTOR * person.melanin)
 
 
 def _edit(

@@ -12,18 +12,18 @@ from capture import hdr
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
 
-GAIN, READ_NOISE, BLACK, WHITE = 2.0, 8.0, 512.0, 16383.0
-TIMES_FASTER = 5.0
-ABOVE_BOUND = 1.05
-FRAMES, SIDE = 23, 1024
-SPAN_S = (1e-3, 1.0)
+GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
+MIN_SPEEDUP_OVER_DEBEVEC = 5.0
+MAX_RATIO_TO_BOUND = 1.05
+N_FRAMES, FULL_SIDE_PX = 23, 1024
+EXPOSURE_RANGE_S = (1e-3, 1.0)
 
 Frames = list[UInt16Array]
 
 
 def merging(*, toy: bool) -> StageBenchmark:
     """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
-    side = 64 if toy else SIDE
+    side = 64 if toy else FULL_SIDE_PX
     rng = np.random.default_rng(0)
     scene = np.geomspace(20.0, 2e5, side * side * 3)
     scene = rng.permutation(scene).reshape(side, side, 3)  # DN per second
@@ -31,15 +31,15 @@ def merging(*, toy: bool) -> StageBenchmark:
     worst = 0.0
     frames: Frames = []
     times = np.ones(1)
-    for count in (2, 3, 5, 9, FRAMES):
-        times = np.geomspace(*SPAN_S, count)
+    for count in (2, 3, 5, 9, N_FRAMES):
+        times = np.geomspace(*EXPOSURE_RANGE_S, count)
         frames = [_expose(scene, t, rng) for t in times]
         timing = measure(lambda f=frames, t=times: _merge(f, t), repeats=1 if toy else 3)  # type: ignore[misc]
         radiance, _, valid = _merge(frames, times)
         bound = _bound(scene, times)
         # near a frame's saturation noise decides whether the frame counts
         settled = valid & ~np.any(
-            [np.abs(scene * t / (WHITE - BLACK) - 1) < 0.05 for t in times], axis=0
+            [np.abs(scene * t / (WHITE_DN - BLACK_DN) - 1) < 0.05 for t in times], axis=0
         )
         squares = ((radiance - scene) / scene)[settled] ** 2
         error = 100 * float(np.sqrt(squares.mean()))
@@ -52,8 +52,8 @@ def merging(*, toy: bool) -> StageBenchmark:
     ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
     interval = (error - spread, error + spread)
-    points.append(Point({"frames": FRAMES, "way": "beside"}, ours, error, interval, least))
-    size = f"{FRAMES} x {side}^2 x 3"
+    points.append(Point({"frames": N_FRAMES, "way": "beside"}, ours, error, interval, least))
+    size = f"{N_FRAMES} x {side}^2 x 3"
     name = f"times faster than OpenCV's Debevec on {size} (its fastest {theirs:.3f} s)"
     return StageBenchmark(
         "hdr",
@@ -62,8 +62,8 @@ def merging(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit(name, ratio, TIMES_FASTER, ">="),
-            Limit("largest error over the Cramér-Rao bound", worst, ABOVE_BOUND, "<="),
+            Limit(name, ratio, MIN_SPEEDUP_OVER_DEBEVEC, ">="),
+            Limit("largest error over the Cramér-Rao bound", worst, MAX_RATIO_TO_BOUND, "<="),
         ),
         interval_of="pixels",
         no_bands="radiances over four decades, whoever sends them",
@@ -71,21 +71,23 @@ def merging(*, toy: bool) -> StageBenchmark:
 
 
 def _merge(frames: Frames, times: Float64Array) -> tuple[Float32Array, Float32Array, BoolArray]:
-    return hdr.merge(frames, times, gain=GAIN, read_noise=READ_NOISE, black=BLACK, white=WHITE)
+    return hdr.merge(
+        frames, times, gain=GAIN_E_PER_DN, read_noise=READ_NOISE_E, black=BLACK_DN, white=WHITE_DN
+    )
 
 
 def _expose(scene: Float64Array, time_s: float, rng: np.random.Generator) -> UInt16Array:
-    electrons = rng.poisson(np.minimum(scene * time_s * GAIN, 1e6)).astype(np.float32)
-    electrons += READ_NOISE * rng.standard_normal(scene.shape, np.float32)
-    return np.clip(np.rint(electrons / GAIN + BLACK), 0, WHITE).astype(np.uint16)
+    electrons = rng.poisson(np.minimum(scene * time_s * GAIN_E_PER_DN, 1e6)).astype(np.float32)
+    electrons += READ_NOISE_E * rng.standard_normal(scene.shape, np.float32)
+    return np.clip(np.rint(electrons / GAIN_E_PER_DN + BLACK_DN), 0, WHITE_DN).astype(np.uint16)
 
 
 def _bound(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
     """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
     information = np.zeros_like(scene)
     for t in times:
-        variance = scene * t / GAIN + (READ_NOISE / GAIN) ** 2 + 1 / 12
-        information += np.where(scene * t < WHITE - BLACK, t**2 / variance, 0.0)
+        variance = scene * t / GAIN_E_PER_DN + (READ_NOISE_E / GAIN_E_PER_DN) ** 2 + 1 / 12
+        information += np.where(scene * t < WHITE_DN - BLACK_DN, t**2 / variance, 0.0)
     return 1.0 / np.where(information > 0, information, np.nan)
 
 

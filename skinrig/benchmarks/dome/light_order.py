@@ -13,8 +13,8 @@ from capture.rig import LedLimits, Rig, load_rig
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
 DWELL_S = 1.0 / 12.0
-LESS_FLICKER = 5.0
-DARK_SHARE = 0.3
+MIN_FLICKER_REDUCTION = 5.0
+DARK_TIME_FRACTION = 0.3
 """Share of each light's time that is dark where lights do not overlap."""
 
 
@@ -52,7 +52,7 @@ def light_order(*, toy: bool) -> StageBenchmark:
             Limit(
                 "times less flicker than a spiral with dark gaps",
                 worst.rms / chosen.rms,
-                LESS_FLICKER,
+                MIN_FLICKER_REDUCTION,
                 ">=",
             ),
         ),
@@ -65,7 +65,7 @@ def light_order(*, toy: bool) -> StageBenchmark:
 def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:
     rows = []
     for light in shown:
-        lit_s = DWELL_S * (1.0 - DARK_SHARE * gaps)
+        lit_s = DWELL_S * (1.0 - DARK_TIME_FRACTION * gaps)
         rows.append(LedRow((light,), 1.0, lit_s))
         if gaps:
             rows.append(LedRow((), 0.0, DWELL_S - lit_s))

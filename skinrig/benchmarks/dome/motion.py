@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from reconstruction.registration import head_motion
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Case, StageBenchmark, compare
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-EXPOSURE_S = 0.03
+TRACKING_EXPOSURE_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,23 @@ class Drift:
     poses: Sequence[tuple[Float64Array, Float64Array]]
     twitch: Float64Array
     """How far the twitch of the mouth has gone, 0 to 1."""
+
+    def estimate(self, tracks: int) -> head_motion.HeadMotion:
+        """Estimate the motion with so many tracks per camera."""
+        return head_motion.estimate(
+            self.frames,
+            self.cameras,
+            self.points_mm,
+            self.normals,
+            self.times_s,
+            tracks_per_camera=tracks,
+        )
+
+    def error(self, found: head_motion.HeadMotion) -> BandError:
+        """Return the mean error over the frames, mm."""
+        errors = self.errors_mm(found)
+        half = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
+        return BandError.around(float(errors.mean()), half)
 
     def errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
         """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
@@ -113,10 +131,12 @@ def simulate(
     )
     frames = []
     for t in times_s:
-        pops = [LedPulse(k, 1.0, t, t + EXPOSURE_S) for k in range(len(rig.lights))]
+        pops = [LedPulse(k, 1.0, t, t + TRACKING_EXPOSURE_S) for k in range(len(rig.lights))]
         row = []
         for view in rig.views:
-            cfa = scene.exposure(view.name, pops=pops, exposure_s=EXPOSURE_S, seed=round(100 * t))
+            cfa = scene.exposure(
+                view.name, pops=pops, exposure_s=TRACKING_EXPOSURE_S, seed=round(100 * t)
+            )
             x = np.asarray(cfa, np.float64) - view.black_level
             row.append((x[::2, ::2] + x[::2, 1::2] + x[1::2, ::2] + x[1::2, 1::2]) / 4)
         frames.append(row)
@@ -139,53 +159,39 @@ def motion(*, toy: bool) -> StageBenchmark:
     """Follow heads that drift little and much, with few and many tracks."""
     width, views, times = (160, 2, (0.0, 8.0, 16.0)) if toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
     texels = 128 if toy else 512
-    points = []
-    for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
-        seen = simulate(
-            width_px=width, views=views, drift_mm=drift_mm, times_s=times, texels=texels
-        )
-        for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
-            points.append(_point(seen, drift_mm, tracks, toy=toy))
-    bands = {}
-    for name, band in MELANIN_BANDS.items():
-        seen = simulate(
-            width_px=width,
-            views=views,
-            drift_mm=1.0,
-            times_s=times[:3],
-            preset=band.preset,
-            texels=texels,
-        )
-        one = _point(seen, 1.0, 100, toy=True)
-        bands[name] = BandError(one.error, one.error_interval)
-    return StageBenchmark(
-        "head-motion",
-        "error of the head's place, mm",
-        f"where the simulated head was; {width // 2} pixels across 300 mm, {views} cameras",
-        0.0,
-        tuple(points),
-        left_out=(("Cramér-Rao bound", "shading that stays in space limits tracks, not noise"),),
-        by_band=bands,
-        condition=("drift mm",),
-        interval_of="frames",
+    drift = partial(simulate, width_px=width, views=views, texels=texels)
+
+    def cases() -> Iterator[Case[head_motion.HeadMotion]]:
+        for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
+            seen = drift(drift_mm=drift_mm, times_s=times)
+            moved_mm = round(float(seen.moved_mm().mean()), 3)
+            for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
+                yield Case(
+                    {"drift mm": drift_mm, "tracks": tracks},
+                    partial(seen.estimate, tracks),
+                    seen.error,
+                    also=lambda _, moved_mm=moved_mm: {"moved_mm": moved_mm},  # type: ignore[misc]
+                )
+
+    def by_band() -> dict[str, BandError]:
+        found = {}
+        for name, band in MELANIN_BANDS.items():
+            seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
+            found[name] = seen.error(seen.estimate(100))
+        return found
+
+    return compare(
+        StageBenchmark(
+            "head-motion",
+            "error of the head's place, mm",
+            f"where the simulated head was; {width // 2} pixels across 300 mm, {views} cameras",
+            left_out=(
+                ("Cramér-Rao bound", "shading that stays in space limits tracks, not noise"),
+            ),
+            condition=("drift mm",),
+            interval_of="frames",
+        ),
+        cases(),
+        repeats=1 if toy else 3,
+        by_band=by_band,
     )
-
-
-def _point(seen: Drift, drift_mm: float, tracks: int, *, toy: bool) -> Point:
-    def run() -> head_motion.HeadMotion:
-        return head_motion.estimate(
-            seen.frames,
-            seen.cameras,
-            seen.points_mm,
-            seen.normals,
-            seen.times_s,
-            tracks_per_camera=tracks,
-        )
-
-    timing = measure(run, repeats=1 if toy else 3)
-    errors = seen.errors_mm(run())
-    error = float(errors.mean())
-    spread = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
-    knobs: Mapping[str, str | int | float | bool] = {"drift mm": drift_mm, "tracks": tracks}
-    also = {"moved_mm": round(float(seen.moved_mm().mean()), 3)}
-    return Point(knobs, timing, error, (error - spread, error + spread), also=also)

@@ -20,15 +20,15 @@ from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchma
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR, luminance
 
-RANKS: Final = (1, 2, 4, 8, 24)
+LOBE_RANKS: Final = (1, 2, 4, 8, 24)
 USUAL_RANK: Final = 4
-NOISE: Final = 0.02
-LEFT_OUT: Final = 0.2
+RELATIVE_NOISE: Final = 0.02
+HELD_OUT_LIGHT_FRACTION: Final = 0.2
 """Share of the lights that no fit sees."""
-LEAST_COSINE: Final = 0.15
+MIN_COSINE: Final = 0.15
 ETA: Final = 1.4
-SUBJECTS: Final = tuple(band.preset for band in MELANIN_BANDS.values())
-EXTREMES: Final = ("palest", "darkest")
+BAND_PRESETS: Final = tuple(band.preset for band in MELANIN_BANDS.values())
+EXTREME_PRESETS: Final = ("palest", "darkest")
 """Beyond the typical people of the bands; of the full size alone."""
 
 
@@ -96,7 +96,7 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     which = np.divmod(pair, len(ends[1]))
     to = [_unit(end[k] - place[:, None]) for end, k in zip(ends, which, strict=True)]
     cosines = [np.einsum("pmk,pk->pm", way, normals) for way in to]
-    seen = (cosines[0] > LEAST_COSINE) & (cosines[1] > LEAST_COSINE)
+    seen = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
     count = pair.shape[1]
     total, specular = surface_brdf.evaluate(
         np.repeat(packed, count, axis=0),
@@ -105,8 +105,8 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
         to[1].reshape(-1, 3),
     )
     clean = np.asarray(total, np.float64).reshape(len(chosen), count, 3)
-    sigma = NOISE * (clean + 0.02 / np.pi / np.maximum(cosines[0], LEAST_COSINE)[..., None])
-    held = rng.random(len(ends[0])) < LEFT_OUT
+    sigma = RELATIVE_NOISE * (clean + 0.02 / np.pi / np.maximum(cosines[0], MIN_COSINE)[..., None])
+    held = rng.random(len(ends[0])) < HELD_OUT_LIGHT_FRACTION
     return FacePoints(
         clean + sigma * rng.standard_normal(clean.shape),
         sigma**2,
@@ -128,7 +128,7 @@ def model(*, toy: bool) -> StageBenchmark:
     points: list[Point] = []
     bands: dict[str, BandError] = {}
     usual: list[float] = []
-    for subject in SUBJECTS if toy else (*SUBJECTS, *EXTREMES):
+    for subject in BAND_PRESETS if toy else (*BAND_PRESETS, *EXTREME_PRESETS):
         p = face_points(subject, points=count, samples=samples, rng=rng)
         use = p.seen & ~p.left_out
         albedo = diffuse_albedo.estimate(
@@ -138,7 +138,7 @@ def model(*, toy: bool) -> StageBenchmark:
             p.f, p.light, p.view, p.normals, albedo.r_d, eta=ETA, variance=p.variance, valid=use
         )
         full = brdf_basis.fit_weights(given, materials)
-        for rank in RANKS:
+        for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
                 continue
 
@@ -224,7 +224,7 @@ def _above(
 ) -> Int64Array:
     """Return the pairs of each point with those above its horizon first, in their order."""
     up = [
-        np.einsum("pmk,pk->pm", _unit(end[None] - place[:, None]), normals) > LEAST_COSINE
+        np.einsum("pmk,pk->pm", _unit(end[None] - place[:, None]), normals) > MIN_COSINE
         for end in ends
     ]
     light, view = np.divmod(pairs, len(ends[1]))

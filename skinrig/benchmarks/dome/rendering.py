@@ -23,12 +23,12 @@ from skinrig.rendering.interior import Interior
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.truth import true_light, true_model
 
-MEDIAN_ERROR: Final = 1.0
-SUM_ERROR: Final = 1.0
-VIEW: Final = "C07"
-LIGHT: Final = 62
-FINE: Final = 6
-SIGMA_TR: Final = (0.598, 1.069, 1.672)
+MAX_MEDIAN_ERROR_PERCENT: Final = 1.0
+MAX_SUM_ERROR_PERCENT: Final = 1.0
+VIEW_NAME: Final = "C07"
+LIGHT_INDEX: Final = 62
+REFERENCE_SUBPIXELS: Final = 6
+MEAN_SIGMA_TR_PER_MM: Final = (0.598, 1.069, 1.672)
 """Of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
 
 
@@ -38,20 +38,22 @@ def model(*, toy: bool) -> StageBenchmark:
     Rays and textures are judged by the simulator at 36 rays a pixel, with every light from inside
     leaving where it entered; the tolerance of light that spreads by our own finest one.
     """
-    width, size, fine = (48, 128, 3) if toy else (325, 512, FINE)
+    width, size, fine = (48, 128, 3) if toy else (325, 512, REFERENCE_SUBPIXELS)
     rays = (1, 2) if toy else (1, 2, 3, 4)
-    rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW])
+    rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
     face = make_subject("III", seed=5, size=size)
     # as the model has it
     direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
     scene = direct(rig, face)
-    true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
+    true = direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0]
     camera = CameraPose.nominal(rig.views[0])
-    light = true_light(scene, LIGHT, VIEW)
+    light = true_light(scene, LIGHT_INDEX, VIEW_NAME)
     caster = Caster(face.mesh)
     points = []
     binnings = (1, 2) if toy else (1, 2, 4, 8)
-    laid = {k: FittedSurface.of(true_model(scene, VIEW, binning=k), face.mesh) for k in binnings}
+    laid = {
+        k: FittedSurface.of(true_model(scene, VIEW_NAME, binning=k), face.mesh) for k in binnings
+    }
 
     def shown(
         on: FittedSurface,
@@ -81,7 +83,7 @@ def model(*, toy: bool) -> StageBenchmark:
         timing = measure(lambda k=binning: shown(laid[k]), repeats=2, memory=None)  # type: ignore[misc]
         error = _relative(shown(laid[binning]).radiance, true)
         points.append(_point({"vary": "texture", "texels": size // binning}, timing, error))
-    skin = laid[1].of_medium(SIGMA_TR)
+    skin = laid[1].of_medium(MEAN_SIGMA_TR_PER_MM)
     interior = Interior.of(skin)
     best = shown(skin, "dipole", interior, 1, 0.001).diffuse
     for tolerance in (0.1, 0.01) if toy else (3.0, 1.0, 0.3, 0.1, 0.01):
@@ -115,14 +117,14 @@ def model(*, toy: bool) -> StageBenchmark:
             Limit(
                 "median relative error of true maps on lit pixels",
                 100.0 * float(np.median(gap)),
-                MEDIAN_ERROR,
+                MAX_MEDIAN_ERROR_PERCENT,
                 "<=",
                 "%",
             ),
             Limit(
                 "two lights of 0.3 and 0.7 beside one of 1",
                 _relative(both, seen.radiance)[0],
-                SUM_ERROR,
+                MAX_SUM_ERROR_PERCENT,
                 "<=",
                 "%",
             ),
@@ -142,10 +144,10 @@ def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
     # as the model has it
     direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
     scene = direct(rig, face)
-    true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
-    on = FittedSurface.of(true_model(scene, VIEW), face.mesh)
+    true = direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0]
+    on = FittedSurface.of(true_model(scene, VIEW_NAME), face.mesh)
     camera = CameraPose.nominal(rig.views[0])
-    light = true_light(scene, LIGHT, VIEW)
+    light = true_light(scene, LIGHT_INDEX, VIEW_NAME)
     seen = render(on.model, on, camera, light, subpixels=2, caster=Caster(face.mesh))
     return BandError(*_relative(seen.radiance, true))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +20,23 @@ from reconstruction.lumitexels import Surface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
-from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    Timing,
+    compare,
+)
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
 
-RADIUS_MM, ALBEDO = 80.0, 0.4
-MEMORY_MB = 400.0
-FULL = 500_000 * 16 * 150
-HOURS = 1.0
-BLOCKS = 40
+SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
+MAX_MEMORY_MB = 400.0
+N_FULL_SAMPLES = 500_000 * 16 * 150
+MAX_HOURS = 1.0
+N_ERROR_BLOCKS = 40
 """Of samples, whose means scatter independently."""
 
 
@@ -39,7 +48,7 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
     rig = load_rig("dome").resized(width).subset(lights=names, views=views)
     cameras = [CameraPose.nominal(view) for view in rig.views]
     lights = LightTable.nominal(rig)
-    sphere = trimesh.creation.icosphere(subdivisions=4 if toy else 6, radius=RADIUS_MM)
+    sphere = trimesh.creation.icosphere(subdivisions=4 if toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
     seen = [_seen(camera) for camera in cameras]
     points = []
@@ -47,7 +56,7 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
     counts = (250, 500) if toy else (2_000, 10_000, 40_000)
     for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
         where = sphere.vertices[:count]
-        surface = Surface(where, where / RADIUS_MM)
+        surface = Surface(where, where / SPHERE_RADIUS_MM)
         with tempfile.TemporaryDirectory() as folder:
             tracemalloc.start()
             start = time.perf_counter()
@@ -70,7 +79,7 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
             start = time.perf_counter()
             for _, part in store.chunks(1000):
                 inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
-                errors.append(part.f[inner][:, 1] * np.pi / ALBEDO - 1)
+                errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
             spent += time.perf_counter() - start
             peak = tracemalloc.get_traced_memory()[1] / 1e6
             tracemalloc.stop()
@@ -82,7 +91,9 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
                 Timing(spent, (spent, spent), spent, peak),
                 float(off.mean()),
                 # samples of a point err alike: blocks of points are drawn
-                mean_error([part.mean() for part in np.array_split(off, BLOCKS)]).error_interval,
+                mean_error(
+                    [part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)]
+                ).error_interval,
             )
         )
     return StageBenchmark(
@@ -93,12 +104,16 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
         tuple(points),
         (
             Limit(
-                "memory of the largest gathering with tables on disk", peak, MEMORY_MB, "<=", "MB"
+                "memory of the largest gathering with tables on disk",
+                peak,
+                MAX_MEMORY_MB,
+                "<=",
+                "MB",
             ),
             Limit(
                 "hours for 500,000 points x 16 x 150 at this rate, images given",
-                rate * FULL / 3600,
-                HOURS,
+                rate * N_FULL_SAMPLES / 3600,
+                MAX_HOURS,
                 "<=",
                 "h",
             ),
@@ -119,34 +134,39 @@ def filling(*, toy: bool) -> StageBenchmark:
         [np.sin(9 * x) * np.cos(7 * y), x + y, np.exp(-20 * ((x - 0.5) ** 2 + (y - 0.5) ** 2))],
         axis=-1,
     ).astype(np.float32)
-    points = []
-    for share in (0.05, 0.15, 0.35, 0.75):
-        weight = (rng.random((side, side)) < share).astype(np.float32)
-        weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
-        ways: dict[str, Callable[[], FloatArray]] = {
-            "push-pull": lambda w=weight: texture_fill.push_pull(truth, w).values,  # type: ignore[misc]
-            "nearest texel": lambda w=weight: _nearest(truth, w),  # type: ignore[misc]
-        }
-        for way, fill in ways.items():
-            timing = measure(fill, repeats=1 if toy else 3)
-            off = tiled_rms(
-                100 * (fill() - truth) / truth.std(), weight == 0, tile_px=max(side // 16, 8)
-            )
-            knobs: dict[str, str | int | float] = {"known": share, "way": way, "side": side}
-            points.append(Point(knobs, timing, off.error, off.error_interval))
-    return StageBenchmark(
-        "texture-fill",
-        "RMS error of filled texels, % of the texture's deviation",
-        "the smooth texture the texels were taken from",
-        0.0,
-        tuple(points),
-        condition=("known",),
-        interval_of="tiles of the texture",
-        no_bands="filling of any map: errors go with its values",
+
+    def cases() -> Iterator[Case[FloatArray]]:
+        for share in (0.05, 0.15, 0.35, 0.75):
+            weight = (rng.random((side, side)) < share).astype(np.float32)
+            weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
+
+            def error(filled: FloatArray, unknown: BoolArray = weight == 0) -> BandError:
+                off = 100 * (filled - truth) / truth.std()
+                return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
+
+            for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
+                knobs: dict[str, str | float] = {"known": share, "way": way, "side": side}
+                yield Case(knobs, partial(fill, truth, weight), error)
+
+    return compare(
+        StageBenchmark(
+            "texture-fill",
+            "RMS error of filled texels, % of the texture's deviation",
+            "the smooth texture the texels were taken from",
+            condition=("known",),
+            interval_of="tiles of the texture",
+            no_bands="filling of any map: errors go with its values",
+        ),
+        cases(),
+        repeats=1 if toy else 3,
     )
 
 
-def _nearest(values: Float32Array, weight: Float32Array) -> Float32Array:
+def _push_pull(values: Float32Array, weight: Float32Array) -> FloatArray:
+    return texture_fill.push_pull(values, weight).values
+
+
+def _nearest(values: Float32Array, weight: Float32Array) -> FloatArray:
     """Return a texture whose unknown texels have the value of the nearest known one."""
     rows, columns = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
     return np.asarray(values[rows, columns])
@@ -158,7 +178,7 @@ def _seen(camera: CameraPose) -> Float64Array:
     row, column = np.mgrid[0:height, 0:width]
     ways = camera.rays(np.stack([column, row], axis=-1))
     along = ways @ camera.center_mm
-    inside = along**2 - camera.center_mm @ camera.center_mm + RADIUS_MM**2
+    inside = along**2 - camera.center_mm @ camera.center_mm + SPHERE_RADIUS_MM**2
     root = np.sqrt(np.where(inside > 0, inside, np.nan))
     return np.asarray(camera.center_mm + (-along - root)[..., None] * ways)
 
@@ -168,7 +188,7 @@ def _image(seen: Float64Array, lights: LightTable, light: int) -> Float32Array:
     way = lights.position_mm[light] - seen
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
     way /= distance
-    cosine = np.clip((way * seen).sum(axis=-1) / RADIUS_MM, 0.0, None)
+    cosine = np.clip((way * seen).sum(axis=-1) / SPHERE_RADIUS_MM, 0.0, None)
     lobe = np.clip(-(way @ lights.axis[light]), 0.0, None) ** lights.exponent[light]
     strength = (cosine * lobe)[..., None] / distance**2
-    return np.asarray(ALBEDO * lights.intensity[light] * strength, np.float32)
+    return np.asarray(SPHERE_ALBEDO * lights.intensity[light] * strength, np.float32)

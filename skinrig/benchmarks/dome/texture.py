@@ -16,15 +16,15 @@ from model.texture_statistics.space import TextureSpace
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
-TIMES_FASTER = 10.0
-SAME_DISTANCE = 1.05
-SAME_RESPONSES = 2e-6
+MIN_SPEEDUP_OVER_PYRTOOLS = 10.0
+MAX_DISTANCE_RATIO = 1.05
+MAX_RESPONSE_DIFFERENCE = 2e-6
 """Of the image's largest value: float32 against float64."""
-FULL_SIDE, FULL_ITERATIONS = 1024, 4
-PEER = "pyrtools and scikit-image"
-SEEDS = 3
-_COLOR = np.array([0.55, 0.38, 0.28])
-_TINTS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
+FULL_SIDE_PX, FULL_ITERATIONS = 1024, 4
+PEER_NAME = "pyrtools and scikit-image"
+N_SOURCES = 3
+_SKIN_COLOR = np.array([0.55, 0.38, 0.28])
+_DENSITY_COLORS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
 
 def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
@@ -56,10 +56,10 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
     count = round(spots * side * side / 128**2)
     marks[tuple(rng.integers(0, side, (2, count)))] = 1.0
     dark = np.minimum(smooth(marks, 2.5, 2.5) * 40.0, 1.5)
-    density = 0.08 * (blotches / blotches.std())[..., None] * _TINTS[0]
-    density = density + 0.04 * (streaks / streaks.std())[..., None] * _TINTS[2]
-    density = density + 0.3 * dark[..., None] * _TINTS[1]
-    return (_COLOR * np.exp(-density)).astype(np.float32)
+    density = 0.08 * (blotches / blotches.std())[..., None] * _DENSITY_COLORS[0]
+    density = density + 0.04 * (streaks / streaks.std())[..., None] * _DENSITY_COLORS[2]
+    density = density + 0.3 * dark[..., None] * _DENSITY_COLORS[1]
+    return (_SKIN_COLOR * np.exp(-density)).astype(np.float32)
 
 
 def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> tuple[float, Any]:
@@ -86,7 +86,7 @@ def _point(
     """Match plain skin to spotted skin; errors are at full depth, whatever depth is matched."""
     rng = np.random.default_rng(0)
     target: Any = skin_texture(side, spots=10.0, rng=rng).astype(dtype)
-    sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(SEEDS)]
+    sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(N_SOURCES)]
     full = TextureSpace.fit([target, *sources])
     used = full if levels == full.levels else TextureSpace.fit([target, *sources], levels=levels)
     vector = describe(target, space=used)
@@ -159,7 +159,7 @@ def matching(*, toy: bool) -> StageBenchmark:
 def _same_texture(side: int) -> float:
     """Return how far apart two textures of one process are: what matching need not beat."""
     rng = np.random.default_rng(2)
-    textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + SEEDS)]
+    textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
     plain = 0.9 * skin_texture(side, spots=0.0, rng=rng)
     space = TextureSpace.fit([*textures, plain])
     return _error(textures[1:], describe(textures[0], space=space), space)[0]
@@ -212,13 +212,13 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def against_peer(side: int = FULL_SIDE) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
+def against_peer(side: int = FULL_SIDE_PX) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
     """Match one channel by turns with the peer; return limits, or what is left out and why."""
     try:
         peer_responses(np.zeros((512, 512)))
     except ImportError as error:
         why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
-        return (), ((f"{TIMES_FASTER:g} x {PEER}", why),)
+        return (), ((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why),)
     rng = np.random.default_rng(0)
     target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
     source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
@@ -253,10 +253,14 @@ def against_peer(side: int = FULL_SIDE) -> tuple[tuple[Limit, ...], tuple[tuple[
     ]
     what = f"an iteration at {side} x {side}, one channel"
     limits = (
-        Limit(f"{what}: times as fast as {PEER}", float(wall), TIMES_FASTER, ">="),
-        Limit(f"{what}: the same of processor time", float(busy), TIMES_FASTER, ">="),
-        Limit("distance from the target over the peer's", off[0] / off[1], SAME_DISTANCE, "<="),
-        Limit("responses less the peer's, of the image", max(apart), SAME_RESPONSES, "<="),
+        Limit(
+            f"{what}: times as fast as {PEER_NAME}", float(wall), MIN_SPEEDUP_OVER_PYRTOOLS, ">="
+        ),
+        Limit(f"{what}: the same of processor time", float(busy), MIN_SPEEDUP_OVER_PYRTOOLS, ">="),
+        Limit(
+            "distance from the target over the peer's", off[0] / off[1], MAX_DISTANCE_RATIO, "<="
+        ),
+        Limit("responses less the peer's, of the image", max(apart), MAX_RESPONSE_DIFFERENCE, "<="),
     )
     return limits, ()
 

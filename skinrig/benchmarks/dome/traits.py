@@ -18,6 +18,7 @@ from reconstruction.correspondence import common_regions
 from rigsim.population.population import Member, shifted, table_1
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
@@ -26,19 +27,18 @@ from skinrig.traits.albedo_vectors import VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
 
-COSINE = 0.95
-RETURN = 0.1
-FALSE_ALARMS = 0.1
+MIN_COSINE_TO_TRUTH = 0.95
+MAX_ROUND_TRIP_RATIO = 0.1
+MAX_FALSE_ALARM_RATE = 0.1
 """Share of traits without any truth that p < 0.05 may let pass: of 200, 5 % and 3.2 deviations."""
-TAN = 1.5
-DRAWS = 12
+N_GROUP_DRAWS = 12
 """Random choices of so many people, whose scatter is the error's."""
-SHUFFLES = 200
-LEFT_OUT = 10
+N_LABEL_SHUFFLES = 200
+N_JACKKNIFE_GROUPS = 10
 """Groups of people, each left out once, for the error of what all of them tell."""
-RANK = 8
-SPACES: tuple[SpaceKind, ...] = ("pca", "nmf")
-KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
+MAX_LOBE_RANK = 8
+SPACE_KINDS: tuple[SpaceKind, ...] = ("pca", "nmf")
+VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 
 def traits(*, toy: bool) -> StageBenchmark:
@@ -101,12 +101,14 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
             ]
         )
         for group in (2, 3) if toy else (3, 8, int(label.sum())):
-            for kind in SPACES:
+            for kind in SPACE_KINDS:
                 knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
                 fit = partial(_fitted, means, label, kind, metric, basis)
                 found.append(_drawn(fit, label, group, knobs, judged))
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
-    limits.append(Limit("cosine of lotion with the truth", judged(space), COSINE, ">="))
+    limits.append(
+        Limit("cosine of lotion with the truth", judged(space), MIN_COSINE_TO_TRUTH, ">=")
+    )
     limits.append(_false_alarms("lobes", means, metric, toy=toy))
     limits += _returned(means[~label], space, metric)
     return found, limits
@@ -123,7 +125,7 @@ def _fitted(
     some = means[rows]
     mix = None
     if kind == "nmf":
-        mix = brdf_basis.reduce(some, min(RANK, len(some) - 1), basis=basis)[1]
+        mix = brdf_basis.reduce(some, min(MAX_LOBE_RANK, len(some) - 1), basis=basis)[1]
     return TraitSpace.fit(some, {"trait": label[rows]}, space=kind, basis=mix, metric=metric)
 
 
@@ -146,7 +148,7 @@ def _drawn(
                 [side if whole else rng.choice(side, most, replace=False) for side in sides]
             )
         )
-        for _ in range(1 if whole else DRAWS)
+        for _ in range(1 if whole else N_GROUP_DRAWS)
     ]
     with resident_memory.watched() as rise:
         fit(groups[0])
@@ -170,8 +172,8 @@ def _drawn(
 
 
 def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
-    """Return a value's standard error by leaving out each of :data:`LEFT_OUT` groups of people."""
-    parts = np.array_split(np.random.default_rng(9).permutation(len(rows)), LEFT_OUT)
+    """Return a value's standard error by leaving out each of `N_JACKKNIFE_GROUPS` groups."""
+    parts = np.array_split(np.random.default_rng(9).permutation(len(rows)), N_JACKKNIFE_GROUPS)
     values = [value(np.delete(rows, part)) for part in parts if part.size]
     count = len(values)
     return float(np.std(values) * np.sqrt(count - 1))
@@ -183,14 +185,14 @@ def _false_alarms(
     """Return how often shuffled labels pass for a trait."""
     rng = np.random.default_rng(6)
     passed = []
-    for _ in range(10 if toy else SHUFFLES):
+    for _ in range(10 if toy else N_LABEL_SHUFFLES):
         label = rng.permutation(np.arange(len(samples)) < len(samples) // 3)
         space = TraitSpace.fit(samples, {"none": label}, components=1, metric=metric)
         passed.append(space.trait("none").confidence.p_value < 0.05)
     return Limit(
         f"shuffled labels of {what} that give a trait at p < 0.05",
         float(np.mean(passed)),
-        FALSE_ALARMS,
+        MAX_FALSE_ALARM_RATE,
         "<=",
     )
 
@@ -218,26 +220,28 @@ def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> l
         Limit(
             "+0.6 lotion, then -0.6: RMS distance from the source over that of the edit",
             float(np.sqrt(np.mean(np.square(back)))),
-            RETURN,
+            MAX_ROUND_TRIP_RATIO,
             "<=",
         ),
         Limit(
             "+0.6 lotion, texel by texel: RMS distance from what was asked over the edit",
             float(np.sqrt(np.mean(np.square(off)))),
-            RETURN,
+            MAX_ROUND_TRIP_RATIO,
             "<=",
         ),
     ]
 
 
 def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
-    tanned = shifted(people, "tan", melanin=TAN, rng=np.random.default_rng(1))
+    tanned = shifted(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
     faces = CommonFaces.of(people, size=64 if toy else 128, common=48 if toy else 80)
     inside = common_regions.region("face", faces.frame)
     compared = list(range(0, len(people), 4))
     seen = list(range(2, len(people), 4))
-    after = shifted(people, "tan", melanin=TAN, share=1.0, rng=np.random.default_rng(1))
+    after = shifted(
+        people, "tan", melanin=TAN_MELANIN_FACTOR, share=1.0, rng=np.random.default_rng(1)
+    )
     points, limits = [], []
     for noise in (0.01,) if toy else (0.01, 0.1):
         maps = [
@@ -248,7 +252,7 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
             [faces.albedo(group[i], noise=0.0, rng=np.random.default_rng(0)) for i in compared]
             for group in (people, after)
         ]
-        for kind in KINDS:
+        for kind in VECTOR_KINDS:
             names = tuple(p.name for p in people)
             spaces = fitting_traits.albedo_spaces(
                 maps, Labels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
@@ -309,7 +313,7 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
                     Limit(
                         f"cosine of tan with the truth, {kind}, {len(seen)} people seen twice",
                         1.0 - points[-1].error,
-                        COSINE,
+                        MIN_COSINE_TO_TRUTH,
                         ">=",
                     )
                 )

@@ -20,7 +20,7 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Points = dict[str, tuple[float, float]]
 
-CAMERA, LIGHT = "Nikon 5100 (NPL)", "D65"
+TABLE_CAMERA, TABLE_ILLUMINANT = "Nikon 5100 (NPL)", "D65"
 
 
 def smooth_displacement(
@@ -89,7 +89,7 @@ class MovedFace:
 
 def table() -> ColorTable:
     """Return the color table that pictures are made with."""
-    return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
 def oval(side: int) -> BoolArray:
@@ -320,7 +320,7 @@ def _on_skin(preset: str, side: int) -> BandError:
     return BandError(_rms(error), _rms_interval(error, side))
 
 
-MISALIGNED_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 def misaligned(*, toy: bool) -> StageBenchmark:
@@ -338,7 +338,7 @@ def misaligned(*, toy: bool) -> StageBenchmark:
     for state in ("exercise",) if toy else ("exercise", "smile"):
         truth = face.hemoglobin(state).astype(np.float64)
         size = _rms((truth - neutral)[mask])
-        for off_px in MISALIGNED_PX[:3] if toy else MISALIGNED_PX:
+        for off_px in MISALIGNMENTS_PX[:3] if toy else MISALIGNMENTS_PX:
             map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
 
             def interpolated(map_of_state: Float64Array = map_of_state) -> Float64Array:

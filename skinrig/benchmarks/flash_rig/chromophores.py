@@ -15,11 +15,11 @@ from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchma
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-NOISE = 0.01
-LEAST_MELANIN = 0.004
+CHANNEL_NOISE = 0.01
+MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
-SECONDS = 0.5
-TIMES_FASTER = 1000.0
+MAX_INVERSION_S = 0.5
+MIN_SPEEDUP_OVER_LEAST_SQUARES = 1000.0
 
 
 def inversion(*, toy: bool) -> StageBenchmark:
@@ -31,9 +31,9 @@ def inversion(*, toy: bool) -> StageBenchmark:
     c_m = 0.02 + 0.01 * np.sin(9 * x) * np.cos(7 * y)
     c_hd = 0.05 + 0.03 * np.cos(8 * x + 3 * y)
     color = np.concatenate([table.lookup(m, h) for m, h in zip(c_m, c_hd, strict=True)])
-    noisy = (color * (1 + NOISE * rng.standard_normal(color.shape))).astype(np.float32)
+    noisy = (color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))).astype(np.float32)
     picture = noisy.reshape(side, side, 3)
-    variance = (NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
+    variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
     points = []
     limits: tuple[Limit, ...] = ()
     for shading in ("known", "free"):
@@ -62,10 +62,17 @@ def inversion(*, toy: bool) -> StageBenchmark:
             ours_s = timing.seconds / side**2
             limits = (
                 Limit(
-                    f"seconds for {side} x {side}, free shading", timing.seconds, SECONDS, "<=", "s"
+                    f"seconds for {side} x {side}, free shading",
+                    timing.seconds,
+                    MAX_INVERSION_S,
+                    "<=",
+                    "s",
                 ),
                 Limit(
-                    "times faster than SciPy's least squares", peer_s / ours_s, TIMES_FASTER, ">="
+                    "times faster than SciPy's least squares",
+                    peer_s / ours_s,
+                    MIN_SPEEDUP_OVER_LEAST_SQUARES,
+                    ">=",
                 ),
             )
     return StageBenchmark(
@@ -88,14 +95,14 @@ def _by_band(
     errors = {}
     for name, band in MELANIN_BANDS.items():
         low, high = band.melanin_range
-        c_m = rng.uniform(max(low, LEAST_MELANIN), min(high, table.c_m_max), count)
+        c_m = rng.uniform(max(low, MIN_MELANIN), min(high, table.c_m_max), count)
         c_hd = rng.uniform(0.02, 0.08, count)
         color = table.lookup(c_m, c_hd)
-        noisy = color * (1 + NOISE * rng.standard_normal(color.shape))
+        noisy = color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))
         found = chromophores.invert(
             noisy.astype(np.float32)[None],
             table,
-            variance=(NOISE * color[None]).astype(np.float32) ** 2,
+            variance=(CHANNEL_NOISE * color[None]).astype(np.float32) ** 2,
         )
         valid = found.valid[0]
         off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
@@ -111,7 +118,7 @@ def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:
 
         def residual(p: Float64Array, color: FloatArray = color) -> Float64Array:
             c_m, c_hd = np.clip(p[:2], 1e-3, [0.79, 0.68]) ** 3
-            return np.asarray((np.exp(p[2]) * table.lookup(c_m, c_hd) / color - 1) / NOISE)
+            return np.asarray((np.exp(p[2]) * table.lookup(c_m, c_hd) / color - 1) / CHANNEL_NOISE)
 
         least_squares(residual, [0.27, 0.33, 0.0])
     return (time.perf_counter() - start) / len(rgb)

@@ -38,7 +38,7 @@ class Trial:
     """Bounds between what is sought and 0, where it cannot be negative."""
 
 
-SUBJECTS: Final = {
+SUBJECT_CHROMOPHORES: Final = {
     "palest": (0.005, 0.03),
     "II": (0.014, 0.05),
     "III": (0.028, 0.05),
@@ -47,18 +47,18 @@ SUBJECTS: Final = {
     "VI": (0.17, 0.05),
 }
 """Melanin and hemoglobin of typical skin."""
-MOST = 1.2
+MAX_RATIO_TO_BOUND = 1.2
 """Mean squared error over the bound that is aimed at."""
-CLEAR, LINEAR = 2.5, 10.0
+MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
 """Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
 cut off, and a bound on unbiased ones says nothing of it. Below the second the color bends within
 the error, so that no estimator reaches the bound: it is measured there, but not judged."""
-NOISE: Final = (0.004, 0.002, 0.001, 0.0005)
+CHANNEL_NOISES: Final = (0.004, 0.002, 0.001, 0.0005)
 """Relative noise of each channel: that of a usual picture; then the first at which all is linear,
 down to the mean of 64 such pixels."""
 ALBEDO_NOISE = 0.02
 """Relative noise of a sample of the BRDF."""
-READINGS = 0.01
+FIBER_NOISE = 0.01
 """Relative noise of each fibre."""
 
 
@@ -81,10 +81,10 @@ def efficiency(*, toy: bool) -> StageBenchmark:
                 "subject": subject,
                 "noise_percent": round(100 * trial.noise, 2),
             }
-            also = {"judged": trial.clear >= LINEAR}
+            also = {"judged": trial.clear >= MIN_EVALUATED_SIGMAS}
             points.append(Point(knobs, timing, ratio, (ratio - spread, ratio + spread), 1.0, also))
-            if trial.clear >= LINEAR:
-                ratios[str(melanin_band(SUBJECTS[subject][0]))].append((ratio, spread))
+            if trial.clear >= MIN_EVALUATED_SIGMAS:
+                ratios[str(melanin_band(SUBJECT_CHROMOPHORES[subject][0]))].append((ratio, spread))
         left_out += _left_out(name, points)
         for band, told in ratios.items():
             if not told:
@@ -96,7 +96,7 @@ def efficiency(*, toy: bool) -> StageBenchmark:
                 Limit(
                     f"{name}, {band} skin: mean squared error over the bound",
                     ratio - 2.0 * spread,
-                    MOST,
+                    MAX_RATIO_TO_BOUND,
                     "<=",
                 )
             )
@@ -122,8 +122,13 @@ def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
     judged = {
         p.knobs["subject"] for p in points if p.knobs["estimator"] == name and p.also["judged"]
     }
-    why = f"a fraction is nearer to 0 than {LINEAR:g} bounds even at {100 * NOISE[-1]:g} % of noise"
-    return [(f"{name}, {subject}", why) for subject in SUBJECTS if subject not in judged]
+    why = (
+        f"a fraction is nearer to 0 than {MIN_EVALUATED_SIGMAS:g} bounds even at "
+        f"{100 * CHANNEL_NOISES[-1]:g} % of noise"
+    )
+    return [
+        (f"{name}, {subject}", why) for subject in SUBJECT_CHROMOPHORES if subject not in judged
+    ]
 
 
 def _chromophores(
@@ -146,23 +151,25 @@ def _chromophores(
         value = getattr(found, which)
         return np.square(np.asarray(value, np.float64)[found.valid] - truth[index])
 
-    for number, (subject, truth) in enumerate(SUBJECTS.items()):
+    for number, (subject, truth) in enumerate(SUBJECT_CHROMOPHORES.items()):
         color = table.lookup(*truth).reshape(3)
         slopes = _differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
         if shading == "free":
             slopes = np.column_stack([slopes, color])
         relative = slopes / color[:, None]
         least = np.diag(np.linalg.inv(relative.T @ relative))[:2]  # at noise of 1
-        for noise in NOISE:
+        for noise in CHANNEL_NOISES:
             clear = float(np.min(np.array(truth) / (noise * np.sqrt(least))))
-            if clear < (CLEAR if noise == NOISE[0] else LINEAR):
+            if clear < (
+                MIN_MEASURED_SIGMAS if noise == CHANNEL_NOISES[0] else MIN_EVALUATED_SIGMAS
+            ):
                 continue
             sigma = noise * color
             rng = np.random.default_rng([1, number])
             noisy = color + sigma * rng.standard_normal((draws, 3))
             call = partial(squared, noisy, sigma, truth)
             yield subject, Trial(call, float(noise**2 * least[index]), noise, clear)
-            if clear >= LINEAR:
+            if clear >= MIN_EVALUATED_SIGMAS:
                 break
 
 
@@ -175,7 +182,7 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
     normal[2] = np.sqrt(1.0 - normal @ normal)
     lit = lights @ normal
     lights, lit = lights[lit > 0.15], lit[lit > 0.15]
-    for subject, albedo in zip(SUBJECTS, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+    for subject, albedo in zip(SUBJECT_CHROMOPHORES, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
         # shot noise of 20,000 electrons at full scale, read noise of 5
         sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
         told = light_selection.information(
@@ -203,7 +210,7 @@ def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
     light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
     through = np.prod([1.0 - fresnel.reflectance(way[:, 2], 1.4) for way in (light, view)], axis=0)
     up = np.array([0.0, 0.0, 1.0])
-    for subject, albedo in zip(SUBJECTS, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+    for subject, albedo in zip(SUBJECT_CHROMOPHORES, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
         value = albedo * through / np.pi
         sigma = ALBEDO_NOISE * value
         bound = 1.0 / np.sum((through / np.pi / sigma) ** 2)
@@ -233,14 +240,14 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
     count = draws // 20
     for number, (subject, (sigma_a, sigma_s)) in enumerate(
         zip(
-            SUBJECTS,
+            SUBJECT_CHROMOPHORES,
             ((0.02, 1.4), (0.03, 1.3), (0.05, 1.2), (0.08, 1.2), (0.15, 1.1), (0.3, 1.0)),
             strict=True,
         )
     ):
         truth = np.array([sigma_a, sigma_s])
         profile = photon_table.reflectance(radius, *truth)
-        sigma = READINGS * profile + 1e-3 * profile.max() * READINGS
+        sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE
         slopes = _differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
         covariance = np.linalg.inv((slopes / sigma[:, None]).T @ (slopes / sigma[:, None]))
         along = _differences(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
@@ -260,7 +267,7 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
             )
             return np.square(fit.sigma_tr_per_mm[fit.valid] - _sigma_tr(truth))
 
-        yield subject, Trial(squared, float(along @ covariance @ along), READINGS)
+        yield subject, Trial(squared, float(along @ covariance @ along), FIBER_NOISE)
 
 
 def _sigma_tr(coefficients: Float64Array) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import cv2
@@ -12,19 +11,19 @@ from scipy import fft, ndimage
 from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, processor_seconds
 
-STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
+PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
-RADII_PX = (16, 32, 64)
-FULL_SIDE = 2048
-RADIUS_PX = 16.0
+DISC_RADII_PX = (16, 32, 64)
+FULL_SIDE_PX = 2048
+RIG_RADIUS_PX = 16.0
 """Of the rig's discs when something else is swept; a texel of the face is 0.5 mm."""
-CORES = 2
+PARALLEL_CORES = 2
 """Cores that a way of many threads has."""
-ROUNDS = 5
+N_TIMING_ROUNDS = 5
 """Rounds in which ours and the libraries take turns; the fastest counts."""
-CROPS = {16: 256, 32: 160, 64: 96}
+CROP_SIDES_PX = {16: 256, 32: 160, 64: 96}
 """Sides of the crops on which scipy.ndimage.convolve is timed; its work goes with the pixels."""
 
 
@@ -35,7 +34,7 @@ def rig(*, toy: bool) -> StageBenchmark:
     rng = np.random.default_rng(0)
     face = subject.make_subject("III", seed=3, size=96 if toy else 512)
     neutral, covered = face.hemoglobin(), face.atlas.covered
-    names = STATES[:2] if toy else STATES
+    names = PREDICTED_STATES[:2] if toy else PREDICTED_STATES
     truths = {name: face.hemoglobin(name) for name in names}
 
     def point(
@@ -70,11 +69,11 @@ def rig(*, toy: bool) -> StageBenchmark:
             ),
         ),
     ]
-    sweep: list[tuple[float, int | None, int]] = [(RADIUS_PX, 256, 0)]
+    sweep: list[tuple[float, int | None, int]] = [(RIG_RADIUS_PX, 256, 0)]
     if not toy:
         sweep += [(r, 256, 0) for r in (4.0, 8.0, 32.0, 64.0)]
-        sweep += [(RADIUS_PX, stored, 0) for stored in (None, 128, 64, 32)]
-        sweep += [(RADIUS_PX, 256, moved) for moved in (1, 2, 4, 8)]
+        sweep += [(RIG_RADIUS_PX, stored, 0) for stored in (None, 128, 64, 32)]
+        sweep += [(RIG_RADIUS_PX, 256, moved) for moved in (1, 2, 4, 8)]
     for radius_px, stored, moved_px in sweep:
         made = fitted(radius_px, stored, moved_px)
         points.append(
@@ -90,9 +89,9 @@ def rig(*, toy: bool) -> StageBenchmark:
         )
     points.append(
         point(
-            {"method": "scale and bias, fitted anew", "radius_px": RADIUS_PX},
+            {"method": "scale and bias, fitted anew", "radius_px": RIG_RADIUS_PX},
             lambda name: HemoglobinRig.from_maps(
-                neutral, {name: truths[name]}, radius_px=RADIUS_PX, valid=covered
+                neutral, {name: truths[name]}, radius_px=RIG_RADIUS_PX, valid=covered
             ).blend({name: 1.0}),
         )
     )
@@ -102,14 +101,14 @@ def rig(*, toy: bool) -> StageBenchmark:
             point(
                 {
                     "method": "exact histograms, windows",
-                    "radius_px": RADIUS_PX,
+                    "radius_px": RIG_RADIUS_PX,
                     "spacing_px": spacing,
                 },
                 lambda name, spacing=spacing: (
                     histogram_matching.match(  # type: ignore[misc]
                         neutral,
                         truths[name],
-                        RADIUS_PX,
+                        RIG_RADIUS_PX,
                         valid=covered,
                         valid_target=covered,
                         spacing_px=spacing,
@@ -135,7 +134,7 @@ def _round_trip(neutral: Float32Array, covered: BoolArray) -> tuple[Limit, ...]:
     """Fit maps that eq. (6) made and make them again."""
     exact = neutral.astype(np.float64)
     states = {"first": 1.3 * exact + 0.004, "second": 0.7 * exact - 0.001}
-    made = HemoglobinRig.from_maps(exact, states, radius_px=RADIUS_PX, valid=covered)
+    made = HemoglobinRig.from_maps(exact, states, radius_px=RIG_RADIUS_PX, valid=covered)
     weights = {"first": 0.8, "second": 0.5, "neutral": -0.3}
     expected = 0.8 * states["first"] + 0.5 * states["second"] - 0.3 * exact
     found = made.evaluate(weights, limits=(-1.0, 1.0))
@@ -172,30 +171,30 @@ def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
     third convolution. Processor time, which does not see who else keeps the cores busy; ours and
     the transforms share it between two cores, cv2.filter2D and scipy.ndimage keep one busy.
     """
-    white = rng.standard_normal((FULL_SIDE, FULL_SIDE), np.float32)
+    white = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
     h = np.asarray(0.03 + 0.02 * ndimage.gaussian_filter(white, 2.0), np.float32)
     limits = []
-    for radius in RADII_PX:
+    for radius in DISC_RADII_PX:
         kernel = disc(radius)
-        crop = np.ascontiguousarray(h[: CROPS[radius], : CROPS[radius]])
+        crop = np.ascontiguousarray(h[: CROP_SIDES_PX[radius], : CROP_SIDES_PX[radius]])
         ways: list[tuple[int, Callable[[], object]]] = [
-            (CORES, lambda radius=radius: disc_statistics.measure(h, radius)),  # type: ignore[misc]
+            (PARALLEL_CORES, lambda radius=radius: disc_statistics.measure(h, radius)),  # type: ignore[misc]
             (1, lambda kernel=kernel: by_opencv(h, kernel)),  # type: ignore[misc]
-            (CORES, lambda kernel=kernel: by_fft(h, kernel)),  # type: ignore[misc]
+            (PARALLEL_CORES, lambda kernel=kernel: by_fft(h, kernel)),  # type: ignore[misc]
         ]
         for _, way in ways:
             way()
         least = [np.inf] * len(ways)
-        for _ in range(ROUNDS):
+        for _ in range(N_TIMING_ROUNDS):
             for index, (cores, way) in enumerate(ways):
-                least[index] = min(least[index], _spent(way) / cores)
-        convolve_s = _spent(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
+                least[index] = min(least[index], processor_seconds(way) / cores)
+        convolve_s = processor_seconds(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits += [
             Limit(
                 f"times faster ({ours_s:.3f} s) than scipy.ndimage.convolve, r = {radius}, a "
-                f"crop of {CROPS[radius]} x {CROPS[radius]} scaled by pixels",
+                f"crop of {CROP_SIDES_PX[radius]} x {CROP_SIDES_PX[radius]} scaled by pixels",
                 convolve_s / ours_s,
                 100.0,
                 ">=",
@@ -239,20 +238,13 @@ def by_fft(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArra
     """Return mean and deviation as eq. (1) is written, by real float32 transforms."""
     side = kernel.shape[0]
     shape = [fft.next_fast_len(n + side - 1, real=True) for n in h.shape]
-    transfer = fft.rfft2(kernel, shape, workers=CORES)
+    transfer = fft.rfft2(kernel, shape, workers=PARALLEL_CORES)
     low, size = side // 2, h.shape
 
     def convolved(image: Float32Array) -> Float32Array:
-        product = fft.rfft2(image, shape, workers=CORES) * transfer
-        whole = fft.irfft2(product, shape, workers=CORES)
+        product = fft.rfft2(image, shape, workers=PARALLEL_CORES) * transfer
+        whole = fft.irfft2(product, shape, workers=PARALLEL_CORES)
         return np.asarray(whole[low : low + size[0], low : low + size[1]])
 
     mean = convolved(h)
     return mean, np.sqrt(np.maximum(convolved(h * h) - mean * mean, 0.0))
-
-
-def _spent(call: Callable[[], object]) -> float:
-    """Return the processor time of a call, s."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start

@@ -23,12 +23,12 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0
 CYCLE_S = 2 * PROMPT_S
-CONSTANT_S = 2.0
+TIME_CONSTANT_S = 2.0
 REACTION_S = 0.16
-LEVEL, NOISE = 0.03, 4e-4
-GAPS = (0.0065, -0.002, 0.001, 0.004, 0.009)
+REST_BLOOD, BLOOD_NOISE = 0.03, 4e-4
+BLOOD_CHANGES = (0.0065, -0.002, 0.001, 0.004, 0.009)
 """Change of blood of the five places; the noise is that of a disc of 12 px of a small picture."""
-SECONDS = 1.0
+MAX_FIT_S = 1.0
 """Most processor time of a fit of five places in 44 frames."""
 
 
@@ -60,23 +60,25 @@ class Train:
 
     def draw(self, constant_s: float, rng: np.random.Generator) -> Float64Array:
         """Return curves of the five places, (5, captures)."""
-        clean = LEVEL + np.outer(GAPS, self.levels(constant_s))
-        return np.asarray(clean + NOISE * rng.standard_normal(clean.shape))
+        clean = REST_BLOOD + np.outer(BLOOD_CHANGES, self.levels(constant_s))
+        return np.asarray(clean + BLOOD_NOISE * rng.standard_normal(clean.shape))
 
     def bound_s(self) -> float:
         """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
         step = 1e-4
-        slope = (self.levels(CONSTANT_S + step) - self.levels(CONSTANT_S - step)) / (2 * step)
-        level = self.levels(CONSTANT_S)
-        shift = self.levels(CONSTANT_S, REACTION_S + step)
-        shift = (shift - self.levels(CONSTANT_S, REACTION_S - step)) / (2 * step)
-        size = 2 + 2 * len(GAPS)
+        slope = (self.levels(TIME_CONSTANT_S + step) - self.levels(TIME_CONSTANT_S - step)) / (
+            2 * step
+        )
+        level = self.levels(TIME_CONSTANT_S)
+        shift = self.levels(TIME_CONSTANT_S, REACTION_S + step)
+        shift = (shift - self.levels(TIME_CONSTANT_S, REACTION_S - step)) / (2 * step)
+        size = 2 + 2 * len(BLOOD_CHANGES)
         information = np.zeros((size, size))
-        for place, gap in enumerate(GAPS):
+        for place, gap in enumerate(BLOOD_CHANGES):
             rows = np.zeros((size, self.captures))
             rows[0], rows[1] = gap * slope, gap * shift
             rows[2 + 2 * place], rows[3 + 2 * place] = 1.0, level
-            information += rows @ rows.T / NOISE**2
+            information += rows @ rows.T / BLOOD_NOISE**2
         scale = np.sqrt(np.diag(information))
         covariance = np.linalg.inv(information / np.outer(scale, scale))
         return float(np.sqrt(covariance[0, 0]) / scale[0])
@@ -115,7 +117,7 @@ def curves(*, toy: bool) -> StageBenchmark:
         phase = train.phase_s
         for way in ("five places", "best place", "best place, scipy"):
             rng = np.random.default_rng(0)
-            draws = [train.draw(CONSTANT_S, rng) for _ in range(runs)]
+            draws = [train.draw(TIME_CONSTANT_S, rng) for _ in range(runs)]
 
             def one(values: Float64Array, way: str = way, phase: Float64Array = phase) -> float:
                 if way == "five places":
@@ -124,7 +126,7 @@ def curves(*, toy: bool) -> StageBenchmark:
                     return fit_cycle(phase, values[-1], cycle_s=CYCLE_S).time_constant_s
                 return scipy_fit(phase, values[-1])[0]
 
-            off = np.array([one(values) for values in draws]) - CONSTANT_S
+            off = np.array([one(values) for values in draws]) - TIME_CONSTANT_S
             error = float(np.sqrt(np.mean(off**2)))
             errors[way, train.captures] = error
             spread = error / np.sqrt(2 * runs)
@@ -177,19 +179,19 @@ def noise_by_band() -> dict[str, float]:
 def _on_skin(noisier: float, runs: int) -> BandError:
     """Return the error of five places in 44 captures, with so many times the noise."""
     train, rng = Train(44, 10.25), np.random.default_rng(0)
-    clean = LEVEL + np.outer(GAPS, train.levels(CONSTANT_S))
+    clean = REST_BLOOD + np.outer(BLOOD_CHANGES, train.levels(TIME_CONSTANT_S))
     off = (
         np.array(
             [
                 fit_cycle(
                     train.phase_s,
-                    clean + noisier * NOISE * rng.standard_normal(clean.shape),
+                    clean + noisier * BLOOD_NOISE * rng.standard_normal(clean.shape),
                     cycle_s=CYCLE_S,
                 ).time_constant_s
                 for _ in range(runs)
             ]
         )
-        - CONSTANT_S
+        - TIME_CONSTANT_S
     )
     error = float(np.sqrt(np.mean(off**2)))
     spread = error / np.sqrt(2 * runs)
@@ -210,10 +212,10 @@ def _limits(
         quick.append(fit_cycle(coarse.phase_s, values, cycle_s=CYCLE_S))
         found = transition(coarse.phase_s, values[-1], cycle_s=CYCLE_S)
         alarms += found.seen
-        slow = fit_cycle(fine.phase_s, fine.draw(CONSTANT_S, rng), cycle_s=CYCLE_S)
-        held += slow.interval_s[0] <= CONSTANT_S <= slow.interval_s[1]
+        slow = fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
+        held += slow.interval_s[0] <= TIME_CONSTANT_S <= slow.interval_s[1]
     begin = time.process_time()
-    fit_cycle(fine.phase_s, fine.draw(CONSTANT_S, rng), cycle_s=CYCLE_S)
+    fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
     spent_s = time.process_time() - begin
     bound_s = next(train for train in trains if train.captures == 44).bound_s()
     # three binomial standard deviations beyond the stated rates
@@ -252,6 +254,6 @@ def _limits(
             "<=",
         ),
         Limit(
-            "processor seconds of a fit of five places, 44 captures", spent_s, SECONDS, "<=", "s"
+            "processor seconds of a fit of five places, 44 captures", spent_s, MAX_FIT_S, "<=", "s"
         ),
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -14,18 +14,25 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-STATES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
-NOISE = 0.003
+STATE_NAMES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
+SUPERPIXEL_NOISE = 0.003
 """Relative noise of a superpixel of the flash rig's camera on light skin."""
 LIGHT_CHANGE = 0.05
 """How much the light of a state differs, smoothly over the face."""
-FULL_SIDE = 1024
-SECONDS_FULL = 90.0
-CORES = 2
+FULL_SIDE_PX = 1024
+MAX_FULL_SIZE_S = 90.0
 
 
 def inversion(*, toy: bool) -> StageBenchmark:
@@ -35,7 +42,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
     colors, prior, covariance = table(), shading_prior.of_faces(), model_error.load()
     face = face_of("II", side, seed=3)
     mask = oval(side)
-    blood = np.stack([face.hemoglobin(state) for state in STATES]).astype(np.float64)
+    blood = np.stack([face.hemoglobin(state) for state in STATE_NAMES]).astype(np.float64)
     rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=rng)
     valid = np.broadcast_to(mask, blood.shape)
     truth = blood[1] - blood[0]
@@ -118,7 +125,7 @@ def pictures(
     covariance: Float64Array,
     *,
     rng: np.random.Generator,
-    noise: float = NOISE,
+    noise: float = SUPERPIXEL_NOISE,
 ) -> tuple[Float32Array, Float32Array]:
     """Return colors (S, H, W, 3) of one melanin and S bloods, and their variance.
 
@@ -144,7 +151,7 @@ def _on_skin(
 ) -> BandError:
     """Return the error of smile's change of blood on skin of a preset, three states together."""
     face, mask = face_of(preset, side, seed=3), oval(side)
-    blood = np.stack([face.hemoglobin(state) for state in STATES[:3]]).astype(np.float64)
+    blood = np.stack([face.hemoglobin(state) for state in STATE_NAMES[:3]]).astype(np.float64)
     rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
     found = shared_melanin.estimate_shared_melanin(
         rgb,
@@ -198,26 +205,23 @@ def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Float64Array
     """Time 7 states of a megapixel by a band of it."""
     rng = np.random.default_rng(2)
     band = 96
-    melanin = np.full((band, FULL_SIDE), 0.02)
-    blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATES), band, FULL_SIDE)) ** 3
+    melanin = np.full((band, FULL_SIDE_PX), 0.02)
+    blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
     rgb, variance = pictures(colors, melanin, blood, covariance, rng=rng)
-    seconds = []
-    for _ in range(2):
-        begin = time.process_time()
-        shared_melanin.estimate_shared_melanin(
-            rgb,
-            colors,
-            prior=prior,
-            variance=variance,
-            model_error=covariance,
-            shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-        )
-        seconds.append(time.process_time() - begin)
-    whole = min(seconds) * FULL_SIDE / band / CORES
+    run = partial(
+        shared_melanin.estimate_shared_melanin,
+        rgb,
+        colors,
+        prior=prior,
+        variance=variance,
+        model_error=covariance,
+        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+    )
+    whole = processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES
     return Limit(
         "processor seconds on each of 2 cores, 7 states of 1024 x 1024, by a band of 96 rows",
         whole,
-        SECONDS_FULL,
+        MAX_FULL_SIZE_S,
         "<=",
         "s",
     )

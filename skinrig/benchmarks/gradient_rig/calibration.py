@@ -15,10 +15,10 @@ from capture.rig import Rig, load_rig
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
 
-SEED = 7
-DIRECTION_DEG = 0.05
-INTENSITY_PERCENT = 1.0
-MISALIGNMENT_SIGMAS = 4.0
+SPHERE_SEED = 7
+MAX_DIRECTION_ERROR_DEG = 0.05
+MAX_INTENSITY_ERROR_PERCENT = 1.0
+MAX_MISALIGNMENT_SIGMAS = 4.0
 
 
 def sphere_lights(*, toy: bool) -> StageBenchmark:
@@ -29,8 +29,8 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
     points, last = [], (np.inf, np.inf, np.inf)
     for width_px in (192,) if toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)
-        sphere = build_sphere(rig, seed=SEED)
-        scene = GradientScene(rig, "ball", sphere=sphere, seed=SEED)
+        sphere = build_sphere(rig, seed=SPHERE_SEED)
+        scene = GradientScene(rig, "ball", sphere=sphere, seed=SPHERE_SEED)
         shots = _shots(scene, rig)
         fewer = ((0, 80, 90), (0, 90, 100)) if toy else ()
         for readings in (*fewer, (0, 90), (0, 80, 90, 100)):
@@ -72,9 +72,9 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (
-            Limit("median error of a direction", last[0], DIRECTION_DEG, "<=", "degrees"),
-            Limit("median error of an intensity", last[1], INTENSITY_PERCENT, "<=", "%"),
-            Limit("analyser's misalignment over its error", last[2], MISALIGNMENT_SIGMAS, "<="),
+            Limit("median error of a direction", last[0], MAX_DIRECTION_ERROR_DEG, "<=", "degrees"),
+            Limit("median error of an intensity", last[1], MAX_INTENSITY_ERROR_PERCENT, "<=", "%"),
+            Limit("analyser's misalignment over its error", last[2], MAX_MISALIGNMENT_SIGMAS, "<="),
         ),
         (("the whole sensor", "2048 px: four times the pixels, and its pictures take minutes"),),
         interval_of="LEDs",

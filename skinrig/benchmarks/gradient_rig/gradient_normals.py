@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,23 +21,34 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]
 
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
-EXPOSURE_S = 0.03
-PRESET = "III"
+PATTERN_EXPOSURE_S = 0.03
+MELANIN_PRESET = "III"
 """Of the skin's melanin."""
-NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
-READINGS = {"parallel": 0.0, "crossed": 90.0}
-SMOOTH_PX = 8.0
+PATTERN_NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
+ANALYZER_DEG = {"parallel": 0.0, "crossed": 90.0}
+RELIEF_BLUR_PX = 8.0
 """Of the relief's texels, by which skin is smoothed that stands for a smooth relief."""
-CLEAN_DEG, NOISY_DEG, SECONDS, TIMES_FORMULA = 0.3, 1.5, 3.0, 8.0
-CORES = 2
-"""Cores of the limit; processor time does not see who else keeps them busy."""
-EDGE_PX = 6
+MAX_CLEAN_ERROR_DEG, MAX_NOISY_ERROR_DEG, MAX_PATTERNS_S, MAX_SLOWDOWN_TO_FORMULA = (
+    0.3,
+    1.5,
+    3.0,
+    8.0,
+)
+IGNORED_BORDER_PX = 6
 """Border that is not judged: the lens brings in what is beyond it."""
 
 
@@ -88,17 +98,17 @@ def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
-    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=PRESET)
+    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=MELANIN_PRESET)
     if smooth:
-        height = gaussian_filter(skin.height_um, SMOOTH_PX, mode="wrap").astype(np.float32)
+        height = gaussian_filter(skin.height_um, RELIEF_BLUR_PX, mode="wrap").astype(np.float32)
         skin = replace(skin, height_um=height)
     sphere = nominal_sphere(rig)
     scene = GradientScene(rig, skin, sphere=sphere)
     images = {
-        (name, polarizer): EXPOSURE_S
-        * scene.radiance(name, grip=NEUTRAL, analyser_deg=READINGS[polarizer])
-        for name in NAMES
-        for polarizer in READINGS
+        (name, polarizer): PATTERN_EXPOSURE_S
+        * scene.radiance(name, grip=NEUTRAL, analyser_deg=ANALYZER_DEG[polarizer])
+        for name in PATTERN_NAMES
+        for polarizer in ANALYZER_DEG
     }
     truth = ground_truth(scene, [NEUTRAL]).maps
     view = rig.views[0]
@@ -129,7 +139,7 @@ def vectors_alone(images: Images) -> Float64Array:
     """Return normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
     s = {
         name: images[name, "parallel"].astype(np.float64) - images[name, "crossed"]
-        for name in NAMES[:7]
+        for name in PATTERN_NAMES[:7]
     }
     c = np.stack([s[axis] - s[f"-{axis}"] for axis in "xyz"], axis=-1)
     n = c / np.linalg.norm(c, axis=-1, keepdims=True) + [0.0, 0.0, 1.0]
@@ -139,7 +149,7 @@ def vectors_alone(images: Images) -> Float64Array:
 def _judged(
     normals: FloatArray, valid: BoolArray, truth: Float64Array, seed: int = 0
 ) -> tuple[float, tuple[float, float]]:
-    inner = (slice(EDGE_PX, -EDGE_PX),) * 2
+    inner = (slice(IGNORED_BORDER_PX, -IGNORED_BORDER_PX),) * 2
     good = valid[inner]
     error = np.degrees(angular_error_rad(normals[inner][good], truth[inner][good]))
     # neighbours share their error: blocks of lines are drawn, not pixels
@@ -174,9 +184,9 @@ def normals(*, toy: bool) -> StageBenchmark:
         return error
 
     subsets = {
-        "16": NAMES,
-        "14, no dark": NAMES[:7],
-        "14, no -x": tuple(n for n in NAMES if n != "-x"),
+        "16": PATTERN_NAMES,
+        "14, no dark": PATTERN_NAMES[:7],
+        "14, no -x": tuple(n for n in PATTERN_NAMES if n != "-x"),
         "8": ("full", "x", "y", "z"),
         "8, x and -x": ("x", "-x", "y", "z"),
     }
@@ -221,7 +231,7 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
     Crossed pictures hold half of the diffuse light and no specular; parallel ones hold the other
     half besides: with another albedo both change by so much of the crossed one.
     """
-    usual = replace(band, melanin=MELANIN_PRESETS[PRESET]).reflectance()
+    usual = replace(band, melanin=MELANIN_PRESETS[MELANIN_PRESET]).reflectance()
     share = float((band.reflectance() / usual)[1])
     images = {
         (name, way): image - np.float32(1.0 - share) * patch.images[name, "crossed"]
@@ -250,37 +260,38 @@ def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
         for key, image in exposed(smooth, rng).items()
     }
     options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
-    spent = []
-    for _ in range(3):
-        begin = time.process_time()
-        from_patterns(big, **options)
-        spent.append(time.process_time() - begin)
-    begin = time.process_time()
+    ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
-        vectors_alone(big)
-    peer_s = time.process_time() - begin
-    ours_s = min(spent) / CORES
+        peer_s = processor_seconds(lambda: vectors_alone(big))
     return (
         *(
             Limit(
                 f"mean error without noise on smooth relief, {name}",
                 error,
-                CLEAN_DEG,
+                MAX_CLEAN_ERROR_DEG,
                 "<=",
                 "degrees",
             )
             for name, error in against.items()
         ),
         Limit(
-            "mean error at the demo's noise, lens' resolution", worst, NOISY_DEG, "<=", "degrees"
+            "mean error at the demo's noise, lens' resolution",
+            worst,
+            MAX_NOISY_ERROR_DEG,
+            "<=",
+            "degrees",
         ),
         Limit(
-            "processor seconds on each of 2 cores for 2048 x 2048 x 16", ours_s, SECONDS, "<=", "s"
+            "processor seconds on each of 2 cores for 2048 x 2048 x 16",
+            ours_s,
+            MAX_PATTERNS_S,
+            "<=",
+            "s",
         ),
         Limit(
             "times the processor time of the formula alone in NumPy",
-            CORES * ours_s / peer_s,
-            TIMES_FORMULA,
+            LIMIT_CORES * ours_s / peer_s,
+            MAX_SLOWDOWN_TO_FORMULA,
             "<=",
         ),
     )

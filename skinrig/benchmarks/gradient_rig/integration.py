@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +16,26 @@ from reconstruction.normal_integration.discontinuities import integrate_broken
 from reconstruction.normal_integration.height_errors import expected_rms
 from reconstruction.normal_integration.height_filters import high_pass
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    processor_seconds,
+)
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
-NOISE_RAD = np.radians(1.5)
+NORMAL_NOISE_RAD = np.radians(1.5)
 """Root mean square angle of the normals' noise."""
-RELIEF_UM = 12.0
-CORES = 2
-"""Cores of the limits; processor time does not see who else keeps them busy."""
-SECONDS = 1.5
-BROKEN_SECONDS = 1.0
-RESIDUAL = 1e-5
-ERROR = 0.05
+RELIEF_RMS_UM = 12.0
+MAX_INTEGRATION_S = 1.5
+MAX_BILATERAL_S = 1.0
+MAX_RELATIVE_RESIDUAL = 1e-5
+MAX_RELATIVE_RMS = 0.05
 
 
 def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
@@ -49,7 +57,7 @@ def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float6
     ridged = -np.abs(smooth / smooth.std())
     waves = fft.rfft2(ridged - ridged.mean()) * np.exp(-((theta / high) ** 2))
     waves[0, 0] = 0.0
-    waves *= RELIEF_UM / fft.irfft2(waves, (side, side)).std()
+    waves *= RELIEF_RMS_UM / fft.irfft2(waves, (side, side)).std()
     waves[1, 1] += 0.25 * side * side * 60.0  # the bulge
     # no derivative of the highest wave of an even number
     odd_x = np.where(theta_x >= np.pi - 1e-9, 0.0, theta_x)
@@ -109,116 +117,85 @@ def integration(*, toy: bool) -> StageBenchmark:
     rng = np.random.default_rng(0)
     side = 64 if toy else 512
     truth, clean = relief(side, rng=rng)
-    noisy = clean + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
+    noisy = clean + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
     whole = np.ones((side, side), bool)
     disc = _disc(side)
-    points: list[Point] = []
 
-    def add(
-        knobs: dict[str, str | int | float],
+    def case(
+        method: str,
         call: Callable[[Float64Array], FloatArray],
         normals: Float64Array,
         valid: BoolArray,
-        stderr: float,
-    ) -> None:
-        timing = measure(lambda: call(normals), repeats=1 if toy else 3)
-        error = high_pass(
-            np.where(valid, call(normals) - truth, 0.0),
-            pixel=PIXEL_UM,
-            cutoff=CUTOFF_UM,
-            valid=valid,
-        )
-        tiles = [float(np.mean(t[m] ** 2)) for t, m in _tiles(error, valid) if m.any()]
-        means = np.mean(rng.choice(tiles, (200, len(tiles))), axis=1)
-        low, high = np.sqrt(np.quantile(means, [0.16, 0.84]))
-        rms = float(np.sqrt(np.mean(error[valid] ** 2)))
+        **effort: float,
+    ) -> Case[FloatArray]:
         bound = None
-        if stderr > 0.0:
-            slope = stderr / np.sqrt(2.0)
+        if normals is noisy:
+            slope = NORMAL_NOISE_RAD / np.sqrt(2.0)
             bound = expected_rms(normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM)
-        points.append(
-            Point(knobs, timing, rms, (min(float(low), rms), max(float(high), rms)), bound)
+
+        def error(height: FloatArray) -> BandError:
+            off = _high_passed(height - truth, valid)
+            tiles = [float(np.mean(t[m] ** 2)) for t, m in _tiles(off, valid) if m.any()]
+            means = np.mean(rng.choice(tiles, (200, len(tiles))), axis=1)
+            low, high = np.sqrt(np.quantile(means, [0.16, 0.84]))
+            rms = float(np.sqrt(np.mean(off[valid] ** 2)))
+            return BandError(rms, (min(float(low), rms), max(float(high), rms)), bound)
+
+        noise, mask = (
+            "1.5 deg" if normals is noisy else "none",
+            "none" if valid is whole else "disc",
         )
+        knobs: dict[str, str | float] = {"noise": noise, "method": method, "mask": mask, **effort}
+        return Case(knobs, lambda: call(normals), error)
 
     def ours(valid: BoolArray, **options: object) -> Callable[[Float64Array], NDArray]:
         return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
 
-    for name, normals, sigma in (("none", clean, 0.0), ("1.5 deg", noisy, NOISE_RAD)):
-        base: dict[str, str | int | float] = {"noise": name}
-        for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
-            settings = Settings(tolerance=tolerance)
-            add(
-                {**base, "method": "multigrid", "mask": "disc", "tolerance": tolerance},
-                ours(disc, settings=settings),
-                normals,
-                disc,
-                sigma,
-            )
-        add(
-            {**base, "method": "multigrid", "mask": "disc", "order": 2},
-            ours(disc, settings=Settings(order=2)),
-            normals,
-            disc,
-            sigma,
-        )
-        add({**base, "method": "cosines", "mask": "none"}, ours(whole), normals, whole, sigma)
-        add(
-            {**base, "method": "Frankot-Chellappa", "mask": "none"},
-            lambda n: frankot_chellappa(n, pixel=PIXEL_UM),
-            normals,
-            whole,
-            sigma,
-        )
-    add(
-        {"noise": "1.5 deg", "method": "multigrid", "mask": "disc", "denoise": 1},
-        ours(disc, stderr_rad=NOISE_RAD, denoise=1.0),
-        noisy,
-        disc,
-        NOISE_RAD,
-    )
-    add(
-        {"noise": "1.5 deg", "method": "bilateral", "mask": "disc"},
-        lambda n: integrate_broken(n, pixel=PIXEL_UM, valid=disc).height,
-        noisy,
-        disc,
-        NOISE_RAD,
-    )
-    add(
-        {"noise": "none", "method": "sparse direct", "mask": "disc"},
-        lambda n: sparse_direct(n, disc, pixel=PIXEL_UM),
-        clean,
-        disc,
-        0.0,
-    )
-    limits: tuple[Limit, ...] = ()
-    if not toy:
-        error = high_pass(
-            np.where(disc, integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, 0.0),
-            pixel=PIXEL_UM,
-            cutoff=CUTOFF_UM,
-            valid=disc,
-        )
-        kept = high_pass(np.where(disc, truth, 0.0), pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=disc)
-        limits = (
+    def cases() -> Iterator[Case[FloatArray]]:
+        for normals in (clean, noisy):
+            for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
+                solve = ours(disc, settings=Settings(tolerance=tolerance))
+                yield case("multigrid", solve, normals, disc, tolerance=tolerance)
+            yield case("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2)
+            yield case("cosines", ours(whole), normals, whole)
+            by_fourier = partial(frankot_chellappa, pixel=PIXEL_UM)
+            yield case("Frankot-Chellappa", by_fourier, normals, whole)
+        denoised = ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0)
+        yield case("multigrid", denoised, noisy, disc, denoise=1)
+        bilateral = partial(integrate_broken, pixel=PIXEL_UM, valid=disc)
+        yield case("bilateral", lambda n: bilateral(n).height, noisy, disc)
+
+    def limits(_: Sequence[Point]) -> tuple[Limit, ...]:
+        error = _high_passed(integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, disc)
+        return (
             Limit(
                 "RMS error over RMS relief after high-pass, noise of 1.5 degrees",
-                float(np.std(error[disc]) / np.std(kept[disc])),
-                ERROR,
+                float(np.std(error[disc]) / np.std(_high_passed(truth, disc)[disc])),
+                MAX_RELATIVE_RMS,
                 "<=",
             ),
             *_full_size(rng),
         )
-    return StageBenchmark(
-        "normal-integration",
-        "RMS error of height after a high-pass of 1 mm, um",
-        f"the relief itself ({RELIEF_UM:g} um RMS), whose normals are exact",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("noise", "mask"),
-        interval_of="tiles of the relief",
-        no_bands="shape alone: no color of skin enters",
+
+    direct = partial(sparse_direct, valid=disc, pixel=PIXEL_UM)
+    return compare(
+        StageBenchmark(
+            "normal-integration",
+            "RMS error of height after a high-pass of 1 mm, um",
+            f"the relief itself ({RELIEF_RMS_UM:g} um RMS), whose normals are exact",
+            condition=("noise", "mask"),
+            interval_of="tiles of the relief",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        cases(),
+        [case("sparse direct", direct, clean, disc)],
+        repeats=1 if toy else 3,
+        limits=None if toy else limits,
     )
+
+
+def _high_passed(height: FloatArray, valid: BoolArray) -> FloatArray:
+    return high_pass(np.where(valid, height, 0.0), pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=valid)
 
 
 def _disc(side: int) -> BoolArray:
@@ -240,50 +217,41 @@ def _tiles(error: FloatArray, valid: BoolArray) -> list[tuple[FloatArray, BoolAr
 def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
     _, normals = relief(2048, rng=rng)
-    noisy = (normals + NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
+    noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
         np.float32
     )
     disc = _disc(2048)
-    found = integrate_map(noisy[:64, :64], method="multigrid")
-    spent = []
-    for _ in range(3):
-        begin = time.process_time()
-        found = integrate_map(noisy, pixel=PIXEL_UM, valid=disc)
-        spent.append(time.process_time() - begin)
+    integrate_map(noisy[:64, :64], method="multigrid")
+    spent_s = processor_seconds(lambda: integrate_map(noisy, pixel=PIXEL_UM, valid=disc), 3)
+    found = integrate_map(noisy, pixel=PIXEL_UM, valid=disc)
     small = np.ascontiguousarray(noisy[:1024, :1024])
     integrate_broken(small[:64, :64])
-    broken = []
-    for _ in range(3):
-        begin = time.process_time()
-        integrate_broken(small, pixel=PIXEL_UM)
-        broken.append(time.process_time() - begin)
+    broken_s = processor_seconds(lambda: integrate_broken(small, pixel=PIXEL_UM), 3)
     part = _disc(512)
     flat = np.asarray(noisy[:512, :512], float)
     mine = integrate(flat, pixel=PIXEL_UM, valid=part)
-    ours = []
-    for _ in range(3):
-        begin = time.process_time()
-        integrate(flat, pixel=PIXEL_UM, valid=part)
-        ours.append(time.process_time() - begin)
-    ours_s = min(ours)
+    ours_s = processor_seconds(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)
     begin = time.process_time()
     theirs = sparse_direct(flat, part, pixel=PIXEL_UM)
     peer_s = time.process_time() - begin
     return (
         Limit(
             "processor seconds on each of 2 cores, 2048 x 2048 with a mask",
-            min(spent) / CORES,
-            SECONDS,
+            spent_s / LIMIT_CORES,
+            MAX_INTEGRATION_S,
             "<=",
             "s",
         ),
         Limit(
-            "relative residual of the same, in float64", found.convergence.residual, RESIDUAL, "<="
+            "relative residual of the same, in float64",
+            found.convergence.residual,
+            MAX_RELATIVE_RESIDUAL,
+            "<=",
         ),
         Limit(
             "processor seconds on each of 2 cores, bilateral, 1024 x 1024",
-            min(broken) / CORES,
-            BROKEN_SECONDS,
+            broken_s / LIMIT_CORES,
+            MAX_BILATERAL_S,
             "<=",
             "s",
         ),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import numba
@@ -18,17 +18,25 @@ from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import mean_error
 
 PIXEL_UM = 6.0
-STRETCH = 0.88
-CORES = 2
-"""Cores of the limits; processor time does not see who else keeps them busy."""
-HIERARCHICAL_S = 15.0
-TIMES_FASTER = 100.0
-FULL_SIDE = 2000
-PEER_CANDIDATES = 3
+STRETCH_RATIO = 0.88
+MAX_SEARCH_S = 15.0
+MIN_SPEEDUP_OVER_NUMPY = 100.0
+FULL_SIDE_PX = 2000
+N_PEER_CANDIDATES = 3
 """Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
 
 
@@ -66,7 +74,7 @@ def numpy_distance(
     """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
-    dx /= STRETCH
+    dx /= STRETCH_RATIO
     w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     edges = np.linspace(-1.0, 1.0, 65)
     counts = np.histogram2d((dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
@@ -79,16 +87,12 @@ def _spent(call: Callable[[], object], repeats: int = 1) -> float:
     Of two threads the one that is done first spins until the other is, which counts as its time:
     where other programs keep the cores busy that is up to as much as the work.
     """
-    seconds, threads = [], numba.get_num_threads()
+    threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        for _ in range(repeats):
-            begin = time.process_time()
-            call()
-            seconds.append(time.process_time() - begin)
+        return processor_seconds(call, repeats)
     finally:
         numba.set_num_threads(threads)
-    return min(seconds)
 
 
 def search(*, toy: bool) -> StageBenchmark:
@@ -97,7 +101,7 @@ def search(*, toy: bool) -> StageBenchmark:
     side = 64 if toy else 256
     height = relief(side, rng=rng)
     target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
     alphas, sigmas = (ALPHAS[::50], SIGMAS_UM[::20]) if toy else (ALPHAS, SIGMAS_UM)
 
@@ -107,7 +111,7 @@ def search(*, toy: bool) -> StageBenchmark:
         return kernel_fit.fit_kernel(
             height[:part, :part],
             target,
-            stretch=STRETCH,
+            stretch=STRETCH_RATIO,
             axis="x",
             pixel_um=PIXEL_UM,
             search=way,
@@ -117,9 +121,8 @@ def search(*, toy: bool) -> StageBenchmark:
         )
 
     best = fit("exhaustive", side, 2)
-    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
-    points = []
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
         ("exhaustive", side, 2, 1),
         ("exhaustive", side, 2, 2 if toy else 5),
@@ -128,45 +131,43 @@ def search(*, toy: bool) -> StageBenchmark:
     ]
     if not toy:
         ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
-    for way, part, first, thin in ways:
-        timing = measure(
-            lambda way=way, part=part, first=first, thin=thin: fit(way, part, first, thin),  # type: ignore[misc]
-            repeats=1,
-            memory=False,
-        )
-        found = fit(way, part, first, thin)
+
+    def error(found: kernel_outcome.KernelFit) -> BandError:
         change = whole.change(found.sigma_um)
         there = buckets.distances((whole.along, whole.across), change, np.array([found.alpha]))
-        error = float(there[0]) - best.distance
-        knobs: dict[str, str | int | float] = {"search": way, "side": part, "every": thin}
-        if way == "hierarchical":
-            knobs["first sample"] = first
-        points.append(Point(knobs, timing, error, (error, error)))
-    limits = () if toy else _full_size(rng)
-    return StageBenchmark(
-        "kernel-fit",
-        "distance above that of the exhaustive search on all pixels",
-        "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="nothing: one search on one relief, distances computed exactly",
-        no_bands="shape alone: no color of skin enters",
+        return BandError.around(float(there[0]) - best.distance, 0.0)
+
+    def knobs(way: str, part: int, first: int, thin: int) -> dict[str, str | int | float]:
+        only = {"first sample": first} if way == "hierarchical" else {}
+        return {"search": way, "side": part, "every": thin, **only}
+
+    return compare(
+        StageBenchmark(
+            "kernel-fit",
+            "distance above that of the exhaustive search on all pixels",
+            "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
+            interval_of="nothing: one search on one relief, distances computed exactly",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        [Case(knobs(*way), partial(fit, *way), error) for way in ways],
+        repeats=1,
+        memory=False,
+        limits=None if toy else lambda _: _full_size(rng),
     )
 
 
 def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
-    height = relief(FULL_SIDE, rng=rng)
+    height = relief(FULL_SIDE_PX, rng=rng)
     target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
-    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     few = SIGMAS_UM[[10, 60, 150]]
     ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHAS, few))
     ours_s *= SIGMAS_UM.size / few.size
-    tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:PEER_CANDIDATES]
+    tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
     peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
     peer_s *= ALPHAS.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
@@ -185,25 +186,25 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         if made == "a kernel":
             moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
             target = normal_histogram.histogram(
-                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
+                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
             )
 
         def run(target: Float64Array = target) -> kernel_outcome.KernelFit:
             return kernel_fit.fit_kernel(
-                height, target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM
+                height, target, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM
             )
 
-        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / CORES)
+        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES)
     found = run()
     return (
         Limit(
             "processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
             default_s[0],
-            HIERARCHICAL_S,
+            MAX_SEARCH_S,
             "<=",
             "s",
         ),
-        Limit("the same, relief made by a kernel", default_s[1], HIERARCHICAL_S, "<=", "s"),
+        Limit("the same, relief made by a kernel", default_s[1], MAX_SEARCH_S, "<=", "s"),
         Limit(
             "steps of alpha from the kernel that made the relief",
             abs(found.alpha + 0.63) / 0.01,
@@ -219,8 +220,8 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         ),
         Limit(
             "times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
-            peer_s / (ours_s / CORES),
-            TIMES_FASTER,
+            peer_s / (ours_s / LIMIT_CORES),
+            MIN_SPEEDUP_OVER_NUMPY,
             ">=",
         ),
         Limit("difference of distances from NumPy's", mismatch, 1e-3, "<="),

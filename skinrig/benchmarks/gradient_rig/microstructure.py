@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
 import tracemalloc
 from collections.abc import Callable
 from functools import partial
@@ -32,36 +31,41 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 
 TEXEL_UM = 10.0
-FITTED_STATES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
+FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
 """Stretch ratios that the table is fitted to, on other patches than those it is judged on."""
-JUDGED_STATES = (0.8, 0.9, 1.1, 1.2)
-ALPHAS = np.round(np.arange(-2.0, 1.001, 0.05), 2)
-SIGMAS_UM = np.arange(4.0, 101.0, 4.0)
-ACROSS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
+EVALUATED_STRETCHES = (0.8, 0.9, 1.1, 1.2)
+SEARCHED_ALPHAS = np.round(np.arange(-2.0, 1.001, 0.05), 2)
+SEARCHED_SIGMAS_UM = np.arange(4.0, 101.0, 4.0)
+JAW_CONDITIONS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
     (0.0, "none"),
     (30.0, "none"),
     (30.0, "volume"),
 )
 """Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
 width, and where it does not, both passes act."""
-CORES = 2
-"""Cores of the limits; processor time does not see who else keeps them busy."""
-TIMES_FASTER = 5.0
-STATIC_PART = 0.6
+MIN_SPEEDUP_OVER_NUMPY = 5.0
+MAX_RATIO_TO_STATIC = 0.6
 """The fitted kernels' error is at most so much of the error of a relief that does not change."""
-FULL_SIDE = 4096
+FULL_SIDE_PX = 4096
 PEER_ROWS = 256
 """Rows of the full map that the straightforward convolution is timed on."""
-TILED_SIDE = 16_384
-TILED_MB = 6000.0
-GRADUAL = 0.02
+TILED_SIDE_PX = 16_384
+MAX_TILED_MB = 6000.0
+GRADUAL_CHANGE_PER_SIGMA = 0.02
 """Turn of axes, rad, and relative change of sigma, within one sigma, that are called gradual."""
-GRADUAL_ERROR = 2.0
+MAX_GRADUAL_ERROR_PERCENT = 2.0
 """Percent of the change that two passes may be off there."""
-WAVES = 60
+N_WAVES = 60
 
 
 def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Float64Array, Float64Array]:
@@ -98,8 +102,8 @@ def fitted_table(
                 stretch=r,
                 axis="x",
                 pixel_um=TEXEL_UM,
-                alphas=ALPHAS[::every],
-                sigmas_um=SIGMAS_UM[::every],
+                alphas=SEARCHED_ALPHAS[::every],
+                sigmas_um=SEARCHED_SIGMAS_UM[::every],
             )
             found.append((r, fit.alpha, fit.sigma_um))
     r, alpha, sigma = np.array(found).T
@@ -152,7 +156,7 @@ def _judged(
 def truth(*, toy: bool) -> StageBenchmark:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
     size_mm = 0.8 if toy else 2.4
-    states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STATES
+    states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STRETCHES
     table = fitted_table(
         [make_micro_skin("forehead", seed=1, size_mm=size_mm, texel_um=TEXEL_UM)],
         states,
@@ -165,11 +169,11 @@ def truth(*, toy: bool) -> StageBenchmark:
     points = []
     errors: dict[tuple[str, str, str], float] = {}
     variances: dict[tuple[str, str, str], float] = {}
-    for angle, across in ACROSS[-1:] if toy else ACROSS:
+    for angle, across in JAW_CONDITIONS[-1:] if toy else JAW_CONDITIONS:
         settled = [
             [
                 deform(skin, stretch=r, angle_deg=angle, compensation=across)
-                for r in (JUDGED_STATES[::3] if toy else JUDGED_STATES)
+                for r in (EVALUATED_STRETCHES[::3] if toy else EVALUATED_STRETCHES)
             ]
             for skin in skins
         ]
@@ -222,13 +226,13 @@ def truth(*, toy: bool) -> StageBenchmark:
             Limit(
                 "fitted kernels' distance of normals over the static relief's, width kept",
                 left(errors, "none"),
-                STATIC_PART,
+                MAX_RATIO_TO_STATIC,
                 "<=",
             ),
             Limit(
                 "their error of slopes' variance along the jaws over the static relief's",
                 left(variances, "none"),
-                STATIC_PART,
+                MAX_RATIO_TO_STATIC,
                 "<=",
             ),
             Limit(
@@ -311,44 +315,39 @@ def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Fl
     return height
 
 
-def _spent(call: Callable[[], object], repeats: int = 1) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _full_size() -> tuple[Limit, ...]:
     """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
     rng = np.random.default_rng(0)
-    height = rng.standard_normal((FULL_SIDE, FULL_SIDE), np.float32)
-    fields = varying_fields(FULL_SIDE, FULL_SIDE)
+    height = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
+    fields = varying_fields(FULL_SIDE_PX, FULL_SIDE_PX)
     own: dict[str, float] = {}
     both: tuple[Sampling, ...] = ("cubic", "linear")
     for sampling in both:
         run = partial(convolve, height, *fields, sampling=sampling)
         run()
-        own[sampling] = _spent(run, 2) / CORES
+        own[sampling] = processor_seconds(run, 2) / LIMIT_CORES
     strip = height[:PEER_ROWS]
     own_strip = tuple(values[:PEER_ROWS] for values in fields)
-    peer_s = _spent(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE / PEER_ROWS
+    peer_s = processor_seconds(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE_PX / PEER_ROWS
     mismatch = np.abs(
         numpy_convolve(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
     ).max()
     del fields, height
-    raster_s = _spent(_rasterized(FULL_SIDE), 2) / CORES
+    raster_s = processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
     tile_s, peak_mb = _tiles_of_16k()
     return (
         Limit(
             "times faster on 2 cores than NumPy on its one, 4096 x 4096, cubic samples",
             peer_s / own["cubic"],
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_NUMPY,
             ">=",
         ),
-        Limit("the same, bilinear samples as NumPy's", peer_s / own["linear"], TIMES_FASTER, ">="),
+        Limit(
+            "the same, bilinear samples as NumPy's",
+            peer_s / own["linear"],
+            MIN_SPEEDUP_OVER_NUMPY,
+            ">=",
+        ),
         Limit(
             "largest difference from NumPy's, bilinear, of heights about 1",
             float(mismatch),
@@ -366,7 +365,7 @@ def _full_size() -> tuple[Limit, ...]:
         Limit(
             "the same for 16,384 x 16,384 in tiles of 2048, by two of 64", tile_s, 200.0, "<=", "s"
         ),
-        Limit("arrays held for that", peak_mb, TILED_MB, "<=", "MB"),
+        Limit("arrays held for that", peak_mb, MAX_TILED_MB, "<=", "MB"),
     )
 
 
@@ -388,14 +387,14 @@ def _rasterized(side: int) -> Callable[[], object]:
 
 def _tiles_of_16k() -> tuple[float, float]:
     """Return processor seconds a core for the whole of 16K, by two tiles, and MB held."""
-    shape = (TILED_SIDE, TILED_SIDE)
+    shape = (TILED_SIDE_PX, TILED_SIDE_PX)
     count = len(tiles_of(shape, 2048))
     chosen = (0, count // 2 + 3)
 
     def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
         s, t, alpha_s, sigma_s, alpha_t, sigma_t = (
             np.ascontiguousarray(values[:, window.columns])
-            for values in varying_fields(TILED_SIDE, window.shape[0], first_row=window.top)
+            for values in varying_fields(TILED_SIDE_PX, window.shape[0], first_row=window.top)
         )
         return LineKernels(s, alpha_s, sigma_s), LineKernels(t, alpha_t, sigma_t)
 
@@ -409,7 +408,7 @@ def _tiles_of_16k() -> tuple[float, float]:
             fields_at,
             finished=[number for number in range(count) if number not in chosen],
         )
-        spent = _spent(run)
+        spent = processor_seconds(run)
         tracemalloc.start()
         try:
             run()
@@ -417,7 +416,7 @@ def _tiles_of_16k() -> tuple[float, float]:
         finally:
             tracemalloc.stop()
         del source, target
-    return spent / CORES * count / len(chosen), peak / 1e6
+    return spent / LIMIT_CORES * count / len(chosen), peak / 1e6
 
 
 def waves(
@@ -427,11 +426,11 @@ def waves(
 
     Wavelengths are 4 to 12 sigmas (no shorter than 5 px), where kernels do most.
     """
-    length = sigma_px * rng.uniform(4.0, 12.0, WAVES)
+    length = sigma_px * rng.uniform(4.0, 12.0, N_WAVES)
     k = 2.0 * np.pi / np.maximum(length, 5.0)
-    direction = rng.uniform(0.0, np.pi, WAVES)
+    direction = rng.uniform(0.0, np.pi, N_WAVES)
     vectors = k[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    return vectors, np.full(WAVES, WAVES**-0.5), rng.uniform(0.0, 2.0 * np.pi, WAVES)
+    return vectors, np.full(N_WAVES, N_WAVES**-0.5), rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
 
 
 def two_passes_error(
@@ -502,7 +501,7 @@ def passes(*, toy: bool) -> StageBenchmark:
     """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
     tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
     if not toy:
-        values = (0.01, GRADUAL, 0.05, 0.1, 0.2)
+        values = (0.01, GRADUAL_CHANGE_PER_SIGMA, 0.05, 0.1, 0.2)
         tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
     points, errors = [], {}
     draws = 2 if toy else 3
@@ -549,15 +548,15 @@ def passes(*, toy: bool) -> StageBenchmark:
             ),
             Limit(
                 "error where axes turn gradually, sigma 3 px",
-                errors[3.0, "cubic", GRADUAL, 0.0],
-                GRADUAL_ERROR,
+                errors[3.0, "cubic", GRADUAL_CHANGE_PER_SIGMA, 0.0],
+                MAX_GRADUAL_ERROR_PERCENT,
                 "<=",
                 "%",
             ),
             Limit(
                 "error where sigma grows gradually, sigma 3 px",
-                errors[3.0, "cubic", 0.0, GRADUAL],
-                GRADUAL_ERROR,
+                errors[3.0, "cubic", 0.0, GRADUAL_CHANGE_PER_SIGMA],
+                MAX_GRADUAL_ERROR_PERCENT,
                 "<=",
                 "%",
             ),

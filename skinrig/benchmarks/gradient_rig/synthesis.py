@@ -18,10 +18,10 @@ from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing,
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384
-THREADS = 2
-CLOSE = 0.03
+N_THREADS = 2
+MAX_HISTOGRAM_DISTANCE = 0.03
 """Half the sum of differences of 64 x 64 buckets that a map may be off its patches."""
-MEMORY_GB = 6.0
+MAX_MEMORY_GB = 6.0
 
 
 def blended(
@@ -213,7 +213,7 @@ def _judged(
     """Lay out the largest map, draw a band of its tiles, and judge them."""
     begin = time.process_time()
     layout = displacement_synthesis.lay_out(
-        patches, LARGEST_PX, rng=np.random.default_rng(0), threads=THREADS
+        patches, LARGEST_PX, rng=np.random.default_rng(0), threads=N_THREADS
     )
     laid_s = time.process_time() - begin
     tile = layout.tile(0, 0)
@@ -226,7 +226,9 @@ def _judged(
     site = layout.sites[0]
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes
     held += site.cells.nbytes + site.across.nbytes + site.down.nbytes
-    memory_gb = (held + 1e6 * THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2) / 1e9
+    memory_gb = (
+        held + 1e6 * N_THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2
+    ) / 1e9
     part = layout.draw((0, 2 * rows), (0, 2 * columns))
     cuts = layout.at_cuts((0, 2 * rows), (0, 2 * columns))
     slope_x, slope_y, _ = relief_slopes.slopes(part, pixel=PIXEL_UM)
@@ -239,7 +241,10 @@ def _judged(
     blend = normal_histogram.halved_distance(slope_histogram([theirs]), truth)
     return (
         Limit(
-            "half the sum of differences of 64 x 64 buckets from the patches'", ours, CLOSE, "<="
+            "half the sum of differences of 64 x 64 buckets from the patches'",
+            ours,
+            MAX_HISTOGRAM_DISTANCE,
+            "<=",
         ),
         Limit(
             "rms slope at cuts over that elsewhere",
@@ -250,7 +255,7 @@ def _judged(
         Limit(
             "memory of 16,384 x 16,384 on 2 threads with the map held in memory",
             memory_gb,
-            MEMORY_GB,
+            MAX_MEMORY_GB,
             "<=",
             "GB",
         ),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,19 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    measure,
+    once,
+    processor_seconds,
+)
 
-CENTRES = (
+ZONE_CENTERS_UV = (
     (0.3, 0.12),
     (0.7, 0.12),
     (0.3, 0.3),
@@ -31,20 +41,23 @@ CENTRES = (
     (0.5, 0.65),
     (0.5, 0.88),
 )
-REACH = 0.12
-PERIODS = 16
+ZONE_RADIUS_UV = 0.12
+FURROWS_PER_FACE = 16
 """Furrows over the height of the face, if it had them everywhere."""
-STEEPEST = 0.6
-FULL_SIDE = 2048
-TIMES_FASTER = 5.0
-NOISE_RAD = 0.02
+MAX_SLOPE = 0.6
+FULL_SIDE_PX = 2048
+MIN_SPEEDUP_OVER_NUMPY = 5.0
+NORMAL_NOISE_RAD = 0.02
 
 
 def zone_masks(side: int) -> Float64Array:
     """Return eight soft zones on a face's texture, (8, side, side), with sums of at most 1."""
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     masks = np.stack(
-        [np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / (0.5 * REACH) ** 2) for a, b in CENTRES]
+        [
+            np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / (0.5 * ZONE_RADIUS_UV) ** 2)
+            for a, b in ZONE_CENTERS_UV
+        ]
     )
     return np.asarray(masks / np.maximum(masks.sum(axis=0), 1.0))
 
@@ -72,7 +85,7 @@ def furrowed_face(
     """
     y = (np.mgrid[:side, :side][0] + 0.5) / side
     bend = gaussian_filter(rng.standard_normal((side, side)), side / 20, mode="wrap")
-    phase = 2 * np.pi * PERIODS * (y + 0.012 * bend / bend.std())
+    phase = 2 * np.pi * FURROWS_PER_FACE * (y + 0.012 * bend / bend.std())
     grain = gaussian_filter(rng.standard_normal((side, side)), 1.5, mode="wrap")
     masks = zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
@@ -84,7 +97,7 @@ def furrowed_face(
 
     rows = {name: JIMENEZ2011.row(name) for name in JIMENEZ2011.rows}
     deep = {name: furrows(row) for name, row in rows.items()}
-    scale = STEEPEST / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
+    scale = MAX_SLOPE / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
 
     def normals(height: Float64Array) -> Float64Array:
         dy, dx = np.gradient(scale * height)
@@ -139,7 +152,7 @@ def opencv_combine(
     return out
 
 
-def _error(normals: FloatArray, truth: FloatArray) -> tuple[float, tuple[float, float]]:
+def _error(normals: FloatArray, truth: FloatArray) -> BandError:
     """Return the mean angle, degrees, and its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
     cut = max(angle.shape[0] // 8, 1)
@@ -148,14 +161,13 @@ def _error(normals: FloatArray, truth: FloatArray) -> tuple[float, tuple[float, 
         for i in range(0, angle.shape[0], cut)
         for j in range(0, angle.shape[1], cut)
     ]
-    mean, scatter = float(angle.mean()), float(np.std(squares) / np.sqrt(len(squares)))
-    return mean, (mean - scatter, mean + scatter)
+    return BandError.around(float(angle.mean()), float(np.std(squares) / np.sqrt(len(squares))))
 
 
 def _mean_error(model: Any, states: dict[str, Float64Array]) -> tuple[float, tuple[float, float]]:
     errors = [_error(model.evaluate({name: 1.0}).normals, n) for name, n in states.items()]
-    mean = float(np.mean([one for one, _ in errors]))
-    low, high = (float(np.mean([both[i] for _, both in errors])) for i in (0, 1))
+    mean = float(np.mean([one.error for one in errors]))
+    low, high = (float(np.mean([one.error_interval[i] for one in errors])) for i in (0, 1))
     return mean, (low, high)
 
 
@@ -188,7 +200,7 @@ def fitting(*, toy: bool) -> StageBenchmark:
             "KB as BC5 and BC3": size.total_bytes / 1024,
         }
         points.append(Point(knobs, timing, error, interval))
-    rest = float(np.mean([_error(neutral, n)[0] for n in states.values()]))
+    rest = float(np.mean([_error(neutral, n).error for n in states.values()]))
     best = min(point.error for point in points)
     return StageBenchmark(
         "wrinkles",
@@ -208,11 +220,11 @@ def fitting(*, toy: bool) -> StageBenchmark:
 def summing(*, toy: bool) -> StageBenchmark:
     """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
     rng = np.random.default_rng(1)
-    side, coarse, mask_side = (256, 32, 8) if toy else (FULL_SIDE, 256, 64)
+    side, coarse, mask_side = (256, 32, 8) if toy else (FULL_SIDE_PX, 256, 64)
     base = gaussian_filter(rng.standard_normal((side, side, 2)), (1, 1, 0)).astype(np.float32)
     base *= 0.1 / base.std()
     wrinkle = gaussian_filter(rng.standard_normal((coarse, coarse, 2)), (2, 2, 0))
-    wrinkle *= STEEPEST / np.abs(wrinkle).max()
+    wrinkle *= MAX_SLOPE / np.abs(wrinkle).max()
     masks = zone_masks(mask_side)
     row = np.full(8, 0.5)
     truth = numpy_combine(base, wrinkle, masks, row)
@@ -235,21 +247,16 @@ def summing(*, toy: bool) -> StageBenchmark:
         "OpenCV and NumPy": lambda: opencv_combine(base, wrinkle, masks, row),
         "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
     }
-    points = []
-    for way, call in ways.items():
-        timing = measure(call, repeats=1 if way == "NumPy" else 5, memory=False)
-        error, interval = _error(call(), truth)
-        points.append(Point({"way": way, "side": side}, timing, error, interval))
-    limits: tuple[Limit, ...] = ()
-    if not toy:
-        peer_s, own_s = _spent(ways["NumPy"], 1), _spent(by_derivatives, 5)
-        library_s = _spent(ways["OpenCV and NumPy"], 5)
+
+    def limits(points: Sequence[Point]) -> tuple[Limit, ...]:
+        peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
+        library_s = processor_seconds(ways["OpenCV and NumPy"], 5)
         apart = float(np.abs(by_derivatives() - truth).max())
-        limits = (
+        return (
             Limit(
                 "times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
                 peer_s / own_s,
-                TIMES_FASTER,
+                MIN_SPEEDUP_OVER_NUMPY,
                 ">=",
             ),
             Limit("the same, than OpenCV and NumPy", library_s / own_s, 2.0, ">="),
@@ -267,26 +274,29 @@ def summing(*, toy: bool) -> StageBenchmark:
                 "<=",
             ),
         )
-    return StageBenchmark(
-        "wrinkle-sum",
-        "mean angle to the normals of the summed relief at half weight, deg",
-        "listing 1.1 in double precision",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="squares of the face",
-        no_bands="shape alone: no color of skin enters",
+
+    cases = [
+        Case(
+            {"way": way, "side": side},
+            call,
+            lambda normals: _error(normals, truth),
+            repeats=1 if way == "NumPy" else 5,
+        )
+        for way, call in ways.items()
+    ]
+    return compare(
+        StageBenchmark(
+            "wrinkle-sum",
+            "mean angle to the normals of the summed relief at half weight, deg",
+            "listing 1.1 in double precision",
+            interval_of="squares of the face",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        cases[:3],
+        cases[3:],
+        memory=False,
+        limits=None if toy else limits,
     )
-
-
-def _spent(call: Callable[[], object], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return max(min(seconds), 1e-9)
 
 
 def storing(*, toy: bool) -> StageBenchmark:
@@ -302,7 +312,6 @@ def storing(*, toy: bool) -> StageBenchmark:
     table = fitted.layer.table
     weights = {"surprise": 1.0, "disgust": 0.6}
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
-    points = []
     encodings: tuple[tuple[Any, Any], ...] = (
         ("float32", "float32"),
         ("float16", "float16"),
@@ -310,44 +319,36 @@ def storing(*, toy: bool) -> StageBenchmark:
         ("bc5", "bc3"),
         ("bc5", "unit8"),
     )
-    for at in (64, 32) if toy else (512, 256, 128, 64):
-        small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
-        for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
-            layer = Layer(
-                wrinkle_storage.stored_map(small, maps_as),
-                wrinkle_storage.stored_masks(masks, masks_as),
-                table,
-            )
 
-            def run(layer: Layer = layer) -> FloatArray:
-                return wrinkles.combine_layers(base, [layer], weights)
-
-            timing = measure(run, repeats=3, memory=False)
-            error, interval = _error(run(), whole)
-            size = wrinkle_storage.footprint(
-                (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
-            )
-            points.append(
-                Point(
-                    {
-                        "map": at,
-                        "as": maps_as,
-                        "masks as": masks_as,
-                        "KB": round(size.total_bytes / 1024, 3),
-                    },
-                    timing,
-                    error,
-                    interval,
+    def cases() -> Iterator[Case[FloatArray]]:
+        for at in (64, 32) if toy else (512, 256, 128, 64):
+            small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
+            for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
+                layer = Layer(
+                    wrinkle_storage.stored_map(small, maps_as),
+                    wrinkle_storage.stored_masks(masks, masks_as),
+                    table,
                 )
-            )
-    return StageBenchmark(
-        "wrinkle-storage",
-        "mean angle to the normals with the map at full size in 32 bits, deg",
-        "the same wrinkles, stored without loss",
-        0.0,
-        tuple(points),
-        interval_of="squares of the face",
-        no_bands="shape alone: no color of skin enters",
+                size = wrinkle_storage.footprint(
+                    (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
+                )
+                kilobytes = round(size.total_bytes / 1024, 3)
+                yield Case(
+                    {"map": at, "as": maps_as, "masks as": masks_as, "KB": kilobytes},
+                    partial(wrinkles.combine_layers, base, [layer], weights),
+                    lambda normals: _error(normals, whole),
+                )
+
+    return compare(
+        StageBenchmark(
+            "wrinkle-storage",
+            "mean angle to the normals with the map at full size in 32 bits, deg",
+            "the same wrinkles, stored without loss",
+            interval_of="squares of the face",
+            no_bands="shape alone: no color of skin enters",
+        ),
+        cases(),
+        memory=False,
     )
 
 
@@ -363,7 +364,7 @@ def weighing(*, toy: bool) -> StageBenchmark:
         layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
         neutral = wrinkle_texels.derivatives_of(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
-        for noise in (0.005, NOISE_RAD) if toy else (0.005, NOISE_RAD, 0.08):
+        for noise in (0.005, NORMAL_NOISE_RAD) if toy else (0.005, NORMAL_NOISE_RAD, 0.08):
             stderr = np.full((side, side), noise)
             bound = _bound(layer, clean, stderr)
             misses = []

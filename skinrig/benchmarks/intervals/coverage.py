@@ -16,7 +16,7 @@ import numpy as np
 
 from skinrig.arrays import Float64Array
 
-LEVELS: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
+COVERAGE_RANGES: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
 """Nominal coverage, %, and the range that a stage's coverage is to lie in."""
 
 GAUSSIAN_95: Final = 1.959964
@@ -67,7 +67,7 @@ class Covered:
     @property
     def verdict(self) -> str:
         """Whether the share is in its range: "kept", "open" (its interval is) or "missed"."""
-        low, high = LEVELS[self.level]
+        low, high = COVERAGE_RANGES[self.level]
         if low <= self.share <= high:
             return "kept"
         return "open" if self.interval[1] >= low and self.interval[0] <= high else "missed"

@@ -24,16 +24,16 @@ from skinrig.benchmarks.intervals import gradient as interval_trials_gradient
 from skinrig.benchmarks.intervals import probe as interval_trials_probe
 from skinrig.benchmarks.intervals import sequence as interval_trials_sequence
 from skinrig.benchmarks.intervals import trials as interval_trials
-from skinrig.benchmarks.intervals.coverage import LEVELS, Covered, Trial, by_band
+from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, once
 
 FIRST_SEED: Final = 400
-FALSE_ALARM: Final = 0.05
+FALSE_ALARM_RATE: Final = 0.05
 """Chance that a run of honest intervals misses a promise."""
 
-PRESETS: Final = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
-SITES: Final = ("forehead", "cheek", "chin")
-MEDIA: Final = (
+FLASH_PRESETS: Final = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
+GRADIENT_SITES: Final = ("forehead", "cheek", "chin")
+PROBE_MEDIA: Final = (
     "homogeneous:0.02,1.0,0.8",
     "homogeneous:0.1,1.5,0.86",
     "homogeneous:0.3,2.0,0.73",
@@ -44,12 +44,12 @@ MEDIA: Final = (
     "homogeneous:0.08,0.9,0.9",
 )
 """Fractions in 1/mm of absorption and reduced scattering, and g."""
-SKIN: Final = ("II", "IV", "VI", "I", "III", "V")
+PROBE_PRESETS: Final = ("II", "IV", "VI", "I", "III", "V")
 """Presets under the probe: a band of melanin each, twice."""
-DIRECTED: Final = ("anisotropic:0.25,2,-1,35", "anisotropic:0.25,2,1,110")
+ANISOTROPIC_MEDIA: Final = ("anisotropic:0.25,2,-1,35", "anisotropic:0.25,2,1,110")
 """Axes at which a turn the other way, or a quarter of a turn, shows: at 0 and 90 degrees the first
 cannot."""
-DOME: Final = ("I", "III", "V", "II", "IV", "VI")
+DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 
 Trials = Iterable[Trial]
 
@@ -77,8 +77,12 @@ def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) 
     told = [trial for trial in trials if trial.deviation.size]
     counted = len(by_band(told, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
-    confidence = 1.0 - 2.0 * FALSE_ALARM / (4 * counted)
-    rows = [row for level in LEVELS for row in by_band(told, level=level, confidence=confidence)]
+    confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
+    rows = [
+        row
+        for level in COVERAGE_RANGES
+        for row in by_band(told, level=level, confidence=confidence)
+    ]
     return StageBenchmark(
         "intervals",
         "distance of the coverage from the nominal one, percentage points",
@@ -98,13 +102,13 @@ def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) 
 
 
 def _full() -> Mapping[str, Callable[[Path], Trials]]:
-    flash = {FIRST_SEED + k: PRESETS[k % len(PRESETS)] for k in range(16)}
-    sites = {FIRST_SEED + k: SITES[k % len(SITES)] for k in range(6)}
-    faces = {FIRST_SEED + k: DOME[k] for k in range(len(DOME))}
-    media = {FIRST_SEED + k: medium for k, medium in enumerate(MEDIA)}
-    skin = {FIRST_SEED + k: SKIN[k] for k in range(len(SKIN))}
-    coarse = {FIRST_SEED + 16 + k: PRESETS[k] for k in range(len(PRESETS))}
-    moving = {FIRST_SEED + 24 + k: PRESETS[k + 1] for k in range(4)}
+    flash = {FIRST_SEED + k: FLASH_PRESETS[k % len(FLASH_PRESETS)] for k in range(16)}
+    sites = {FIRST_SEED + k: GRADIENT_SITES[k % len(GRADIENT_SITES)] for k in range(6)}
+    faces = {FIRST_SEED + k: DOME_PRESETS[k] for k in range(len(DOME_PRESETS))}
+    media = {FIRST_SEED + k: medium for k, medium in enumerate(PROBE_MEDIA)}
+    skin = {FIRST_SEED + k: PROBE_PRESETS[k] for k in range(len(PROBE_PRESETS))}
+    coarse = {FIRST_SEED + 16 + k: FLASH_PRESETS[k] for k in range(len(FLASH_PRESETS))}
+    moving = {FIRST_SEED + 24 + k: FLASH_PRESETS[k + 1] for k in range(4)}
     return {
         "flash": lambda folder: interval_trials_flash.flash(folder, flash, width_px=768),
         "coarse": lambda folder: interval_trials_flash.flash(
@@ -122,7 +126,7 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
             folder,
             media,
             skin=skin,
-            directed={FIRST_SEED + k: medium for k, medium in enumerate(DIRECTED)},
+            directed={FIRST_SEED + k: medium for k, medium in enumerate(ANISOTROPIC_MEDIA)},
         ),
     }
 
@@ -160,7 +164,7 @@ def _point(row: Covered, timing: Timing) -> Point:
 
 
 def _limits(row: Covered) -> tuple[Limit, Limit]:
-    low, high = LEVELS[row.level]
+    low, high = COVERAGE_RANGES[row.level]
     skin = "" if row.band in ("all", interval_trials.ANY_BAND) else f", {row.band} skin"
     name = f"share of truths in {row.level} % intervals, {row.quantity}{skin}"
     return (

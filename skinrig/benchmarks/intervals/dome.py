@@ -15,7 +15,13 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.dome.stages import WEIGHTS
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import forget, of_map, of_normals, truth_of, valid_of
+from skinrig.benchmarks.intervals.trials import (
+    delete_trial_outputs,
+    of_map,
+    of_normals,
+    truth_of,
+    valid_of,
+)
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection, skin_bands
 from skinrig.evaluating import surface as surface_evaluation
@@ -25,11 +31,11 @@ FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface":
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on faces of seeds 0 to 5 and
 types I to V that are not judged (R_d: of seeds 1 to 3, types V, I and II): tails are heavier than a
 Gaussian's where one point in twenty is not like the others."""
-NORMALS: Final[Mapping[str, str]] = {
+NORMAL_MAP_NAMES: Final[Mapping[str, str]] = {
     "normals": "normals of the dome",
     "normals_refined": "refined normals of the dome",
 }
-COLORS: Final = ("red", "green", "blue")
+CHANNEL_NAMES: Final = ("red", "green", "blue")
 
 
 def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
@@ -51,14 +57,14 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
         )
         pipeline.reconstruct(
             done.session,
-            want=[*NORMALS, "r_d", *WEIGHTS],
+            want=[*NORMAL_MAP_NAMES, "r_d", *WEIGHTS],
             out=folder / "maps",
             calibration=calibration,
         )
         yield from of_face(
             store.read(folder / "maps"), store.read(truth_of(done)), f"{preset} {seed}"
         )
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
         for place in (*targets, calibration):
             shutil.rmtree(place)
 
@@ -81,7 +87,7 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
         for key in ("normals", "r_d")
     )
     band = str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(true_albedo))))
-    for name, quantity in NORMALS.items():
+    for name, quantity in NORMAL_MAP_NAMES.items():
         normals = found.maps[name]
         good = valid_of(normals)[pairs.rows, pairs.columns]
         if normals.stderr is not None:
@@ -100,7 +106,7 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
     true[pairs.rows, pairs.columns] = true_albedo
     told = np.zeros(shape, bool)
     told[pairs.rows, pairs.columns] = True
-    for channel, color in enumerate(COLORS):
+    for channel, color in enumerate(CHANNEL_NAMES):
         yield of_map(
             f"R_d, {color}",
             albedo,

@@ -22,7 +22,7 @@ from skinrig.benchmarks.intervals.coverage import Trial
 from skinrig.benchmarks.intervals.trials import (
     band_of,
     calibrated,
-    forget,
+    delete_trial_outputs,
     of_map,
     truth_of,
     valid_of,
@@ -35,10 +35,10 @@ FACTOR_95: Final = 2.4
 """Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
 subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
 
-STANCE_SHARE: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
+STANCE_DEVIATION: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
 """Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
 what the stated errors take it for. Light goes with the square of the distance."""
-_STANCE: Final = 1
+_STANCE_STREAM: Final = 1
 """Beside a subject's seed: of the draw of its place."""
 
 
@@ -50,8 +50,8 @@ def nearer_mm(seed: int) -> float:
     >>> round(nearer_mm(520), 1) == round(nearer_mm(520), 1) != round(nearer_mm(521), 1)
     True
     """
-    drawn = np.random.default_rng([seed, _STANCE]).standard_normal()
-    return float(STANCE_SHARE * load_rig("flash").views[0].distance_mm * drawn)
+    drawn = np.random.default_rng([seed, _STANCE_STREAM]).standard_normal()
+    return float(STANCE_DEVIATION * load_rig("flash").views[0].distance_mm * drawn)
 
 
 def flash(
@@ -113,7 +113,7 @@ def flash(
             )
         if moving:
             yield from _of_rig(done, folder, state, subject=name, band=band)
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
 
 
 def _of_rig(

@@ -27,7 +27,13 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSER
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import ANY_BAND, forget, of_normals, truth_of, valid_of
+from skinrig.benchmarks.intervals.trials import (
+    ANY_BAND,
+    delete_trial_outputs,
+    of_normals,
+    truth_of,
+    valid_of,
+)
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.simulating.simulation import simulate_session
 
@@ -36,11 +42,11 @@ FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretc
 13 that are not judged: tails are heavier than a Gaussian's. Kernels state both half widths."""
 
 
-STRETCH_STEP: Final = 2
+MAX_STRETCH_STEP: Final = 2
 """Steps of the caliper to either side of neutral at which the skin's stretch is told."""
-SKIN_MM: Final = 2.4
+REFERENCE_SKIN_MM: Final = 2.4
 """Side of the skin whose kernels are true."""
-EDGE_MM: Final = 1.0
+SIMULATED_BORDER_MM: Final = 1.0
 """What is simulated besides: skin at the border of the simulation is not looked at."""
 
 
@@ -65,7 +71,7 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
             seed=seed,
             width_px=width_px,
             angles=(0.0,),
-            steps=(-STRETCH_STEP, STRETCH_STEP),
+            steps=(-MAX_STRETCH_STEP, MAX_STRETCH_STEP),
         )
         pipeline.reconstruct(
             done.session,
@@ -113,7 +119,7 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
             FACTORS_95["stretch"],
         )
         yield from _kernels(found, truth, site=site, seed=seed)
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
         for place in (ball, calibration):
             shutil.rmtree(place)
 
@@ -175,7 +181,7 @@ def deviation(error: float, half: float, half_95: float) -> float:
 
 
 def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> KernelFit:
-    """Fit the kernel of `SKIN_MM` of a simulated skin, of which a session's patch is the middle.
+    """Fit the kernel of `REFERENCE_SKIN_MM` of skin around the patch of a session.
 
     Parameters
     ----------
@@ -189,14 +195,14 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
     from rigsim.skin_patch.microrelief import make_micro_skin
     from rigsim.skin_patch.stretch import deform
 
-    skin = make_micro_skin(site, seed=seed, size_mm=SKIN_MM + EDGE_MM)
+    skin = make_micro_skin(site, seed=seed, size_mm=REFERENCE_SKIN_MM + SIMULATED_BORDER_MM)
     strained = deform(skin, stretch=stretch, angle_deg=0.0)
     shown = []
     for state, sides in (
         (deform(skin, stretch=1.0, angle_deg=0.0), (1.0, 1.0)),
         (strained, (strained.gradient[0, 0], strained.gradient[1, 1])),
     ):
-        columns, rows = (round(1e3 * SKIN_MM * side / pixel_um) for side in sides)
+        columns, rows = (round(1e3 * REFERENCE_SKIN_MM * side / pixel_um) for side in sides)
         x, y = np.meshgrid(
             (np.arange(columns) - 0.5 * (columns - 1)) * 1e-3 * pixel_um,
             (0.5 * (rows - 1) - np.arange(rows)) * 1e-3 * pixel_um,

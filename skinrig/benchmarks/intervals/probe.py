@@ -17,21 +17,21 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import ANY_BAND, forget, truth_of
+from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, truth_of
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.simulating.orders import Simulated
 from skinrig.simulating.simulation import simulate_session
 
-PHOTONS: Final = "full"
+PHOTON_BUDGET: Final = "full"
 """Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,
 two percent, passes for errors of the probe. Skin's truth is of the very profile that is read."""
-BLOCKS: Final = 90_000
+BLOCK_SEED_OFFSET: Final = 90_000
 """Added to a subject's seed for that of its phantom."""
-DIRECTIONS: Final = 8
+N_DIRECTIONS: Final = 8
 """Of the head on tissue that scatters by direction."""
-COEFFICIENTS: Final[Mapping[str, str]] = {
+COEFFICIENT_LABELS: Final[Mapping[str, str]] = {
     "sigma_a": "sigma_a of media",
     "sigma_s_prime": "sigma_s' of media",
 }
@@ -59,24 +59,24 @@ def probe(
         Seed of each and "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG": axis and ratio.
     """
     for seed, medium in media.items():
-        done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTONS)
+        done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
         found, truth = _maps(folder, done, "subsurface")
         name = f"{medium} {seed}"
         yield of_decay("sigma_tr of media", found, truth, subject=name, band=ANY_BAND)
-        for coefficient in COEFFICIENTS:
+        for coefficient in COEFFICIENT_LABELS:
             yield of_coefficient(coefficient, found, truth, subject=name)
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
     for seed, preset in (skin or {}).items():
         done = _subject(folder, preset, seed)
         found, truth = _maps(folder, done, "subsurface")
         band = melanin_band_of(preset)
         yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
     for seed, medium in (directed or {}).items():
-        done = _subject(folder, medium, seed, sites=("cheek",), angles=(DIRECTIONS,))
+        done = _subject(folder, medium, seed, sites=("cheek",), angles=(N_DIRECTIONS,))
         found, truth = _maps(folder, done, "anisotropy")
         yield from of_directions(found, truth, _farthest_deg(medium), f"{medium} {seed}")
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
 
 
 def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
@@ -87,9 +87,13 @@ def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
     phantom = folder / "session-phantom"
     shutil.rmtree(phantom, ignore_errors=True)
     shutil.rmtree(folder / "truth-phantom", ignore_errors=True)
-    simulate_session("probe", phantom, target="phantom", seed=BLOCKS + seed, size=PHOTONS)
+    simulate_session(
+        "probe", phantom, target="phantom", seed=BLOCK_SEED_OFFSET + seed, size=PHOTON_BUDGET
+    )
     paper = folder / "block.json"
-    paper.write_text(json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCKS]))))
+    paper.write_text(
+        json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET])))
+    )
     calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
     return simulate_session(
         "probe", folder / "session-subject", subject=subject, seed=seed, **asked
@@ -113,7 +117,7 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
     from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
 
     paper = dict(phantom_certificate())
-    for name, made in zip(COEFFICIENTS, PHANTOM_DEVIATIONS, strict=True):
+    for name, made in zip(COEFFICIENT_LABELS, PHANTOM_DEVIATIONS, strict=True):
         unsure = float(paper["uncertainty"][name])
         factor = (1.0 + made * unsure) / (1.0 + unsure * float(rng.standard_normal()))
         paper[f"{name}_per_mm"] = [factor * value for value in paper[f"{name}_per_mm"]]
@@ -148,7 +152,7 @@ def of_decay(
     fits = [
         fit
         for fit in evaluation.compare_fits(found, truth)
-        if fit.method == evaluation.RECOMMENDED and fit.valid
+        if fit.method == evaluation.RECOMMENDED_METHOD and fit.valid
     ]
     half = np.array([0.5 * np.log(fit.interval[1] / fit.interval[0]) for fit in fits])
     center = np.array([0.5 * np.log(fit.interval[1] * fit.interval[0]) for fit in fits])
@@ -179,14 +183,14 @@ def of_coefficient(
         true = known[evaluation.name_of(entry)][f"{name}_per_mm"]
         for fit in entry["fits"]:
             told = fit["valid"] and fit["coefficients_identified"]
-            if fit["method"] != evaluation.RECOMMENDED or not told:
+            if fit["method"] != evaluation.RECOMMENDED_METHOD or not told:
                 continue
             value = evaluation.number(fit[f"{name}_per_mm"])
             off.append(abs(value / true[CHANNELS.index(fit["channel"])] - 1.0))
             stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
     spread = np.array(stderr)
     return Trial(
-        COEFFICIENTS[name],
+        COEFFICIENT_LABELS[name],
         subject,
         ANY_BAND,
         np.array(off) / spread,

@@ -19,17 +19,17 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import band_of, calibrated, forget, truth_of
+from skinrig.benchmarks.intervals.trials import band_of, calibrated, delete_trial_outputs, truth_of
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.simulating.sequence import COURSE_FILE
 from skinrig.simulating.simulation import simulate_session
 
-CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
+TIME_CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
     "exercise": (15.0, 30.0, 60.0),
     "smile": (1.0, 2.0, 4.0),
 }
 """Time constants that are simulated, s, of an event and of prompts."""
-REACTIONS_S: Final = (0.1, 0.4)
+REACTION_RANGE_S: Final = (0.1, 0.4)
 """Between which mean times from a prompt to the movement a person's own is drawn, s: from that of
 one who knows the rhythm to that of one who is slow."""
 
@@ -48,11 +48,11 @@ def sequences(
     width_px
         Pixels across the camera.
     state
-        One of `CONSTANTS_S`.
+        One of `TIME_CONSTANTS_S`.
     """
     calibrated("flash", folder, {"white": "white"}, width_px=width_px)
     for seed, preset in subjects.items():
-        constant_s = CONSTANTS_S[state][seed % len(CONSTANTS_S[state])]
+        constant_s = TIME_CONSTANTS_S[state][seed % len(TIME_CONSTANTS_S[state])]
         done = simulate_session(
             "flash",
             folder / "session-subject",
@@ -84,7 +84,7 @@ def sequences(
                 band=band,
                 delay=True,
             )
-        forget(folder, done)
+        delete_trial_outputs(folder, done)
 
 
 def order_of(state: str, seed: int) -> SequenceOrder:
@@ -93,14 +93,14 @@ def order_of(state: str, seed: int) -> SequenceOrder:
     Parameters
     ----------
     state
-        One of `CONSTANTS_S`.
+        One of `TIME_CONSTANTS_S`.
     seed
         Of the subject.
     """
     order = SequenceOrder(state=state)
     if not order.prompted:
         return order
-    reaction_s = float(np.random.default_rng([seed, 16]).uniform(*REACTIONS_S))
+    reaction_s = float(np.random.default_rng([seed, 16]).uniform(*REACTION_RANGE_S))
     return dataclasses.replace(order, reaction_s=reaction_s)
 
 

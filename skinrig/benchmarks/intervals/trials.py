@@ -19,13 +19,12 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, RAYLEIGH_95, Trial
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
+from skinrig.evaluating.surface import RAYLEIGH_68
 from skinrig.simulating.orders import Simulated
 from skinrig.simulating.simulation import simulate_session
 
 ANY_BAND: Final = "any"
 """Band of quantities that do not depend on the color of the skin."""
-RAYLEIGH_68: Final = float(np.sqrt(-2.0 * np.log(1.0 - 0.6827)))
-"""Of an error with the same deviation in two directions, the length that 68.27 % stay below."""
 
 
 def band_of(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
@@ -158,7 +157,7 @@ def truth_of(done: Simulated) -> Path:
     return done.truth
 
 
-def forget(folder: Path, done: Simulated) -> None:
+def delete_trial_outputs(folder: Path, done: Simulated) -> None:
     """Take a subject's folders away: the next one's have their names."""
     for place in (done.session, folder / "maps", folder / "moving"):
         shutil.rmtree(place, ignore_errors=True)

@@ -16,15 +16,15 @@ from capture.rig import load_rig
 from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
-SEED = 5
-DECADES = 7.0
-COUNTS = (1, 2, 3, 5, 8, 12, 23)
-DRAWS = 6
+PROBE_SEED = 5
+LIGHT_DECADES = 7.0
+EXPOSURE_COUNTS = (1, 2, 3, 5, 8, 12, 23)
+N_NOISE_DRAWS = 6
 """Series of each number of exposures, of one probe with new noise."""
-WORST_PERCENT = 1.0
+MAX_RMS_ERROR_PERCENT = 1.0
 """Within five decades of the brightest."""
-ABOVE_BOUND = 1.15
-COVERAGE = (60.0, 76.0)
+MAX_RATIO_TO_BOUND = 1.15
+COVERAGE_RANGE_PERCENT = (60.0, 76.0)
 
 Frames = list[UInt16Array]
 
@@ -47,12 +47,12 @@ class _Bench:
 
 def fibre_readings(*, toy: bool) -> StageBenchmark:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
-    bench = _bench(draws=2 if toy else DRAWS)
+    bench = _bench(draws=2 if toy else N_NOISE_DRAWS)
     points = []
     away: Float64Array = np.zeros(0)
     relative: Float64Array = np.zeros(0)
     bound: Float64Array = np.ones(1)
-    for count in (1, 3, 8, 23) if toy else COUNTS:
+    for count in (1, 3, 8, 23) if toy else EXPOSURE_COUNTS:
         chosen = _spread(len(bench.times), count)
 
         def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FiberReadings:
@@ -97,13 +97,17 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
             Limit(
                 "largest RMS error within five decades, 23 exposures",
                 worst,
-                WORST_PERCENT,
+                MAX_RMS_ERROR_PERCENT,
                 "<=",
                 "%",
             ),
-            Limit("RMS error over the Cramér-Rao bound, 23 exposures", ratio, ABOVE_BOUND, "<="),
-            Limit("68 % intervals that hold", inside, COVERAGE[0], ">=", "%"),
-            Limit("68 % intervals that hold, at most", inside, COVERAGE[1], "<=", "%"),
+            Limit(
+                "RMS error over the Cramér-Rao bound, 23 exposures", ratio, MAX_RATIO_TO_BOUND, "<="
+            ),
+            Limit("68 % intervals that hold", inside, COVERAGE_RANGE_PERCENT[0], ">=", "%"),
+            Limit(
+                "68 % intervals that hold, at most", inside, COVERAGE_RANGE_PERCENT[1], "<=", "%"
+            ),
         ),
         (("steadiness of the source", "steady here; see `test_readings.py` of its calibration"),),
         interval_of="fibres and colors",
@@ -117,13 +121,15 @@ def _bench(*, draws: int) -> _Bench:
 
     rig = load_rig("probe")
     view = rig.views[0]
-    build = build_probe(rig, seed=SEED, tolerances=ProbeTolerances(crosstalk=0, wings=0, veil=0))
+    build = build_probe(
+        rig, seed=PROBE_SEED, tolerances=ProbeTolerances(crosstalk=0, wings=0, veil=0)
+    )
     sensor = sensor_of(view, dark_e_per_s=0.3, vignetting=0.1)
     noise = CameraNoise.of_view(view)
     times = np.array(exposure_series_s())
     shape = (view.height_px, view.width_px)
     # the brightest reaches half of full scale in the shortest exposure
-    light = 0.5 / times[0] * np.geomspace(1, 10.0**-DECADES, len(build.gain))[:, None]
+    light = 0.5 / times[0] * np.geomspace(1, 10.0**-LIGHT_DECADES, len(build.gain))[:, None]
     light = light * np.array([0.6, 1.0, 0.5])
     images = unit_images(build, view).astype(np.float64)
     colors = color_masks(shape, view.cfa)
@@ -152,7 +158,7 @@ def _bench(*, draws: int) -> _Bench:
             for i in range(len(names))
         ]
     )
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(PROBE_SEED)
     dark_s = [times[k] for k in (0, 16, 22) for _ in range(4)]
     nothing = np.zeros((*shape, 3), np.float32)
     darks = [expose(nothing, sensor=sensor, rng=rng, exposure_s=t) for t in dark_s]

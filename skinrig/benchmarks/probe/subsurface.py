@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from math import inf
 from typing import Any
 
@@ -16,20 +14,27 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
+from skinrig.evaluating.subsurface import MAX_MEDIAN_ERROR, MAX_WORST_ERROR
 
-RADIUS_MM = 0.3 + 0.25 * np.arange(28)
-CORE_MM = 0.2
-FIBRE_ERROR, COMMON_ERROR = 0.012, 0.01
+FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
+FIBER_CORE_MM = 0.2
+RELATIVE_FIBER_ERROR, RELATIVE_COMMON_ERROR = 0.012, 0.01
 """Relative errors of a calibration: of each fibre, and common to all."""
-FLOOR_PER_MM2 = 1e-8
+DARK_NOISE_PER_MM2 = 1e-8
 """Noise of a reading in the dark."""
-MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08
-TIMES_FASTER = 300.0
-BATCH = 30_000
-PEERS = 60
+MIN_SPEEDUP_OVER_LEAST_SQUARES = 300.0
+N_BATCH_PROFILES = 30_000
+N_PEER_FITS = 60
 """SciPy fits that are timed; their time is extrapolated to the batch."""
 
 
@@ -45,16 +50,16 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
         media.append((0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s), s))
     media += [(b.sigma_a_per_mm, b.sigma_s_prime_per_mm) for b in MELANIN_BANDS.values()]
     sigma_tr = np.array([np.sqrt(3.0 * a * (a + s)) for a, s in media])
-    profiles, errors = np.empty((2, len(media), RADIUS_MM.size))
+    profiles, errors = np.empty((2, len(media), FIBER_RADII_MM.size))
     for n, (a, s) in enumerate(media):
         g = (0.8, 0.73, 0.9)[n % 3]
         found = fibre_profile(
             LayerStack((Layer(inf, a, s / (1.0 - g), g, 1.4),)),
-            radii_mm=RADIUS_MM,
+            radii_mm=FIBER_RADII_MM,
             photons=3_000 if toy else 100_000,
             rng=np.random.default_rng(n),
-            core_mm=CORE_MM,
-            source_core_mm=CORE_MM,
+            core_mm=FIBER_CORE_MM,
+            source_core_mm=FIBER_CORE_MM,
         )
         profiles[n], errors[n] = found.reflectance_per_mm2, found.stderr
     return sigma_tr, profiles, errors
@@ -68,10 +73,10 @@ def tiers(*, toy: bool) -> StageBenchmark:
     bands: dict[str, BandError] = {}
     draws = 4 if toy else 40
     shape = (draws, *profiles.shape)
-    noisy = profiles * np.exp(COMMON_ERROR * rng.standard_normal((*shape[:2], 1)))
-    noisy *= 1.0 + FIBRE_ERROR * rng.standard_normal(shape)
-    noisy += FLOOR_PER_MM2 * rng.standard_normal(shape)
-    variance = (FIBRE_ERROR * profiles) ** 2 + errors**2 + FLOOR_PER_MM2**2
+    noisy = profiles * np.exp(RELATIVE_COMMON_ERROR * rng.standard_normal((*shape[:2], 1)))
+    noisy *= 1.0 + RELATIVE_FIBER_ERROR * rng.standard_normal(shape)
+    noisy += DARK_NOISE_PER_MM2 * rng.standard_normal(shape)
+    variance = (RELATIVE_FIBER_ERROR * profiles) ** 2 + errors**2 + DARK_NOISE_PER_MM2**2
     chosen: list[tuple[Method, slice]] = [
         ("photon_table", slice(None)),
         ("diffusion", slice(None)),
@@ -86,14 +91,14 @@ def tiers(*, toy: bool) -> StageBenchmark:
 
         def fit(method: Method = method, part: slice = part) -> subsurface.SubsurfaceFit:
             return subsurface.invert(
-                RADIUS_MM[part],
+                FIBER_RADII_MM[part],
                 noisy[..., part],
                 variance=variance[..., part],
                 method=method,
                 collection="fibre",
-                core_mm=CORE_MM,
-                source_core_mm=CORE_MM,
-                common_error=COMMON_ERROR,
+                core_mm=FIBER_CORE_MM,
+                source_core_mm=FIBER_CORE_MM,
+                common_error=RELATIVE_COMMON_ERROR,
             )
 
         timing = measure(fit, repeats=1 if toy else 3)
@@ -107,7 +112,7 @@ def tiers(*, toy: bool) -> StageBenchmark:
         error = np.abs(relative[:, spread])
         bias = np.median(relative[:, spread], axis=0)
         interval = _over_media(error)
-        radius = RADIUS_MM[part]
+        radius = FIBER_RADII_MM[part]
         knobs: dict[str, str | int | float] = {
             "model": method,
             "fibres": radius.size,
@@ -128,13 +133,13 @@ def tiers(*, toy: bool) -> StageBenchmark:
                 Limit(
                     "median error of sigma_tr, 0.3...3.0 per mm, photon table",
                     float(np.median(error)),
-                    MEDIAN_LIMIT,
+                    MAX_MEDIAN_ERROR,
                     "<=",
                 ),
                 Limit(
                     "worst of the media's median errors, photon table",
                     float(np.median(error, axis=0).max()),
-                    WORST_LIMIT,
+                    MAX_WORST_ERROR,
                     "<=",
                 ),
                 Limit("share of 68 % intervals that hold the truth, at least", share, 0.55, ">="),
@@ -161,7 +166,7 @@ def tiers(*, toy: bool) -> StageBenchmark:
         "subsurface-fit",
         "relative error of sigma_tr, median",
         "Monte Carlo profiles in fibres of homogeneous media, sigma_tr 0.3...3.0 per mm",
-        float(np.median(errors / profiles)) / np.sqrt(RADIUS_MM.size),
+        float(np.median(errors / profiles)) / np.sqrt(FIBER_RADII_MM.size),
         tuple(points),
         () if toy else tuple(limits),
         interval_of="media, drawn again with their noise",
@@ -177,23 +182,15 @@ def _over_media(error: Float64Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _spent(call: Callable[[], Any], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _least_error(
     sigma_a: Float64Array, sigma_s: Float64Array, variance: Float64Array
 ) -> Float64Array:
     """Return the Cramér-Rao bound of each profile's relative error of sigma_tr, (N,)."""
     step = 1e-4
     slopes = [
-        diffusion.reflectance(RADIUS_MM, (sigma_a * up)[:, None], (sigma_s * along)[:, None], 1.4)
+        diffusion.reflectance(
+            FIBER_RADII_MM, (sigma_a * up)[:, None], (sigma_s * along)[:, None], 1.4
+        )
         for up, along in ((1 + step, 1), (1 - step, 1), (1, 1 + step), (1, 1 - step))
     ]
     # by the logarithms of both coefficients
@@ -214,17 +211,21 @@ def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
 def batches(*, toy: bool) -> StageBenchmark:
     """Fit batches of 28 fibres by diffusion; 30,000 beside a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
-    count = 200 if toy else BATCH
+    count = 200 if toy else N_BATCH_PROFILES
     k = np.exp(rng.uniform(np.log(0.3), np.log(3.0), count))
     s = np.exp(rng.uniform(np.log(0.7), np.log(4.0), count))
     a = 0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s)
-    clean = diffusion.reflectance(RADIUS_MM, a[:, None], s[:, None], 1.4)
-    variance = (0.02 * clean) ** 2 + FLOOR_PER_MM2**2
+    clean = diffusion.reflectance(FIBER_RADII_MM, a[:, None], s[:, None], 1.4)
+    variance = (0.02 * clean) ** 2 + DARK_NOISE_PER_MM2**2
     noisy = clean + np.sqrt(variance) * rng.standard_normal(clean.shape)
 
     def ours(n: int = count, model_error: float | None = 0.0) -> subsurface.SubsurfaceFit:
         return subsurface.invert(
-            RADIUS_MM, noisy[:n], variance=variance[:n], method="diffusion", model_error=model_error
+            FIBER_RADII_MM,
+            noisy[:n],
+            variance=variance[:n],
+            method="diffusion",
+            model_error=model_error,
         )
 
     points = []
@@ -259,23 +260,24 @@ def batches(*, toy: bool) -> StageBenchmark:
 
             def residual(pair: Float64Array) -> Float64Array:
                 sigma_a, sigma_s = np.exp(pair)
-                value = diffusion.reflectance(RADIUS_MM, sigma_a, sigma_s, 1.4)
+                value = diffusion.reflectance(FIBER_RADII_MM, sigma_a, sigma_s, 1.4)
                 return np.asarray((value - noisy[n]) / deviation)
 
             return least_squares(residual, start, method="lm")
 
-        for n in range(PEERS):
+        for n in range(N_PEER_FITS):
             theirs = peer(n)
             above.append(float(found.chi2[n]) / (2.0 * theirs.cost) - 1.0)
             pair = np.array([found.sigma_a_per_mm[n], found.sigma_s_prime_per_mm[n]])
             apart.append(float(np.abs(np.log(pair) - theirs.x).max()))
-        theirs_s = _spent(lambda: [peer(n) for n in range(PEERS)], 2) * count / PEERS
-        ours_s = _spent(ours, 3)
+        theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
+        theirs_s *= count / N_PEER_FITS
+        ours_s = processor_seconds(ours, 3)
         limits = (
             Limit(
-                f"times less processor time than SciPy's loop, 30,000 fits ({PEERS} timed)",
+                f"times less processor time than SciPy's loop, 30,000 fits ({N_PEER_FITS} timed)",
                 theirs_s / ours_s,
-                TIMES_FASTER,
+                MIN_SPEEDUP_OVER_LEAST_SQUARES,
                 ">=",
             ),
             Limit("chi2 above SciPy's, relative, worst", float(max(above)), 1e-6, "<="),

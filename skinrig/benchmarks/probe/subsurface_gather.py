@@ -17,18 +17,18 @@ from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-SIDE = 512
-SECONDS = 5.0
-ERROR_PERCENT = 1.0
-TIMES_FASTER = 1000.0
-DIM = 0.01
+FULL_SIDE_PX = 512
+MAX_GATHER_S = 5.0
+MAX_EXITANCE_ERROR_PERCENT = 1.0
+MIN_SPEEDUP_OVER_DIRECT_SUM = 1000.0
+MIN_RELATIVE_EXITANCE = 0.01
 """Of the brightest exitance: what is darker is left out where errors are over the local value."""
-R_D = np.array([0.55, 0.35, 0.25])
-TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
+MEAN_R_D = np.array([0.55, 0.35, 0.25])
+MEAN_TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
 """Of a mean face, table 2 of Weyrich et al. 2005."""
-USUAL_STEP_MM = 0.8
+BAND_STEP_MM = 0.8
 """Of the sources where errors are told by skin."""
-EDGE_MM = np.linspace(-3.0, 3.0, 60)
+EDGE_POSITIONS_MM = np.linspace(-3.0, 3.0, 60)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +56,8 @@ def face(side: int) -> Scene:
         place.reshape(-1, 3),
         area.ravel(),
         lit.reshape(-1, 1) * np.array([1.0, 0.9, 0.8]),
-        R_D * (1.0 + 0.1 * np.sin(x / 5.0)).reshape(-1, 1),
-        TRANSLUCENCY_MM * (1.0 + 0.2 * np.cos(y / 20.0)).reshape(-1, 1),
+        MEAN_R_D * (1.0 + 0.1 * np.sin(x / 5.0)).reshape(-1, 1),
+        MEAN_TRANSLUCENCY_MM * (1.0 + 0.2 * np.cos(y / 20.0)).reshape(-1, 1),
     )
 
 
@@ -129,8 +129,10 @@ def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
 
 
 def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
-    media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(R_D, TRANSLUCENCY_MM, strict=True)]
-    truth = np.stack([edge_profile(EDGE_MM, medium) for medium in media], axis=-1)
+    media = [
+        Media.of(r, t, eta=ETA_SKIN) for r, t in zip(MEAN_R_D, MEAN_TRANSLUCENCY_MM, strict=True)
+    ]
+    truth = np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
     points = []
     for step in (0.8, 0.4) if toy else (1.6, 0.8, 0.4, 0.2):
         for known in (False, True):
@@ -155,16 +157,19 @@ def _bands(rng: np.random.Generator) -> dict[str, BandError]:
         sigma_tr = np.sqrt(
             3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
         )
-        skin = band.reflectance(), TRANSLUCENCY_MM / TRANSLUCENCY_MM[0] / sigma_tr
+        skin = band.reflectance(), MEAN_TRANSLUCENCY_MM / MEAN_TRANSLUCENCY_MM[0] / sigma_tr
         media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(*skin, strict=True)]
-        truth = np.stack([edge_profile(EDGE_MM, medium) for medium in media], axis=-1)
-        error, interval = _rms(_edge(USUAL_STEP_MM, True, skin=skin) - truth, rng)
+        truth = np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
+        error, interval = _rms(_edge(BAND_STEP_MM, True, skin=skin) - truth, rng)
         found[name] = BandError(error, interval)
     return found
 
 
 def _edge(
-    step_mm: float, known: bool, *, skin: tuple[Float64Array, Float64Array] = (R_D, TRANSLUCENCY_MM)
+    step_mm: float,
+    known: bool,
+    *,
+    skin: tuple[Float64Array, Float64Array] = (MEAN_R_D, MEAN_TRANSLUCENCY_MM),
 ) -> Float64Array:
     """Return the profile of a shadow's edge from sources a step apart, (X, 3).
 
@@ -175,8 +180,12 @@ def _edge(
     x, y = np.meshgrid(grid, grid)
     place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     lit = np.repeat(place[:, :1] < 0.0, 3, axis=1).astype(np.float64)
-    at = np.stack([EDGE_MM, 0.3 * EDGE_MM, np.zeros_like(EDGE_MM)], axis=-1)
-    own = np.repeat(EDGE_MM[:, None] < 0.0, 3, axis=1).astype(np.float64) if known else None
+    at = np.stack(
+        [EDGE_POSITIONS_MM, 0.3 * EDGE_POSITIONS_MM, np.zeros_like(EDGE_POSITIONS_MM)], axis=-1
+    )
+    own = (
+        np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64) if known else None
+    )
     tree = SourceTree.of(place, np.full(len(place), step_mm**2))
     found = gather(tree, lit, at, *skin, entered_at=own)
     return np.asarray(found.exitance / skin[0])
@@ -210,7 +219,7 @@ def _rms(error: Float64Array, rng: np.random.Generator) -> tuple[float, tuple[fl
 
 def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     """Gather 512 x 512 texels at as many exit points, and some of them directly."""
-    scene = face(SIDE)
+    scene = face(FULL_SIDE_PX)
     spent = []
     for _ in range(2):
         begin = time.process_time()
@@ -220,7 +229,7 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     begin = time.process_time()
     truth = _directly(scene, at)
     peer_s = (time.process_time() - begin) / len(at) * len(scene.area)
-    seen = truth > DIM * (scene.r_d * scene.entered.max())[at]
+    seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.entered.max())[at]
     relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
     even = gather(
         SourceTree.of(scene.place, scene.area),
@@ -232,16 +241,17 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     plane = _plane_level()
     return (
         Limit(
-            f"processor seconds for {SIDE} x {SIDE} texels and exit points, tree included",
+            f"processor seconds for {FULL_SIDE_PX} x {FULL_SIDE_PX} texels and exit points, "
+            "tree included",
             min(spent),
-            SECONDS,
+            MAX_GATHER_S,
             "<=",
             "s",
         ),
         Limit(
             "error over the local exitance, 95th percentile",
             float(100.0 * np.quantile(relative, 0.95)),
-            ERROR_PERCENT,
+            MAX_EXITANCE_ERROR_PERCENT,
             "<=",
             "%",
         ),
@@ -250,7 +260,7 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
             float(
                 100.0 * np.max(np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))
             ),
-            ERROR_PERCENT,
+            MAX_EXITANCE_ERROR_PERCENT,
             "<=",
             "%",
         ),
@@ -263,14 +273,14 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
         Limit(
             "largest deviation from R_d on an evenly lit plane, not normalized",
             100.0 * plane,
-            ERROR_PERCENT,
+            MAX_EXITANCE_ERROR_PERCENT,
             "<=",
             "%",
         ),
         Limit(
             "times less processor time than the direct sum in NumPy, extrapolated",
             peer_s / min(spent),
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_DIRECT_SUM,
             ">=",
         ),
     )
@@ -285,5 +295,5 @@ def _plane_level() -> float:
     tree = SourceTree.of(place, np.full(len(place), step**2))
     offset = np.linspace(0.0, step, 9)
     at = np.stack(np.meshgrid(offset, offset, [0.0]), axis=-1).reshape(-1, 3)
-    found = gather(tree, np.ones_like(place), at, R_D, TRANSLUCENCY_MM, normalize=False)
-    return float(np.max(np.abs(found.exitance / R_D - 1.0)))
+    found = gather(tree, np.ones_like(place), at, MEAN_R_D, MEAN_TRANSLUCENCY_MM, normalize=False)
+    return float(np.max(np.abs(found.exitance / MEAN_R_D - 1.0)))

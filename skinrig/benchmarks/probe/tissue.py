@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from model import color_table, metrics, spectra
 from model.tissue_optics import layers as tissue_optics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Case,
+    Limit,
+    Point,
+    StageBenchmark,
+    compare,
+    measure,
+)
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
-USUAL_SIZE = 64
+BAND_TABLE_SIZE = 64
 """Of the table that errors by band are of."""
 
 
@@ -32,38 +42,45 @@ def layered_reflectance(*, toy: bool) -> StageBenchmark:
     for g in (0.0, tissue_optics.ANISOTROPY_SKIN):
         for directions in (4, 8) if toy else (4, 8, 16, 24):
             tiers.append({"tier": "adding_doubling", "g": g, "directions": directions})
-    points = []
-    by_band: dict[str, BandError] = {}
-    for knobs in tiers:
 
-        def evaluate(knobs: dict[str, str | float] = knobs) -> Float64Array:
-            if knobs["tier"] == "diffusion":
-                return tissue_optics.two_layer_reflectance(
-                    truth.wavelength_nm, c_m, c_hd, tier="diffusion"
-                )
+    def evaluate(knobs: dict[str, str | float]) -> Float64Array:
+        if knobs["tier"] == "diffusion":
             return tissue_optics.two_layer_reflectance(
-                truth.wavelength_nm,
-                c_m,
-                c_hd,
-                anisotropy=float(knobs["g"]),
-                directions=int(knobs["directions"]),
+                truth.wavelength_nm, c_m, c_hd, tier="diffusion"
             )
+        return tissue_optics.two_layer_reflectance(
+            truth.wavelength_nm,
+            c_m,
+            c_hd,
+            anisotropy=float(knobs["g"]),
+            directions=int(knobs["directions"]),
+        )
 
-        timing = measure(evaluate, repeats=1 if toy else 3)
-        relative = 100 * np.abs(evaluate() / reference - 1)
-        median, interval = metrics.median_with_interval(relative, rng=rng)
-        points.append(Point(knobs, timing, median, interval))
-        by_band = {
-            band: median_error(relative[melanin_band(c_m) == band]) for band in MELANIN_BANDS
-        }
-    return StageBenchmark(
-        "layered-reflectance",
-        "median error of R, %",
-        "Monte Carlo transport with the full phase function",
-        float(reference_error),
-        tuple(points),
+    def relative(found: Float64Array) -> Float64Array:
+        return np.asarray(100 * np.abs(found / reference - 1))
+
+    def by_band() -> dict[str, BandError]:
+        off, bands = relative(evaluate(tiers[-1])), melanin_band(c_m)
+        return {band: median_error(off[bands == band]) for band in MELANIN_BANDS}
+
+    return compare(
+        StageBenchmark(
+            "layered-reflectance",
+            "median error of R, %",
+            "Monte Carlo transport with the full phase function",
+            float(reference_error),
+            interval_of="chromophores and wavelengths",
+        ),
+        [
+            Case(
+                knobs,
+                partial(evaluate, knobs),
+                lambda found: BandError(*metrics.median_with_interval(relative(found), rng=rng)),
+            )
+            for knobs in tiers
+        ],
+        repeats=1 if toy else 3,
         by_band=by_band,
-        interval_of="chromophores and wavelengths",
     )
 
 
@@ -96,7 +113,7 @@ def table(*, toy: bool) -> StageBenchmark:
             points.append(
                 Point({"size": size, "between nodes": between}, timing, worst, _largest(difference))
             )
-            if (size, between) == (USUAL_SIZE, "spline"):
+            if (size, between) == (BAND_TABLE_SIZE, "spline"):
                 by_band = {
                     band: BandError(float(some.max()), _largest(some))
                     for band in MELANIN_BANDS

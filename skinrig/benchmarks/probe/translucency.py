@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -19,23 +17,30 @@ from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Way = Literal["sigma_tr", "profiles"]
 
-RADIUS_MM = 0.3 + 0.25 * np.arange(28)
+FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 Medium = tuple[float, float]
 """sigma_a and sigma_s', 1/mm."""
 
-MEDIUM: Medium = (0.04, 1.5)
+MEDIUM_PER_MM: Medium = (0.04, 1.5)
 ETA = 1.4
-RATIO, AXIS_RAD = 1.1, 0.6
+TRUE_RATIO, TRUE_AXIS_RAD = 1.1, 0.6
 """Greatest over least 1/sigma_tr."""
-COUPLING, FIBRE, DARK = 0.02, 0.01, 1e-7
+COUPLING_ERROR, SINGLE_FIBER_ERROR, DARK_NOISE = 0.02, 0.01, 1e-7
 """Relative deviations of a head set down anew and of each of its fibres; noise, 1/mm^2."""
 FALSE_ALARM_RATE = 0.01
-SURE = 1e-6
+LIMIT_FALSE_ALARM_PROBABILITY = 1e-6
 """Chance that a count exceeds its limit though all is well."""
 SITE_ERROR = 0.03
 """Relative standard error of sigma_tr at a site."""
@@ -50,60 +55,60 @@ def _profiles(
     ratio: float,
     cases: int,
     *,
-    medium: Medium = MEDIUM,
+    medium: Medium = MEDIUM_PER_MM,
     rng: np.random.Generator,
 ) -> Float64Array:
     """Return readings (N, cases, F) of tissue that scatters less along an axis, heads set down."""
-    sigma_tr = np.hypot(np.cos(angle - AXIS_RAD) / ratio, np.sin(angle - AXIS_RAD))
+    sigma_tr = np.hypot(np.cos(angle - TRUE_AXIS_RAD) / ratio, np.sin(angle - TRUE_AXIS_RAD))
     # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the middle of its extremes
     sigma_a, sigma_s_prime = medium
     total = (sigma_a + sigma_s_prime) * ratio * sigma_tr**2
-    truth = photon_table.reflectance(RADIUS_MM, sigma_a, (total - sigma_a)[:, None], eta=ETA)
-    shape = (angle.size, cases, RADIUS_MM.size)
-    seen = truth[:, None] * np.exp(COUPLING * rng.standard_normal((*shape[:2], 1)))
-    seen = seen * (1.0 + FIBRE * rng.standard_normal(shape))
-    return np.asarray(seen + DARK * rng.standard_normal(shape))
+    truth = photon_table.reflectance(FIBER_RADII_MM, sigma_a, (total - sigma_a)[:, None], eta=ETA)
+    shape = (angle.size, cases, FIBER_RADII_MM.size)
+    seen = truth[:, None] * np.exp(COUPLING_ERROR * rng.standard_normal((*shape[:2], 1)))
+    seen = seen * (1.0 + SINGLE_FIBER_ERROR * rng.standard_normal(shape))
+    return np.asarray(seen + DARK_NOISE * rng.standard_normal(shape))
 
 
 def _told(
-    way: Way, angle: Float64Array, profiles: Float64Array, *, medium: Medium = MEDIUM
+    way: Way, angle: Float64Array, profiles: Float64Array, *, medium: Medium = MEDIUM_PER_MM
 ) -> anisotropy.Anisotropy:
-    variance = np.full(profiles.shape, DARK**2)
+    variance = np.full(profiles.shape, DARK_NOISE**2)
     if way == "profiles":
         return profile_anisotropy.estimate_from_profiles(
             angle,
-            RADIUS_MM,
+            FIBER_RADII_MM,
             profiles,
             variance,
             sigma_a_per_mm=medium[0],
             sigma_s_prime_per_mm=medium[1],
             eta=ETA,
-            floor=FIBRE,
+            floor=SINGLE_FIBER_ERROR,
         )
     fits = subsurface.invert(
-        RADIUS_MM,
+        FIBER_RADII_MM,
         profiles,
         eta=ETA,
-        variance=variance + (FIBRE * profiles) ** 2,
-        common_error=COUPLING,
+        variance=variance + (SINGLE_FIBER_ERROR * profiles) ** 2,
+        common_error=COUPLING_ERROR,
         g_error=0.0,
         model_error=0.0,
     )
     return anisotropy.estimate(angle, fits.sigma_tr_per_mm, fits.sigma_tr_stderr, valid=fits.valid)
 
 
-def _bound(count: int, medium: Medium = MEDIUM) -> float:
+def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
     """Return the least standard deviation of the log ratio, absorption known, coupling not."""
     sigma_a, sigma_s_prime = medium
-    here = photon_table.derivatives(RADIUS_MM, sigma_a, sigma_s_prime, eta=ETA)
+    here = photon_table.derivatives(FIBER_RADII_MM, sigma_a, sigma_s_prime, eta=ETA)
     light = here.reflectance_per_mm2
     by_log = here.by_sigma_s_prime * sigma_s_prime
     # deviations known, as those of readings with weights: coupling is free beside its prior
-    weight = 1.0 / ((FIBRE * light) ** 2 + DARK**2)
+    weight = 1.0 / ((SINGLE_FIBER_ERROR * light) ** 2 + DARK_NOISE**2)
     across = (weight * light * by_log).sum()
     fisher = np.array(
         [
-            [(weight * light * light).sum() + COUPLING**-2.0, across],
+            [(weight * light * light).sum() + COUPLING_ERROR**-2.0, across],
             [across, (weight * by_log * by_log).sum()],
         ]
     )
@@ -122,7 +127,7 @@ def directions(*, toy: bool) -> StageBenchmark:
     ways: tuple[Way, ...] = ("sigma_tr", "profiles")
     for count in (5, 16) if toy else (5, 8, 16, 32, 64):
         angle = _directions(count)
-        profiles = _profiles(angle, RATIO, cases, rng=rng)
+        profiles = _profiles(angle, TRUE_RATIO, cases, rng=rng)
         one = profiles[:, :3]  # three channels of one measurement
         for way in ways:
             timing = measure(
@@ -131,7 +136,7 @@ def directions(*, toy: bool) -> StageBenchmark:
                 memory=False,
             )
             h = np.log(_told(way, angle, profiles).ratio)
-            error = float(np.sqrt(((h - math.log(RATIO)) ** 2).mean()))
+            error = float(np.sqrt(((h - math.log(TRUE_RATIO)) ** 2).mean()))
             errors[way, count] = error
             spread = error / math.sqrt(2.0 * (cases - 1))
             points.append(
@@ -151,9 +156,9 @@ def directions(*, toy: bool) -> StageBenchmark:
     return StageBenchmark(
         "anisotropy",
         "error of the log of the ratio",
-        f"profiles of tissue whose sigma_tr is an ellipse of ratio {RATIO}, coupling off by "
-        f"{100 * COUPLING:g} % and fibres by {100 * FIBRE:g} %; truth and both ways by one "
-        "table, so that errors are those of noise alone",
+        f"profiles of tissue whose sigma_tr is an ellipse of ratio {TRUE_RATIO}, coupling off by "
+        f"{100 * COUPLING_ERROR:g} % and fibres by {100 * SINGLE_FIBER_ERROR:g} %; truth and both "
+        "ways by one table, so that errors are those of noise alone",
         0.0,
         tuple(points),
         limits,
@@ -165,9 +170,9 @@ def directions(*, toy: bool) -> StageBenchmark:
 def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator) -> BandError:
     """Return the error of comparing profiles of skin that absorbs like this."""
     angle = _directions(count)
-    profiles = _profiles(angle, RATIO, cases, medium=medium, rng=rng)
+    profiles = _profiles(angle, TRUE_RATIO, cases, medium=medium, rng=rng)
     h = np.log(_told("profiles", angle, profiles, medium=medium).ratio)
-    error = float(np.sqrt(((h - math.log(RATIO)) ** 2).mean()))
+    error = float(np.sqrt(((h - math.log(TRUE_RATIO)) ** 2).mean()))
     spread = error / math.sqrt(2.0 * (cases - 1))
     return BandError(error, (error - spread, error + spread), _bound(count, medium))
 
@@ -180,7 +185,7 @@ def _direction_limits(
     null = _profiles(angle, 1.0, cases, rng=rng)
     limits = []
     # an outlier left out by mistake may add its own rate
-    most = float(stats.binom.isf(SURE, cases, FALSE_ALARM_RATE + 0.001))
+    most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
     ways: tuple[Way, ...] = ("sigma_tr", "profiles")
     for way in ways:
         alarms = float((_told(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
@@ -300,16 +305,6 @@ def sites(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _spent(call: Callable[[], object], repeats: int) -> float:
-    """Return the least processor time of some calls, s."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
-
-
 def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
     """Return how many times faster than its Gaussian process, and the largest difference."""
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -339,4 +334,4 @@ def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[fl
         float(np.abs(found.log_stderr.reshape(-1) - deviation).max()),
     )
     with threadpool_limits(1, "blas"):
-        return _spent(theirs, 2) / max(_spent(ours, 5), 1e-6), mismatch
+        return processor_seconds(theirs, 2) / max(processor_seconds(ours, 5), 1e-6), mismatch

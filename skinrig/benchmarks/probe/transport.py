@@ -11,20 +11,29 @@ from numba import njit
 
 from capture.rig import load_rig
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    BandError,
+    Limit,
+    Point,
+    StageBenchmark,
+    measure,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-RED = (0.04, 1.5)  # sigma_a and sigma_s' in 1/mm, issue of the fibre probe and rigs.md section 4
-G = 0.8
+RED_MEDIUM_PER_MM = (
+    0.04,
+    1.5,
+)  # sigma_a and sigma_s' in 1/mm, issue of the fibre probe and rigs.md section 4
+MEDIUM_G = 0.8
 ETA = 1.4
 SPEED_MEDIUM = (0.05, 10.0, 0.9, 1.4)  # sigma_a, sigma_s (1/mm), g, eta
 MCML_R_D = 0.3592  # MCML's diffuse reflectance of that medium, specular left out
-CORES = 2
-SECONDS_TO_ONE_PERCENT = 30.0
-TIMES_CHEAPER = 1000.0
-TIMES_FASTER = 4.0
+MAX_S_TO_ONE_PERCENT = 30.0
+MIN_SPEEDUP_OVER_VOLPATH = 1000.0
+MIN_SPEEDUP_OVER_WALK = 4.0
 PEER_SAMPLES = 4096
-PEER_RUNS = 20
+N_PEER_RUNS = 20
 
 
 @njit(cache=True, nogil=True)
@@ -99,13 +108,19 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
     if probe is None:
         raise ValueError("rig: the probe's rig has no probe")
     radii = np.array(probe.radius_mm)
-    stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, ETA),))
+    stack = LayerStack(
+        (Layer(inf, RED_MEDIUM_PER_MM[0], RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G), MEDIUM_G, ETA),)
+    )
     points = []
     for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
 
         def next_event(photons: int = photons) -> Any:
             return fibre_profile(
-                stack, radii_mm=radii, photons=photons, rng=np.random.default_rng(1), threads=CORES
+                stack,
+                radii_mm=radii,
+                photons=photons,
+                rng=np.random.default_rng(1),
+                threads=LIMIT_CORES,
             )
 
         timing = measure(next_event, repeats=1, memory=None)
@@ -165,13 +180,15 @@ def _bands(radii: Float64Array, *, photons: int) -> dict[str, BandError]:
 
     found = {}
     for name, band in MELANIN_BANDS.items():
-        layer = Layer(inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - G), G, ETA)
+        layer = Layer(
+            inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - MEDIUM_G), MEDIUM_G, ETA
+        )
         run = fibre_profile(
             LayerStack((layer,)),
             radii_mm=radii,
             photons=photons,
             rng=np.random.default_rng(1),
-            threads=CORES,
+            threads=LIMIT_CORES,
         )
         point = _point({}, None, 100.0 * run.stderr / run.reflectance_per_mm2)
         found[name] = BandError(point.error, point.error_interval)
@@ -191,7 +208,15 @@ def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
     for batch, row in enumerate(rings):
         counted = np.zeros(edges.size - 1)
         plain_walk(
-            RED[0], RED[1] / (1.0 - G), G, ETA, photons // 20, batch, 0.22, edges**2, counted
+            RED_MEDIUM_PER_MM[0],
+            RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G),
+            MEDIUM_G,
+            ETA,
+            photons // 20,
+            batch,
+            0.22,
+            edges**2,
+            counted,
         )
         row[: counted.size] = counted
     seen = rings[:, 0 : 2 * len(radii) : 2]
@@ -222,8 +247,8 @@ def _one_percent(radii: Float64Array, stack: Any) -> tuple[Limit, ...]:
     return (
         Limit(
             "processor seconds on each of 2 cores to 1 % at every fibre, red",
-            seconds * worst**2 / CORES,
-            SECONDS_TO_ONE_PERCENT,
+            seconds * worst**2 / LIMIT_CORES,
+            MAX_S_TO_ONE_PERCENT,
             "<=",
             "s",
         ),
@@ -244,15 +269,17 @@ def _against_volpath(radii: Float64Array) -> tuple[Limit, ...]:
     peer_s, runs = _spent(
         lambda: [
             radiance(scene, kind="mono", samples=PEER_SAMPLES, seed=seed)[0, :, 0]
-            for seed in range(PEER_RUNS)
+            for seed in range(N_PEER_RUNS)
         ]
     )
     seen = np.array(runs, np.float64)
-    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(PEER_RUNS)
+    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(N_PEER_RUNS)
     # Where light came in one run or none the error is not known: it is taken as that of one run,
     # 100 %, which flatters the peer.
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
-    stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, 1.0),))
+    stack = LayerStack(
+        (Layer(inf, RED_MEDIUM_PER_MM[0], RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G), MEDIUM_G, 1.0),)
+    )
     ours_s, run = _spent(
         lambda: fibre_profile(
             stack,
@@ -270,7 +297,7 @@ def _against_volpath(radii: Float64Array) -> tuple[Limit, ...]:
         Limit(
             "times less processor time to 1 % than volpath, n = 1, by 1/sqrt(samples)",
             peers / ours,
-            TIMES_CHEAPER,
+            MIN_SPEEDUP_OVER_VOLPATH,
             ">=",
         ),
     )
@@ -285,8 +312,8 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
 
     pitch = float(radii[1] - radii[0])
     middle, half = float(radii.mean()), 0.5 * pitch * len(radii)
-    sigma_s = RED[1] / (1.0 - G)
-    sigma_t = RED[0] + sigma_s
+    sigma_s = RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G)
+    sigma_t = RED_MEDIUM_PER_MM[0] + sigma_s
 
     def placed(x: float, y: float, z: float, at: float) -> Float64Array:
         matrix = np.diag([x, y, z, 1.0])
@@ -319,7 +346,7 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
                 "type": "homogeneous",
                 "sigma_t": {"type": "spectrum", "value": sigma_t},
                 "albedo": {"type": "spectrum", "value": sigma_s / sigma_t},
-                "phase": {"type": "hg", "g": G},
+                "phase": {"type": "hg", "g": MEDIUM_G},
             },
         },
         "light": {
@@ -356,13 +383,13 @@ def _rates(medium: Any) -> tuple[Limit, ...]:
         Limit(
             "times the photons a processor second of a plain numba walk, Dr.Jit",
             rate / (40_000 / plain_s),
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_WALK,
             ">=",
         ),
         Limit(
             "the same beside the simulator's own scalar walk",
             rate / (40_000 / scalar_s),
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_WALK,
             ">=",
         ),
         Limit(

@@ -14,8 +14,8 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 if TYPE_CHECKING:
     from rigsim.scenes.dome.reference import Way
 
-PATH_SPEED_UP = 10.0
-DIRECT_SPEED_UP = 5.0
+MIN_SPEEDUP_OVER_PATH = 10.0
+MIN_SPEEDUP_OVER_DIRECT = 5.0
 
 
 def render(*, toy: bool) -> StageBenchmark:
@@ -61,13 +61,13 @@ def render(*, toy: bool) -> StageBenchmark:
         Limit(
             "times faster than Mitsuba's path tracer, no noisier",
             found.speed_up(found.path),
-            PATH_SPEED_UP,
+            MIN_SPEEDUP_OVER_PATH,
             ">=",
         ),
         Limit(
             "times faster than Mitsuba's direct integrator, no noisier",
             found.speed_up(found.direct),
-            DIRECT_SPEED_UP,
+            MIN_SPEEDUP_OVER_DIRECT,
             ">=",
         ),
     )

@@ -10,8 +10,8 @@ import numpy as np
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 
-TIMES_FASTER = 25.0
-LIT_CONDITIONS = 14
+MIN_SPEEDUP_OVER_MITSUBA = 25.0
+N_LIT_CONDITIONS = 14
 """Of the 16 conditions two are dark; Mitsuba is not asked to render those."""
 
 
@@ -77,7 +77,7 @@ def render(*, toy: bool) -> StageBenchmark:
             wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
             ways.append(judge(image.reshape(-1)[pixels].astype(np.float64), wanted, seconds))
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
-        seconds = LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
+        seconds = N_LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
         theirs[samples] = (seconds, error, ways)
         add({"way": "Mitsuba", "samples": samples}, seconds, error, rise.mb)
     best = ours[2, 32, 65]
@@ -87,10 +87,10 @@ def render(*, toy: bool) -> StageBenchmark:
     off = max(abs(way.mean_ratio - 1.0) / way.mean_ratio_stderr for way in ways)
     limits = (
         Limit(
-            f"times less processor time than {LIT_CONDITIONS} Mitsuba renders at equal error, "
+            f"times less processor time than {N_LIT_CONDITIONS} Mitsuba renders at equal error, "
             f"extrapolated from {samples} samples by 1 over their root",
             at_equal_error / best.seconds,
-            TIMES_FASTER,
+            MIN_SPEEDUP_OVER_MITSUBA,
             ">=",
         ),
         Limit("error, 2 samples a pixel's side, of the mean", 100.0 * best.error, 1.0, "<=", "%"),

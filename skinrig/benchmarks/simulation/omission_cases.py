@@ -13,12 +13,12 @@ import numpy as np
 
 from skinrig.arrays import Float32Array, Float64Array
 
-ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
+FLOAT32_ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a picture in single precision, after a few sums."""
 
 FACE_TEXELS: Final = 256
 
-REPEATS: Final = 3
+N_TIMED_PICTURES: Final = 3
 """Pictures of which the quickest is timed."""
 
 
@@ -88,13 +88,13 @@ def compare(
             continue
         on, off = switched[effect.switch]
         # only of what is left out the seconds are a claim
-        times = REPEATS if effect.verdict == "negligible" else 1
+        times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
         have, with_s = _timed(render, {effect.switch: on}, times)
         lack, without_s = _timed(render, {effect.switch: off}, times)
         sigma = noise.sigma(have.light)
         change = np.abs(_shown(have) - _shown(lack)) / sigma
         place = np.unravel_index(int(np.argmax(change)), change.shape)
-        rounded = ROUNDING * float(np.max(have.light / sigma))
+        rounded = FLOAT32_ROUNDING * float(np.max(have.light / sigma))
         error = rounded
         if have.stderr is not None and lack.stderr is not None:
             both = np.hypot(have.stderr, lack.stderr) / sigma
@@ -319,7 +319,7 @@ def changed(
     """Compare two pictures that one effect tells apart."""
     sigma = noise.sigma(have.light)
     change = float((np.abs(have.light.astype(np.float64) - lack.light) / sigma).max())
-    rounded = ROUNDING * float(np.max(have.light / sigma))
+    rounded = FLOAT32_ROUNDING * float(np.max(have.light / sigma))
     return Omission(
         rig, subject, effect.name, effect.verdict, effect.over_noise, change, rounded, *seconds
     )
@@ -402,7 +402,7 @@ def flat_targets() -> Iterator[Omission]:
                 effect.verdict,
                 effect.over_noise,
                 noise.share(lost),
-                noise.share(ROUNDING),
+                noise.share(FLOAT32_ROUNDING),
                 spent,
                 told_s,
             )

@@ -9,18 +9,18 @@ from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
 
-BOUND = 0.1
+MAX_OMITTED_NOISE_RATIO = 0.1
 """Of a pixel's noise: what may be left out. Not `rigsim.needs.effects.NEGLIGIBLE_NOISE_RATIO`
 itself, so that a rule that was loosened shows here."""
 
-NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
+WHY_NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
 GRAZED_PX = 96
 GRAZING_DEG = 88.0
 """A plate that faces the camera gets 1/29 of what faces the light."""
 DOME_PX = 100
 GRADIENT_PX = 128
-DOME_LIGHTS = 3
+N_DOME_LIGHTS = 3
 
 
 def omissions(*, toy: bool) -> StageBenchmark:
@@ -34,7 +34,7 @@ def omissions(*, toy: bool) -> StageBenchmark:
     points, limits = [], []
     for one in found:
         spent = one.without_s
-        timing = Timing(spent, (spent, spent), spent, None, no_memory=NO_MEMORY)
+        timing = Timing(spent, (spent, spent), spent, None, no_memory=WHY_NO_MEMORY)
         knobs: dict[str, str | int | float | bool] = {
             "rig": one.rig,
             "subject": one.subject,
@@ -51,7 +51,7 @@ def omissions(*, toy: bool) -> StageBenchmark:
                 Limit(
                     f"{one.rig}, {one.subject}: {one.effect}: change with 3 standard errors",
                     one.at_most,
-                    BOUND,
+                    MAX_OMITTED_NOISE_RATIO,
                     "<=",
                     "of the noise",
                 )
@@ -103,6 +103,6 @@ def _cases(toy: bool) -> Iterator[Omission]:
         yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
     yield from omission_cases.flash_face("darkest", width_px=GRAZED_PX, light_deg=GRAZING_DEG)
     for preset in ("II", "darkest"):
-        yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=DOME_LIGHTS)
-    yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=DOME_LIGHTS)
+        yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=N_DOME_LIGHTS)
+    yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=N_DOME_LIGHTS)
     yield from omission_cases.gradient_skin("forehead", width_px=GRADIENT_PX)

@@ -10,13 +10,13 @@ import numpy as np
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure_and_keep
 
-STATES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
+CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
-PATCH_STATES_S = 15.0
+MAX_PATCH_STATES_S = 15.0
 """Processor seconds allowed for eight states of a patch for 384 px of 6 um."""
-FIELD_STATE_S = 60.0
+MAX_FIELD_STATE_S = 60.0
 """Processor seconds allowed for one state of the camera's whole field."""
 
 
@@ -52,22 +52,16 @@ def stretched(*, toy: bool) -> StageBenchmark:
                     deform(s, stretch=stretch, angle_deg=90.0, tolerance=tolerance) for s in skins
                 ]
 
-            timing = measure(run, repeats=1, memory=not toy)
-            states = run()
+            timing, states = measure_and_keep(run, repeats=1, memory=not toy)
             errors = np.array(
                 [abs(_variance(s, half) / t - 1.0) for s, t in zip(states, truth, strict=True)]
             )
             spread = float(errors.std(ddof=1) / np.sqrt(errors.size))
             error = float(errors.mean())
             evaluations = np.mean([s.convergence.evaluations for s in states])
-            points.append(
-                Point(
-                    {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)},
-                    timing,
-                    100.0 * error,
-                    (100.0 * (error - spread), 100.0 * (error + spread)),
-                )
-            )
+            knobs = {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)}
+            interval = (100.0 * (error - spread), 100.0 * (error + spread))
+            points.append(Point(knobs, timing, 100.0 * error, interval))
     return StageBenchmark(
         "skin-stretch",
         "error of the slopes' variance along the jaws, %",
@@ -86,14 +80,14 @@ def _limits() -> tuple[Limit, ...]:
     for site in SITE_NAMES:
         skin = make_micro_skin(site, seed=1, size_mm=2.8)
         begin = time.process_time()
-        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in STATES}
+        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
         spent = time.process_time() - begin
-        variance = np.array([_variance(states[r], 1.2) for r in STATES])
+        variance = np.array([_variance(states[r], 1.2) for r in CALIPER_STRETCHES])
         limits.append(
             Limit(
                 f"processor seconds for 8 states of 2.8 mm, {site}",
                 spent,
-                PATCH_STATES_S,
+                MAX_PATCH_STATES_S,
                 "<=",
                 "s",
             )
@@ -101,7 +95,10 @@ def _limits() -> tuple[Limit, ...]:
         flatter = float((np.diff(variance) < 0.0).sum())
         limits.append(
             Limit(
-                f"steps of r along which slopes flatten, {site}", flatter, len(STATES) - 1.0, ">="
+                f"steps of r along which slopes flatten, {site}",
+                flatter,
+                len(CALIPER_STRETCHES) - 1.0,
+                ">=",
             )
         )
         strain = max(abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
@@ -115,7 +112,7 @@ def _limits() -> tuple[Limit, ...]:
         Limit(
             "processor seconds for one state of 12.3 mm",
             time.process_time() - begin,
-            FIELD_STATE_S,
+            MAX_FIELD_STATE_S,
             "<=",
             "s",
         )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
-from skinrig.evaluating.flash import BANDS
+from skinrig.evaluating.flash import MELANIN_RANGES
 from skinrig.reporting import consents, map_images, page
 from skinrig.reporting.comparison import checks as check_comparison
 from skinrig.reporting.comparison import conditions, truth_errors
@@ -258,7 +258,7 @@ def _by_band(pair: Pair) -> Iterator[page.Block]:
     for one in pair.differences:
         if one.sigmas is None or one.difference.shape != level.shape:
             continue
-        for low, high in BANDS:
+        for low, high in MELANIN_RANGES:
             inside = (level >= low) & (level < high) & ~np.isnan(one.difference)
             inside &= ~np.isnan(one.sigmas)
             if np.count_nonzero(inside) < 20:

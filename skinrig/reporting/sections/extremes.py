@@ -9,7 +9,7 @@ from typing import Any
 
 from skinrig.benchmarks.table import write_whole
 from skinrig.console import Console, plain
-from skinrig.extremes.cases import PRECISIONS, SCHEMA, run_cases, to_document
+from skinrig.extremes.cases import INPUT_PRECISIONS, SCHEMA, run_cases, to_document
 from skinrig.reporting import page
 
 __all__ = ["SCHEMA", "run_extremes", "section"]
@@ -44,7 +44,7 @@ def run_extremes(
             f"{'held' if case['passed'] else 'FAILED'}: {case['stage']}: {case['name']} "
             f"({case['extreme']}); expected: {case['expected']}"
         )
-        for name in PRECISIONS:
+        for name in INPUT_PRECISIONS:
             if not case["passed"] or name == "float64":
                 console.say(f"    {name}: {case[name]['got']}")
     failed = sum(not case["passed"] for case in document["cases"])
@@ -69,14 +69,14 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
             case["expected"],
             *(
                 ("" if case[name]["passed"] else "FAILED: ") + case[name]["got"]
-                for name in PRECISIONS
+                for name in INPUT_PRECISIONS
             ),
         )
         for case in cases
     ]
     yield page.Heading("Stiff and extreme cases", level=2)
     yield page.table(
-        ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS),
+        ("stage", "case", "extreme", "why it can break", "expected", *INPUT_PRECISIONS),
         rows,
         caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",
     )

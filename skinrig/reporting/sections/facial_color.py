@@ -12,7 +12,7 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.applying.expression import colors, hemoglobin_rig
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
-from skinrig.evaluating.flash import BANDS
+from skinrig.evaluating.flash import MELANIN_RANGES
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import melanin_band
@@ -173,14 +173,14 @@ def _errors(
 ) -> Iterator[page.Block]:
     if not states:
         return
-    by_rig = [row for row in states if row.way == evaluation.WAYS[1]]
+    by_rig = [row for row in states if row.way == evaluation.METHODS[1]]
     for row in by_rig:
         worst = _worst(row.state, banded)
         checks.append(
             page.Check(
                 f"{name}: blood of {row.state} by the rig, median error",
                 100 * row.median_relative,
-                100 * evaluation.LEVEL_LIMIT,
+                100 * evaluation.MAX_LEVEL_ERROR,
                 "<=",
                 "%",
                 coverage=row.coverage,
@@ -234,7 +234,7 @@ def _errors(
             )
             for label in labels
         ]
-        for way in evaluation.WAYS
+        for way in evaluation.METHODS
     }
     yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
 
@@ -270,7 +270,7 @@ def errors_by_band(
         good = blend.valid & (true.values > 0)
         if true.valid is not None:
             good = good & true.valid
-        for low, high in BANDS:
+        for low, high in MELANIN_RANGES:
             inside = good & (melanin.values >= low) & (melanin.values < high)
             if np.count_nonzero(inside) < MIN_BAND_PIXELS:
                 continue

@@ -39,7 +39,7 @@ def section(
             page.Check(
                 f"{name}: histogram distance after the kernel over that before, worst state",
                 worst["distance"] / worst["distance_before"],
-                evaluation.DISTANCE_LIMIT,
+                evaluation.MAX_HISTOGRAM_DISTANCE,
                 "<=",
                 "",
                 worst=state_words(worst["name"]),

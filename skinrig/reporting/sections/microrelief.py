@@ -167,7 +167,7 @@ def _relief_errors(
             page.Check(
                 f"{name}: specular normals at the lens's resolution, mean error",
                 row.mean_deg,
-                evaluation.NORMAL_LIMIT_DEG,
+                evaluation.MAX_NORMAL_ERROR_DEG,
                 "<=",
                 "°",
                 state_words(row.state),
@@ -181,7 +181,7 @@ def _relief_errors(
     yield page.note(
         "Errors are told at the lens's resolution; the unblurred truth has detail "
         "that this aperture does not show. Heights have the lens's blur undone and are told "
-        f"against the unblurred relief: {100 * evaluation.HEIGHT_LIMIT:g} % is kept on smooth "
+        f"against the unblurred relief: {100 * evaluation.MAX_HEIGHT_ERROR:g} % is kept on smooth "
         "relief; on skin, steep walls of furrows hide light from themselves, which is not "
         "corrected, and standard errors, which know noise alone, are then too small."
     )
@@ -232,7 +232,7 @@ def _strain(
             page.Check(
                 f"{name}: stretch of the skin, largest error",
                 abs(worst.error),
-                evaluation.STRAIN_LIMIT,
+                evaluation.MAX_STRAIN_ERROR,
                 "<=",
                 "",
                 worst=state_words(worst.state),

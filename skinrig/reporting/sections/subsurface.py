@@ -85,7 +85,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
                 )
             )
             for fit in [] if found is None else found["fits"]:
-                if fit["channel"] != channel or fit["method"] != evaluation.RECOMMENDED:
+                if fit["channel"] != channel or fit["method"] != evaluation.RECOMMENDED_METHOD:
                     continue
                 predicted = numbers(fit["predicted_per_mm2"])
                 series.append(
@@ -118,7 +118,7 @@ def _residuals(
     channel = "green"
     one = entry["channels"][channel]
     value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
-    told = np.asarray(one["valid"], bool) & (value > evaluation.SIGNAL_TO_NOISE * stderr)
+    told = np.asarray(one["valid"], bool) & (value > evaluation.MIN_SIGNAL_TO_NOISE * stderr)
     series = []
     for fit in [] if found is None else found["fits"]:
         if fit["channel"] == channel and fit["valid"]:
@@ -218,11 +218,11 @@ def _errors(
             caption=f"By method, {kind} tissue",
         )
         yield from _by_channel([row for row in rows if row.kind == kind])
-        best = next((row for row in found if row.method == evaluation.RECOMMENDED), None)
+        best = next((row for row in found if row.method == evaluation.RECOMMENDED_METHOD), None)
         if kind == "homogeneous" and best is not None:
             for word, got, bound in (
-                ("median", best.median, evaluation.MEDIAN_LIMIT),
-                ("worst", best.worst, evaluation.WORST_LIMIT),
+                ("median", best.median, evaluation.MAX_MEDIAN_ERROR),
+                ("worst", best.worst, evaluation.MAX_WORST_ERROR),
             ):
                 checks.append(
                     page.Check(f"{name}: sigma_tr, {word} error", 100 * got, 100 * bound, "<=", "%")

@@ -202,7 +202,7 @@ def _errors(
     banded = errors_by_band(appearance, truth)
     registration = appearance.parameters.get("registration")
     pixel_mm = registration.get("pixel_mm", 0.0) if isinstance(registration, dict) else 0.0
-    coarse = float(pixel_mm) > evaluation.JUDGED_PIXEL_MM
+    coarse = float(pixel_mm) > evaluation.MAX_EVALUATED_PIXEL_MM
     for row in found:
         if row.name == "half_vector_normals":
             continue  # the published baseline, shown beside ours and held to nothing
@@ -228,8 +228,8 @@ def _errors(
     if coarse:
         yield page.note(
             f"A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
-            f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
-            f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
+            f"limit of {evaluation.MAX_NORMAL_ERROR_DEG:g}° is promised for "
+            f"{evaluation.MAX_EVALUATED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
         )
     yield page.records(
         found,
@@ -276,7 +276,7 @@ def _reflection(
         page.Check(
             f"{name}: reflection in held-out directions, median error",
             100 * held_out.median,
-            100 * reflection.HELD_OUT_LIMIT,
+            100 * reflection.MAX_HELD_OUT_ERROR,
             "<=",
             "%",
             f"{held_out.points} points × {held_out.directions} directions",

@@ -7,7 +7,7 @@ from model import dipole
 from reconstruction.diffuse_albedo.estimation import estimate, reduced_albedo
 from skinrig.benchmarks.dome import brdf_truth
 
-SKINS = {"light": brdf_truth.LIGHT_SKIN, "dark": brdf_truth.DARK_SKIN}
+SKINS = {"light": brdf_truth.LIGHT_SKIN_ALBEDO, "dark": brdf_truth.DARK_SKIN_ALBEDO}
 
 
 def scene(skin, *, noise=0.02, points=60, samples=None, tail="light"):

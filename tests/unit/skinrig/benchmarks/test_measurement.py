@@ -97,7 +97,7 @@ def test_a_reference_of_its_own_error_is_told_from_the_truth():
 
 
 def test_memory_of_slow_calls_is_what_the_process_grew_by(monkeypatch):
-    monkeypatch.setattr("skinrig.benchmarks.measurement.TRACED_S", 0.0)
+    monkeypatch.setattr("skinrig.benchmarks.measurement.MAX_TRACED_CALL_S", 0.0)
     with resident_memory.watched() as seen:
         pass
     if seen.mb is None:

@@ -115,7 +115,7 @@ def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, caps
         run(600.0, ["a", "b", "c"], out=tmp_path)
     kept = json.loads((tmp_path / "bench.json").read_text())
     assert list(kept["stages"]) == ["a"]
-    assert kept["left_out"] == [[name, bench_stages.INTERRUPTED] for name in ("b", "c")]
+    assert kept["left_out"] == [[name, bench_stages.INTERRUPTED_REASON] for name in ("b", "c")]
     calls[0]["b"] = stage("b", calls)
     run(600.0, ["a", "b", "c"], out=tmp_path)
     whole = json.loads((tmp_path / "bench.json").read_text())
@@ -138,7 +138,7 @@ def test_a_long_stage_that_is_interrupted_leaves_what_it_measured_of_it(calls, t
         run(600.0, ["a", "b"], out=tmp_path)
     kept = json.loads((tmp_path / "bench.json").read_text())
     assert [len(kept["stages"][name]["points"]) for name in ("a", "b")] == [4, 2]
-    assert kept["left_out"] == [["b", bench_stages.INTERRUPTED]]
+    assert kept["left_out"] == [["b", bench_stages.INTERRUPTED_REASON]]
     stopped = False
     document = run(600.0, ["a", "b"], out=tmp_path)
     assert [len(document["stages"][name]["points"]) for name in ("a", "b")] == [4, 4]

@@ -77,7 +77,7 @@ def test_texels_without_a_true_point_near_by_are_left_out(rng):
     maps["position"] = maps["position"] + [10.0, 0.0, 0.0]
     pairs = evaluation.match(appearance(maps), appearance(truth))
     assert 0 < len(pairs.rows) < 40 * 40
-    assert pairs.distance_mm.max() <= evaluation.NEAR_MM
+    assert pairs.distance_mm.max() <= evaluation.MAX_MATCH_DISTANCE_MM
 
 
 def test_a_scan_that_is_not_registered_is_named(rng):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from skinrig.benchmarks.intervals.coverage import (
+    COVERAGE_RANGES,
     GAUSSIAN_95,
-    LEVELS,
     RAYLEIGH_95,
     Trial,
     by_band,
@@ -25,7 +25,7 @@ def trials_of(rng, *, shared, scale=1.0, subjects=12, band="any"):
 
 def test_honest_gaussian_intervals_are_kept_at_both_levels(rng):
     made = trials_of(rng, shared=0.0)
-    for level in LEVELS:
+    for level in COVERAGE_RANGES:
         found = pooled(made, level=level)
         assert found.verdict == "kept"
         assert found.interval[0] < level / 100 + 0.003

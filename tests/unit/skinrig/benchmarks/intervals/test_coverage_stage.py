@@ -35,14 +35,14 @@ def test_media_show_an_axis_turned_the_other_way_or_across():
     Rationale: at 0 and 90 degrees a direction and its mirror image are one; at 45 a direction
     across is the mirror image.
     """
-    for medium in intervals.DIRECTED:
+    for medium in intervals.ANISOTROPIC_MEDIA:
         true_deg = interval_trials_probe._farthest_deg(medium)
         for wrong_deg in (-true_deg, true_deg + 90.0, 90.0 - true_deg):
             turn = abs((wrong_deg - true_deg + 90.0) % 180.0 - 90.0)
             assert turn >= 10.0
 
 
-@pytest.mark.parametrize("medium", intervals.DIRECTED)
+@pytest.mark.parametrize("medium", intervals.ANISOTROPIC_MEDIA)
 def test_the_estimator_finds_the_axis_that_media_are_judged_by(medium):
     """Exact decays: least along the direction in which light goes farthest."""
     true_deg = interval_trials_probe._farthest_deg(medium)

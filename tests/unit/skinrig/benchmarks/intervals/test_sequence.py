@@ -5,7 +5,7 @@ import pytest
 
 from reconstruction.facial_color.perfusion_fit import fit_course
 from skinrig.benchmarks.intervals.coverage import pooled
-from skinrig.benchmarks.intervals.sequence import REACTIONS_S, of_fits, order_of
+from skinrig.benchmarks.intervals.sequence import REACTION_RANGE_S, of_fits, order_of
 
 CONSTANT_S = 20.0
 
@@ -104,7 +104,7 @@ def test_what_tells_nothing_is_left_out():
 def test_each_person_reacts_in_a_time_of_their_own():
     own = [order_of("smile", seed).reaction_s for seed in range(200)]
     assert order_of("smile", 3).reaction_s == own[3]
-    low, high = REACTIONS_S
+    low, high = REACTION_RANGE_S
     assert low <= min(own) < low + 0.05 < high - 0.05 < max(own) <= high
     assert order_of("exercise", 3).reaction_s is None
 
