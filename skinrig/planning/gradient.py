@@ -20,14 +20,10 @@ from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import PATTERNS
 from capture.rig import Rig
-from rigsim.scenes.gradient.truth import appearance as ground_truth
-from skinrig.arrays import Float32Array, Float64Array
+from skinrig.arrays import Float32Array
+from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
 
-Key = tuple[str, str]
-
-PATCH_PX = 96
-"""Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
 PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
     ("full", "x", "y", "z", "-x", "-y", "-z"),
@@ -44,27 +40,8 @@ UNMODELED_TILT_RAD = math.radians(0.2)
 is assumed; see docs/planning.md."""
 FORECAST_RELATIVE_SD = 0.2
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-BORDER_PX = 6
-"""That is not judged: the lens brings in what is beyond it."""
 WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
-    """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
-
-    rates: Mapping[Key, Float32Array]
-    """By pattern and polarizer, (H, W), full scales per second at full level."""
-    told: Mapping[str, Any]
-    """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
-    chip: Any
-    """The sensor, see `rigsim.sensor.Sensor`."""
-    seen: Float64Array
-    """(H, W, 3) normals as the lens shows them."""
-    lost_rad: float
-    """Median angle between the relief's normals before and behind the lens."""
-    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,47 +63,6 @@ class Prediction:
     noise_rad: float
     """Median of the errors that noise and lost detail make."""
     valid_share: float
-
-
-def simulate_observation(
-    rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX
-) -> Observation:
-    """Look at a patch of simulated skin, neutral, under all patterns.
-
-    Parameters
-    ----------
-    rig
-        The gradient sphere.
-    subject, seed
-        Pigment and relief of the forehead.
-    side_px
-        Pixels across.
-    """
-    from model.metrics import angular_error_rad
-    from rigsim.as_built.sphere import as_drawn
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.gradient.scene import GradientScene
-    from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
-
-    small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
-    size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
-    skin = subject_file.named(subject).patch("forehead", seed=seed, size_mm=size_mm)
-    sphere = as_drawn(small)
-    scene = GradientScene(small, skin, sphere=sphere, seed=seed)
-    rates = {
-        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
-        for pattern in PATTERNS
-        if pattern != "dark"
-        for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
-    }
-    truth = ground_truth(scene, [NEUTRAL]).maps
-    seen, sharp = (
-        np.asarray(truth[name].values, np.float64) for name in ("normals_seen_a000_n0", "normals")
-    )
-    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
-    lost = float(np.median(angular_error_rad(seen[inner], sharp[inner])))
-    told = {"lights": lights_of(sphere), **pixel_geometry(small)}
-    return Observation(rates, told, scene.sensor(), seen, lost, seed)
 
 
 def predict(observation: Observation, setting: Setting) -> Prediction:
@@ -156,11 +92,11 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
         values[key] = noisy.astype(np.float32)
         dark = floor / setting.darks if setting.darks else 0.0
         variance[key] = (spread + dark).astype(np.float32)
-    told = dict(observation.told)
+    known = dict(observation.known)
     alpha = estimate_roughness(
-        values, lights=told["lights"], view=told["view"], variance=variance, smooth_px=SMOOTH_PX
+        values, lights=known["lights"], view=known["view"], variance=variance, smooth_px=SMOOTH_PX
     )
-    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **told)
+    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **known)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)

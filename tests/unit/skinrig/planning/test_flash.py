@@ -10,7 +10,7 @@ import pytest
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from skinrig.cli import main
-from skinrig.planning import flash, plans
+from skinrig.planning import flash, flash_observation, plans
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def rig():
 @pytest.fixture(scope="module")
 def look(rig):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flash, "TEXTURE_TEXELS", 128)
+        patch.setattr(flash_observation, "TEXTURE_TEXELS", 128)
         return flash.simulate_observation(rig, "III", width_px=96)
 
 

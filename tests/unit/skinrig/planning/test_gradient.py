@@ -100,9 +100,13 @@ def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig
             variance[key] = gain * np.maximum(light, 0) + floor
             values[key] = light + np.sqrt(variance[key]) * rng.standard_normal(light.shape)
     alpha = estimate_roughness(
-        values, lights=look.told["lights"], view=look.told["view"], variance=variance, smooth_px=1.0
+        values,
+        lights=look.known["lights"],
+        view=look.known["view"],
+        variance=variance,
+        smooth_px=1.0,
     )
-    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.told)
+    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.known)
     inner = (slice(6, -6),) * 2
     cosine = np.sum(made.normals[inner] * look.seen[inner], axis=-1)
     error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
