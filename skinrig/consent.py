@@ -90,7 +90,7 @@ def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:
     Examples
     --------
     >>> from model.skin import SkinAppearance
-    >>> carried(SkinAppearance({}, "measured"))[0]["consent_scope"], carried()
+    >>> merge_consent(SkinAppearance({}, "measured"))[0]["consent_scope"], merge_consent()
     ([], [])
     """
     out: list[dict[str, Any]] = []
@@ -103,12 +103,13 @@ def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:
 
 
 def format_consent(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return records as people read them, a line a subject.
+    """Format records of consent, a line a subject.
 
     Examples
     --------
-    >>> told([{"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2031-01-01"},
-    ...       {"pseudonym": "P7", "consent_scope": [], "consent_expires": None}])
+    >>> first = {"pseudonym": "P042", "consent_scope": ["research"]}
+    >>> second = {"pseudonym": "P7", "consent_scope": [], "consent_expires": None}
+    >>> format_consent([first | {"consent_expires": "2031-01-01"}, second])
     ['P042: research, until 2031-01-01', 'P7: nothing']
     """
     lines = []

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
-PACKAGES = Path(__file__).parent.parent
+PACKAGES_FOLDER = Path(__file__).parent.parent
 """The folder that the packages are installed in."""
 
 
@@ -44,7 +44,7 @@ def writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK | os.X_OK)
 
 
-def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES) -> Path | None:
+def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES_FOLDER) -> Path | None:
     """Name a private folder for compiled kernels where Numba would find none.
 
     Numba keeps them beside the sources or in the user's cache, and refuses to compile where it can

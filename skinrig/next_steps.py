@@ -53,7 +53,7 @@ def shell_quote(path: str | Path) -> str:
 
     Examples
     --------
-    >>> named("session"), named("my session")
+    >>> shell_quote("session"), shell_quote("my session")
     ('session', "'my session'")
     """
     return shlex.quote(str(path))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-DEGREE: Final = "°"
-_SIGNS: Final = {"deg": DEGREE, "1": ""}
+DEGREE_SIGN: Final = "°"
+_SIGNS: Final = {"deg": DEGREE_SIGN, "1": ""}
 
 
 def unit_sign(unit: str) -> str:
@@ -43,4 +43,4 @@ def written(number: str, unit: str) -> str:
     ('1.5°', '1.5°', '12 %', '3')
     """
     sign = unit_sign(unit)
-    return number + ("" if sign == DEGREE or not sign else " ") + sign
+    return number + ("" if sign == DEGREE_SIGN or not sign else " ") + sign

@@ -20,7 +20,14 @@ from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array
 from skinrig.calibrating import dome, gradient, probe, white_tile
 
-KINDS = ("sensor", "color", "polarization", "white", *dome.KINDS, probe.KIND)
+CALIBRATION_KINDS = (
+    "sensor",
+    "color",
+    "polarization",
+    "white",
+    *dome.DOME_CALIBRATION_KINDS,
+    probe.FIBER_CALIBRATION_KIND,
+)
 
 
 class CalibratingError(ValueError):
@@ -54,7 +61,7 @@ def calibrate(
     Parameters
     ----------
     kind
-        One of :data:`KINDS`.
+        One of :data:`CALIBRATION_KINDS`.
     sessions
         Folders; frames of all of them are pooled. They must come from one camera, those of a
         dome's "geometry" and "lights" from one rig.
@@ -75,21 +82,23 @@ def calibrate(
     NoTileError
         When the frames for "white" show something else than a white tile.
     """
-    if kind not in KINDS:
-        raise CalibratingError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
+    if kind not in CALIBRATION_KINDS:
+        raise CalibratingError(
+            f"kind: got {kind!r}, expected one of {', '.join(CALIBRATION_KINDS)}"
+        )
     opened = [Session.open(path) for path in sessions]
     if not opened:
         raise CalibratingError("sessions: got none, expected at least one folder")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
     findings: tuple[str, ...] = ()
-    if kind == probe.KIND:
+    if kind == probe.FIBER_CALIBRATION_KIND:
         paper = None if phantom is None else read_certificate(phantom)
         done = probe.calibrate_probe(opened, out, made_on, certificate=paper)
         calibration, summary, findings = done.calibration, done.summary, done.findings
     elif gradient.of_a_gradient_sphere(opened):
         found = gradient.calibrate_gradient(kind, opened, out, made_on)
         calibration, summary, findings = found.calibration, found.summary, found.findings
-    elif kind in dome.KINDS:
+    elif kind in dome.DOME_CALIBRATION_KINDS:
         made = dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
         calibration, summary, findings = made.calibration, made.summary, made.findings
     else:

@@ -20,7 +20,7 @@ from capture.rig import Rig
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float64Array
 
-KINDS = ("geometry", "lights")
+DOME_CALIBRATION_KINDS = ("geometry", "lights")
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
 
 
@@ -71,7 +71,7 @@ def calibrate_dome(
     Parameters
     ----------
     kind
-        One of :data:`KINDS`.
+        One of :data:`DOME_CALIBRATION_KINDS`.
     sessions
         For "geometry" of the board; for "lights" of the mirror sphere, the white plate, or both.
     folder

@@ -20,8 +20,8 @@ from capture.raw import RawFrame
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array, Float64Array, UInt16Array
 
-KINDS = ("sensor", "lights", "polarization")
-READING_DEG = {"parallel": 0.0, "crossed": 90.0}
+GRADIENT_CALIBRATION_KINDS = ("sensor", "lights", "polarization")
+ANALYZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser in each of its named states."""
 
 
@@ -57,7 +57,7 @@ def calibrate_gradient(
     Parameters
     ----------
     kind
-        One of :data:`KINDS`.
+        One of :data:`GRADIENT_CALIBRATION_KINDS`.
     sessions
         For "sensor" of the flat field; for the others of the ball of black glass, one session.
     folder
@@ -81,9 +81,10 @@ def calibrate_gradient(
             f"sessions: got rigs {sorted(rigs)} with cameras {sorted(serials)}, expected one rig"
             " with one camera"
         )
-    if kind not in KINDS:
+    if kind not in GRADIENT_CALIBRATION_KINDS:
+        known = ", ".join(GRADIENT_CALIBRATION_KINDS)
         raise GradientCalibratingError(
-            f"kind: got {kind!r}, expected one of {', '.join(KINDS)} of rig {rigs.pop()!r}"
+            f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}"
         )
     if kind == "sensor":
         return _sensor(sessions, created)
@@ -175,7 +176,11 @@ def _above_black(frame: RawFrame) -> Float32Array:
 
 def _reading_deg(record: FrameRecord) -> float:
     asked = record.settings.get("analyser_deg")
-    return float(asked) if asked is not None else READING_DEG[str(record.settings["polarizer"])]
+    return (
+        float(asked)
+        if asked is not None
+        else ANALYZER_READING_DEG[str(record.settings["polarizer"])]
+    )
 
 
 def _flat_field(

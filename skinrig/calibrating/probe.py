@@ -22,8 +22,8 @@ from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
-KIND: Final = "fibre"
-WORN_GAIN: Final = 0.5
+FIBER_CALIBRATION_KIND: Final = "fibre"
+MIN_HEALTHY_GAIN: Final = 0.5
 """Of the usual gain: a fibre below it is told of."""
 
 
@@ -281,7 +281,7 @@ def _worn(fibres: FiberCalibration) -> tuple[str, ...]:
             found.append(f"{name} is dead: it gives no light")
         elif fibres.valid[i].any():
             share = float(np.median((fibres.gain[i] / usual)[fibres.valid[i]]))
-            if share < WORN_GAIN:
+            if share < MIN_HEALTHY_GAIN:
                 found.append(f"{name} passes {100 * share:.0f} % of what the others do: clean it")
         elif fibres.spots.found[i]:
             found.append(f"{name}: too little light from the phantom to calibrate it")

@@ -9,23 +9,23 @@ import numpy as np
 from capture.calibration.sensor.transfer_curve import block_sums
 from skinrig.arrays import BoolArray, FloatArray
 
-__all__ = ["LEAST_EVEN", "NoTileError", "evenness", "examine"]
+__all__ = ["MIN_EVEN_FRACTION", "NoTileError", "evenness", "examine"]
 
-BLOCKS: Final = 24
+BLOCKS_ACROSS: Final = 24
 """Along the shorter side of the picture; the noise of a pixel is averaged away in them."""
-LEAST_SIDE: Final = 4
+MIN_BLOCK_PX: Final = 4
 """Pixels a side of a square, where a picture has room for three: 3 % noise becomes 0.8 %."""
-BEND: Final = 0.03
+MAX_BEND: Final = 0.03
 """Most that a block may differ from its four neighbors' mean, relative. Light of a lamp a metre
 away and the shading of a lens change over much of the field: even where they fall by 6 % from block
 to block they bend by 0.4 %. Cheeks, noses, hair and edges bend by tens of percent."""
-TINT: Final = 0.1
+MAX_TINT: Final = 0.1
 """Most that red or blue over green may differ from its median over the field, relative. A tile has
 one color under one kind of light, of which a lens that tints its corners leaves a few percent."""
-LEAST_EVEN: Final = 0.8
+MIN_EVEN_FRACTION: Final = 0.8
 """Share of the picture that must be even: a tile may leave a margin, or a holder cover one. A
 face that takes a sixth of the picture before an even wall leaves less, in the dark an eighth."""
-FILLED: Final = 0.95
+MIN_FILLED_FRACTION: Final = 0.95
 """Share of the picture below which a tile is said not to fill it: a speck of dust, with the squares
 that border on it, is a hundredth."""
 
@@ -52,9 +52,9 @@ def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     Notes
     -----
     The picture is cut into squares. Such a one is even where its green light differs from the mean
-    of its four neighbors by less than `BEND`, and its red and blue over green from those of the
-    median square by less than `TINT`. How bright it is and which color the light has play no part:
-    both are what a white tile is to tell.
+    of its four neighbors by less than `MAX_BEND`, and its red and blue over green from those of the
+    median square by less than `MAX_TINT`. How bright it is and which color the light has play no
+    part: both are what a white tile is to tell.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     1.0
     """
     shorter = min(valid.shape)
-    side = max(shorter // BLOCKS, min(LEAST_SIDE, shorter // 3), 1)
+    side = max(shorter // BLOCKS_ACROSS, min(MIN_BLOCK_PX, shorter // 3), 1)
     count = block_sums(valid.astype(np.float64), side)
     judged = count >= side * side / 2
     sums = [block_sums(np.where(valid, rgb[..., k], 0.0), side) for k in range(3)]
@@ -81,8 +81,8 @@ def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     around = sum((green[place] for place in cross), np.zeros_like(green[inner])) / len(cross)
     tint = logs[..., (0, 2)] - green[..., None]
     usual = np.median(tint[lit], axis=0) if lit.any() else np.zeros(2)
-    even = (np.abs(green[inner] - around) < BEND) & bright
-    even &= (np.abs(tint[inner] - usual) < TINT).all(axis=-1)
+    even = (np.abs(green[inner] - around) < MAX_BEND) & bright
+    even &= (np.abs(tint[inner] - usual) < MAX_TINT).all(axis=-1)
     return float(np.count_nonzero(even & whole) / np.count_nonzero(whole))
 
 
@@ -107,13 +107,13 @@ def examine(rgb: FloatArray, valid: BoolArray, what: str) -> tuple[str, ...]:
     """
     even = evenness(rgb, valid)
     share = f"{100 * even:.0f} % of the picture"
-    if even < LEAST_EVEN:
+    if even < MIN_EVEN_FRACTION:
         raise NoTileError(
             f"sessions: {what} shows no white tile: {share} is even and neutral, expected all of"
             " it; give a session of a tile that fills the picture (`skinrig capture flash"
             " --target white`, `skinrig simulate flash --target white`)"
         )
-    if even < FILLED:
+    if even < MIN_FILLED_FRACTION:
         return (
             f"{what}: {share} is even and neutral; where the tile does not reach, or is dirty or"
             " shadowed, maps will be wrong",

@@ -12,7 +12,7 @@ from skinrig.commands.options import Json, Out
 from skinrig.console import Console, counted
 from skinrig.errors import UnusableError
 
-NEXT: Final[Mapping[str, str]] = {
+NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
     "mtlx": "load skin.mtlx on skin.obj; material.json has the scene unit and what was assumed",
     "gltf": "open skin.glb; in Blender, run skin_in_blender.py for the light below the surface",
@@ -147,7 +147,9 @@ def export(
         )
     else:
         done = sessions.export_session(source, out, to=to, use=sessions.require_use(use))
-    after = NEXT.get(to, "hand the folder on; `ascmhl verify` tells whether it is still whole")
+    after = NEXT_STEP_BY_FORMAT.get(
+        to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
+    )
     for what, why in done.left_out:
         console.say(f"left out: {what}: {why}")
     console.say(f"{done.path}: {counted(done.files, 'file')}, listed in {done.manifest}")

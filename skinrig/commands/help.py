@@ -10,7 +10,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from skinrig.errors import UnusableError, UsageError
 
-SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
+HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Begin", ("demo", "doctor")),
     (
         "Capture, on a rig or its simulation",
@@ -20,7 +20,7 @@ SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Look, and hand on", ("report", "view", "render", "export")),
     ("Measure", ("bench",)),
 )
-OTHER: Final = "More"
+OTHER_SECTION: Final = "More"
 
 
 _KINDS: Final = ((re.compile(r"<list\[(\w+)\]>"), r"<\1>"), (re.compile("<%Y-%m-%d>"), "<date>"))
@@ -62,7 +62,7 @@ def plain(name: str) -> str:
 
 
 class Commands(TyperGroup):
-    """A group that lists its commands under the headings of `SECTIONS`, nothing cut off."""
+    """A group that lists its commands under the headings of `HELP_SECTIONS`, nothing cut off."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the headings and the commands below them."""
@@ -76,12 +76,12 @@ class Commands(TyperGroup):
             for name in self.list_commands(ctx)
             if (command := self.get_command(ctx, name)) is not None and not command.hidden
         }
-        for title, names in SECTIONS:
+        for title, names in HELP_SECTIONS:
             rows = [(name, summary(left.pop(name))) for name in names if name in left]
             if rows:
                 yield title, rows
         if left:
-            yield OTHER, [(name, summary(command)) for name, command in left.items()]
+            yield OTHER_SECTION, [(name, summary(command)) for name, command in left.items()]
 
 
 class Subcommands(TyperGroup):

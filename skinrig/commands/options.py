@@ -44,12 +44,12 @@ def file_to_write(context: typer.Context, out: Path | None) -> Path | None:
 
 def page_to_write(context: typer.Context, out: Path | None) -> Path | None:
     """Refuse a folder, and the standard output, which has no name to be opened by."""
-    if out is not None and not context.resilient_parsing and str(out) == STDOUT:
+    if out is not None and not context.resilient_parsing and str(out) == STDOUT_MARK:
         raise UsageError("--out: got '-', expected a file to write")
     return file_to_write(context, out)
 
 
-STDOUT = "-"
+STDOUT_MARK = "-"
 """The standard output where a file is named."""
 Page = Annotated[Path, typer.Option("-o", "--out", callback=page_to_write, help="The page.")]
 Subject = Annotated[

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import STDOUT, Json, Page, file_to_write
+from skinrig.commands.options import STDOUT_MARK, Json, Page, file_to_write
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
@@ -44,7 +44,7 @@ def report(
     from skinrig.report import make
     from skinrig.reporting.folders import write_page
 
-    piped = str(out) == STDOUT
+    piped = str(out) == STDOUT_MARK
     if piped and json:
         raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)

@@ -77,14 +77,14 @@ class SimulateOptions:
         """Return what every order has, by name."""
         from skinrig.capturing.plan_choice import read_plan
         from skinrig.consent import subject_of
-        from skinrig.simulating.orders import USES
+        from skinrig.simulating.orders import SIMULATED_USES
         from skinrig.simulating.subject_records import pseudonym
 
         # a resumed session keeps what it was begun with, unless something else is said
         person = None
         if not self.resume or self.consent or self.consent_expires is not None:
             name = pseudonym(subject, self.seed)
-            person = subject_of(name, self.consent or USES, self.consent_expires)
+            person = subject_of(name, self.consent or SIMULATED_USES, self.consent_expires)
         return {
             "out": self.out,
             "size": self.size,

@@ -23,17 +23,17 @@ from reconstruction.photometric_stereo.light_selection import Prediction
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from skinrig.arrays import Float64Array
-from skinrig.planning.dome_observation import LIGHT_ERROR, Sight, sight
+from skinrig.planning.dome_observation import LIGHT_ERROR, Observation, simulate_observation
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
 
 VALID_SHARE = 0.9
 """Of the points that the whole dome gives an estimate, so many must keep one."""
-FORECAST_SPREAD = {"normals": 0.2, "r_d": 0.2}
+FORECAST_RELATIVE_SD = {"normals": 0.2, "r_d": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-CALIBRATION = 0.0095
+SHARED_R_D_ERROR = 0.0095
 """Relative error of R_d that a face's points share or that follows nothing known, whatever the
-lights. With `GLOSS` set on faces of seeds 1 to 3, types V, I and IV."""
-GLOSS = 0.0022
+lights. With `GLOSS_R_D_ERROR` set on faces of seeds 1 to 3, types V, I and IV."""
+GLOSS_R_D_ERROR = 0.0022
 """What gloss outside the part that is left out adds to R_d by one light: the same on all skin, so
 much on dark skin. Lights' errors of R_d by it are as far from each other as their `LIGHT_ERROR`."""
 
@@ -71,27 +71,29 @@ def choose(
             f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
             f"{least} and {surface_estimates.MIN_VIEWS}"
         )
-    look = sight(rig, subject, seed=seed)
+    observation = simulate_observation(rig, subject, seed=seed)
     every_view = range(len(rig.views))
     every_light = range(len(rig.lights))
-    best = light_selection.predict(look.information(every_view), every_light, least=least)
+    best = light_selection.predict(observation.information(every_view), every_light, least=least)
     full = dome_plan(rig)
     if not wants:
-        return _choice(rig, look, list(every_light), list(every_view), best, wants, rig, full)
-    reasons = _out_of_reach(best, look, wants)
+        return _choice(
+            rig, observation, list(every_light), list(every_view), best, wants, rig, full
+        )
+    reasons = _out_of_reach(best, observation, wants)
     target = math.radians(wants.get("normals", 90.0))
     share = valid_share * best.valid_share
     selected = light_selection.select(
-        look.information(every_view),
+        observation.information(every_view),
         median_rad=target,
         valid_share=share,
         least=least,
         most=most_lights,
     )
     lights, prediction = list(selected.lights), selected.prediction
-    while not _r_d_reached(prediction, look, wants) and len(lights) < len(rig.lights):
+    while not _r_d_reached(prediction, observation, wants) and len(lights) < len(rig.lights):
         selected = light_selection.select(
-            look.information(every_view),
+            observation.information(every_view),
             median_rad=0.0,
             valid_share=2.0,
             least=least,
@@ -101,7 +103,7 @@ def choose(
         lights, prediction = list(selected.lights), selected.prediction
         if most_lights is not None and len(lights) >= most_lights:
             break
-    views, prediction = _fewer_views(look, lights, prediction, wants, share)
+    views, prediction = _fewer_views(observation, lights, prediction, wants, share)
     kept = rig.subset(
         lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
     )
@@ -110,11 +112,11 @@ def choose(
         for n, error, share_now in selected.path
     )
     return _choice(
-        rig, look, lights, views, prediction, wants, kept, full, path=path, reasons=reasons
+        rig, observation, lights, views, prediction, wants, kept, full, path=path, reasons=reasons
     )
 
 
-def foresee(
+def forecast(
     rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
 ) -> Choice:
     """Return what a plan of the dome will give.
@@ -137,14 +139,16 @@ def foresee(
             f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
             f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
-    look = sight(rig, subject, seed=seed)
+    observation = simulate_observation(rig, subject, seed=seed)
     prediction = light_selection.predict(
-        look.information(views), lights, least=surface_estimates.MIN_LIGHTS
+        observation.information(views), lights, least=surface_estimates.MIN_LIGHTS
     )
     kept = rig.subset(
         lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
     )
-    return _choice(rig, look, lights, views, prediction, wants, kept, dome_plan(rig), plan=plan)
+    return _choice(
+        rig, observation, lights, views, prediction, wants, kept, dome_plan(rig), plan=plan
+    )
 
 
 def confirm(
@@ -200,7 +204,7 @@ def confirm(
 
 def _choice(
     rig: Rig,
-    look: Sight,
+    observation: Observation,
     lights: list[int],
     views: list[int],
     prediction: Prediction,
@@ -217,7 +221,7 @@ def _choice(
         Forecast(name, unit, value, _interval(name, value), wants.get(name))
         for name, unit, value in (
             ("normals", "deg", math.degrees(prediction.median_rad)),
-            ("r_d", "%", 100.0 * _r_d_error(prediction, look)),
+            ("r_d", "%", 100.0 * _r_d_error(prediction, observation)),
         )
     )
     left_out = []
@@ -257,20 +261,22 @@ def _choice(
 
 
 def _interval(name: str, value: float) -> tuple[float, float]:
-    return value / (1.0 + FORECAST_SPREAD[name]), value * (1.0 + FORECAST_SPREAD[name])
+    return value / (1.0 + FORECAST_RELATIVE_SD[name]), value * (1.0 + FORECAST_RELATIVE_SD[name])
 
 
-def _r_d_error(prediction: Prediction, look: Sight) -> float:
+def _r_d_error(prediction: Prediction, observation: Observation) -> float:
     """Return the predicted median relative error of R_d."""
     if not prediction.valid.any():
         return math.inf
     good = prediction.valid
-    gloss = GLOSS / LIGHT_ERROR / look.r_d[good]
-    common = CALIBRATION**2 + (surface_errors.R_D_ERROR_PER_RAD * prediction.tilt_rad[good]) ** 2
+    gloss = GLOSS_R_D_ERROR / LIGHT_ERROR / observation.r_d[good]
+    common = (
+        SHARED_R_D_ERROR**2 + (surface_errors.R_D_ERROR_PER_RAD * prediction.tilt_rad[good]) ** 2
+    )
     sigma = np.sqrt(
         np.square(prediction.log_albedo[good, None]) * (1.0 + np.square(gloss)) + common[:, None]
     )
-    return _median_magnitude(look.unresolved[good], sigma)
+    return _median_magnitude(observation.unresolved[good], sigma)
 
 
 def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
@@ -285,19 +291,21 @@ def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
     return 0.5 * (low + high)
 
 
-def _r_d_reached(prediction: Prediction, look: Sight, wants: Mapping[str, float]) -> bool:
-    return "r_d" not in wants or 100.0 * _r_d_error(prediction, look) <= wants["r_d"]
+def _r_d_reached(
+    prediction: Prediction, observation: Observation, wants: Mapping[str, float]
+) -> bool:
+    return "r_d" not in wants or 100.0 * _r_d_error(prediction, observation) <= wants["r_d"]
 
 
 def _fewer_views(
-    look: Sight,
+    observation: Observation,
     lights: list[int],
     prediction: Prediction,
     wants: Mapping[str, float],
     valid_share: float,
 ) -> tuple[list[int], Prediction]:
     """Take off cameras, the one that is missed least first, while what is wanted is reached."""
-    views = list(range(look.variance.shape[2]))
+    views = list(range(observation.variance.shape[2]))
     least = surface_estimates.MIN_LIGHTS
     target = math.radians(wants.get("normals", 90.0))
     if prediction.median_rad > target or prediction.valid_share < valid_share:
@@ -306,11 +314,11 @@ def _fewer_views(
         tried = []
         for view in views:
             rest = [other for other in views if other != view]
-            now = light_selection.predict(look.information(rest), lights, least=least)
+            now = light_selection.predict(observation.information(rest), lights, least=least)
             if (
                 now.median_rad <= target
                 and now.valid_share >= valid_share
-                and _r_d_reached(now, look, wants)
+                and _r_d_reached(now, observation, wants)
             ):
                 tried.append((-now.valid_share, now.median_rad, view, now))
         if not tried:
@@ -320,21 +328,23 @@ def _fewer_views(
     return views, prediction
 
 
-def _out_of_reach(best: Prediction, look: Sight, wants: Mapping[str, float]) -> tuple[str, ...]:
+def _out_of_reach(
+    best: Prediction, observation: Observation, wants: Mapping[str, float]
+) -> tuple[str, ...]:
     """Say why no number of lights gives what is wanted, where that is so."""
     out = []
     normals = math.degrees(best.median_rad)
     if normals > wants.get("normals", math.inf):
-        floor = math.degrees(light_selection.median_of_rayleigh(look.systematic_rad))
+        floor = math.degrees(light_selection.median_of_rayleigh(observation.systematic_rad))
         out.append(
             f"normals: all lights and cameras leave {normals:.2f}°, {floor:.2f}° of it by "
-            f"misplaced samples and fine relief at {look.pixel_mm:.2g} mm a pixel; "
+            f"misplaced samples and fine relief at {observation.pixel_mm:.2g} mm a pixel; "
             "more pixels would help, more lights will not"
         )
-    r_d = 100.0 * _r_d_error(best, look)
+    r_d = 100.0 * _r_d_error(best, observation)
     if r_d > wants.get("r_d", math.inf):
         out.append(
-            f"r_d: all lights and cameras leave {r_d:.2g} %; at {look.pixel_mm:.2g} mm a pixel "
-            "albedo too fine for it is part of that"
+            f"r_d: all lights and cameras leave {r_d:.2g} %; at {observation.pixel_mm:.2g} mm a "
+            "pixel albedo too fine for it is part of that"
         )
     return tuple(out)

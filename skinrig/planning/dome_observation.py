@@ -18,7 +18,7 @@ from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
-POINTS = 1500
+FACE_POINTS = 1500
 """Points of the face that are looked at."""
 LIGHT_ERROR = 0.015
 """Relative error that all cameras share of what one light shows: gloss outside the part that is
@@ -27,12 +27,12 @@ BLUR_PX = 1.0
 """Standard deviation, in each direction, of what an estimate of the albedo averages over, px:
 pixels and their interpolation, obliqueness, samples beside their place. R_d of simulated faces of
 seeds 1 to 3 (types V, I and IV) came nearest to the truth blurred by 0.9 to 1.05 of it."""
-TEXELS = 512
+TEXTURE_TEXELS = 512
 """Along one side of the face's maps: albedo finer than pixels must be in them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class Observation:
     """What the dome's lights and cameras reach of a face."""
 
     normals: Float64Array
@@ -72,7 +72,9 @@ class Sight:
         )
 
 
-def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -> Sight:
+def simulate_observation(
+    rig: Rig, subject: str, *, seed: int = 0, points: int | None = None
+) -> Observation:
     """Look at a simulated face from the dome.
 
     Parameters
@@ -84,7 +86,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     seed
         Of the face and of the points.
     points
-        How many to look at; `POINTS` by default.
+        How many to look at; `FACE_POINTS` by default.
     """
     from rigsim.light.led_light import white_intensity
     from rigsim.light.surface_brdf import skin_surface
@@ -92,8 +94,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     from rigsim.render import OFFSET_MM, Caster
     from rigsim.sensor import sensor_of
 
-    points = POINTS if points is None else points
-    face = subject_file.load_subject(subject).face(seed=seed, size=TEXELS)
+    points = FACE_POINTS if points is None else points
+    face = subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_TEXELS)
     texels = np.flatnonzero(face.atlas.covered & (face.hair < 0.5))
     along_u, along_v = face.atlas.texel_mm()
     area = (along_u * along_v).reshape(-1)[texels]
@@ -130,7 +132,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     pixel = float(
         2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
     )  # mm on the subject, of a cell of the color filter
-    return Sight(
+    return Observation(
         normal,
         to_light,
         np.where(there, variance[:, :, None], np.inf),

@@ -16,61 +16,29 @@ import numpy as np
 
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
-from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.detectability import detectable
 from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating.bounds import relative_bounds
+from skinrig.planning.flash_observation import (
+    CHROMOPHORES,
+    CONFIRM_PX,
+    Observation,
+    simulate_observation,
+)
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
 
-NAMES = ("melanin", "hemoglobin")
-REPEATS = (1, 2, 4, 8, 16)
+REPEAT_CHOICES = (1, 2, 4, 8, 16)
 """Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
-DARKS = (0, 1, 4)
-POWERS = (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0)
+DARK_CHOICES = (0, 1, 4)
+POWER_CHOICES = (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0)
 """Of the flashes' full energy; less is kinder to eyes and costs no time."""
-FORECAST_SPREAD: Mapping[str, float] = {"melanin": 0.2, "hemoglobin": 0.15}
+FORECAST_RELATIVE_SD: Mapping[str, float] = {"melanin": 0.2, "hemoglobin": 0.15}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-TEXTURE_PX = 512
-"""Side of the face's texture: finer than what the forecast's pixels show."""
-WIDTH_PX = 256
-"""Pixels across the face that the forecast looks at, each as noisy as one of the whole camera."""
-CONFIRM_PX = 640
-"""Pixels across that are simulated: coarser ones mix the colors of different skin."""
-EXCESS: Mapping[str, float] = {"melanin": 1.1, "hemoglobin": 1.0}
+ERROR_OVER_BOUND: Mapping[str, float] = {"melanin": 1.1, "hemoglobin": 1.0}
 """Errors over their bounds, medians of sessions. Melanin's exceed it as the light's prior tells
 less of most pixels than its information says in the mean (2 to 10 %), as the model error of a face
 is not that of faces in general (up to 10 %), and as color bends over errors of its size."""
-MIXING_POWER = 2.4
-"""The model error's variance grows so with the size of pixels wider than these, which mix the
-colors of different skin: at 320 across its share of the errors of three faces was 2 to 2.8 times
-that at 640."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What the crossed camera sees of a face at full power, by superpixels."""
-
-    melanin: Float64Array
-    """(H, W) volume fraction, as the light's spreading leaves it to be seen."""
-    hemoglobin: Float64Array
-    """(H, W)."""
-    light: Float64Array
-    """(H, W, 3) fraction of full scale."""
-    skin: BoolArray
-    """(H, W)."""
-    gain: float
-    """Variance of a pixel of full scale by its photons."""
-    floor: float
-    """Variance of a pixel without light."""
-    shares: Float64Array
-    """(3,) variance of a superpixel's channels over that of a sensor's pixel."""
-    table: Any
-    """Color table of the camera and the light."""
-    light_spread: float
-    """Standard error of log light that the prior of faces alone would leave."""
-    mixing: float = 1.0
-    """Variance of the model error over that of pictures `CONFIRM_PX` across."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,68 +60,13 @@ class Prediction:
         return float(self.valid[name].sum() / max(self.skin.sum(), 1))
 
 
-def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) -> Sight:
-    """Look at a simulated face through the crossed polarizers.
-
-    Parameters
-    ----------
-    rig
-        The flash rig.
-    subject, seed
-        The face, see `rigsim.subject.PRESET_NAMES`.
-    width_px
-        Pixels across; fewer see the same face with the same noise a pixel.
-    """
-    from model import color_table
-    from model.tissue_optics.layers import ANISOTROPY_SKIN
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.flash.scene import FlashScene
-    from rigsim.sensor import sensor_of, vignetting_map
-    from skinrig.simulating.flash_truth import to_superpixels
-
-    small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
-    view = small.views[0]
-    scene = FlashScene(
-        small, subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_PX), seed=seed
-    )
-    truth = scene.truth()
-    chip = sensor_of(view)
-    light = (
-        scene.radiance("crossed")
-        * vignetting_map(chip.vignetting, view.height_px, view.width_px)[..., None]
-    )
-    bare = np.asarray(truth["mask"], bool) & (np.asarray(truth["melanin"]) > 0)
-    table = color_table.build(
-        view.spectral_sensitivity, small.lights[0].illuminant, anisotropy=ANISOTROPY_SKIN
-    )
-    melanin, hemoglobin = (
-        to_superpixels(np.asarray(truth[f"{name}_blurred"], np.float64), bare) for name in NAMES
-    )
-    skin = to_superpixels(bare.astype(np.float64)) == 1.0
-    skin &= (melanin > 0) & (melanin <= table.c_m_max)
-    skin &= (hemoglobin > 0) & (hemoglobin <= table.c_hd_max)
-    gain, floor = chip.noise_profile(0.008)
-    return Sight(
-        melanin,
-        hemoglobin,
-        to_superpixels(light.astype(np.float64)),
-        skin,
-        gain,
-        floor,
-        _shares(view.cfa),
-        table,
-        light_spread(),
-        max(1.0, CONFIRM_PX / rig.views[0].width_px) ** MIXING_POWER,
-    )
-
-
-def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Prediction:
+def predict(observation: Observation, *, repeats: int, power: float, darks: int) -> Prediction:
     """Return the errors that crossed frames of a face leave.
 
     Parameters
     ----------
-    look
-        See `sight`.
+    observation
+        See `simulate_observation`.
     repeats
         Crossed frames that are averaged.
     power
@@ -161,27 +74,29 @@ def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Predictio
     darks
         Frames without light; 0: the black level of the camera is taken at its word.
     """
-    frame = look.gain * power * np.maximum(look.light, 0.0) + look.floor
-    dark = look.floor / darks if darks else 0.0
-    variance = (frame / repeats + dark) * look.shares
+    frame = observation.gain * power * np.maximum(observation.light, 0.0) + observation.floor
+    dark = observation.floor / darks if darks else 0.0
+    variance = (frame / repeats + dark) * observation.shares
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = variance / np.square(power * look.light)
-    skin = look.skin & (relative < 1.0 / DARKEST_SIGMAS**2).all(axis=-1)
+        relative = variance / np.square(power * observation.light)
+    skin = observation.skin & (relative < 1.0 / DARKEST_SIGMAS**2).all(axis=-1)
     bounds = relative_bounds(
-        look.table,
-        look.melanin[skin],
-        look.hemoglobin[skin],
+        observation.table,
+        observation.melanin[skin],
+        observation.hemoglobin[skin],
         relative[skin],
-        shading_spread=look.light_spread,
-        model_scale=look.mixing,
+        shading_spread=observation.light_spread,
+        model_scale=observation.mixing,
     )
     sigma, valid = {}, {}
-    for name, truth, bound in zip(NAMES, (look.melanin, look.hemoglobin), bounds, strict=True):
+    for name, truth, bound in zip(
+        CHROMOPHORES, (observation.melanin, observation.hemoglobin), bounds, strict=True
+    ):
         told = np.full(skin.shape, np.inf)
-        told[skin] = EXCESS[name] * bound
+        told[skin] = ERROR_OVER_BOUND[name] * bound
         sigma[name] = told
         valid[name] = detectable(truth, np.where(skin, told, 0.0) * truth, skin)
-    return Prediction(sigma, valid, look.skin)
+    return Prediction(sigma, valid, observation.skin)
 
 
 def choose(
@@ -206,39 +121,47 @@ def choose(
     valid_share
         Of the skin that most light and most frames give an estimate, so much must keep one.
     """
-    look = sight(rig, subject, seed=seed)
-    best = predict(look, repeats=REPEATS[-1], power=1.0, darks=DARKS[-1])
+    observation = simulate_observation(rig, subject, seed=seed)
+    best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
     if not wants:
         plan = flash_plan(rig)
         whole = {"repeats": 1, "power": 1.0, "darks": 4, "parallel": True}
-        return _choice(rig, look, plan, whole, wants)
+        return _choice(rig, observation, plan, whole, wants)
     path = []
     chosen: dict[str, Any] = {}
     for settings in _candidates(rig):
-        found = predict(look, **settings)
-        if settings["power"] == POWERS[-1]:
+        found = predict(observation, **settings)
+        if settings["power"] == POWER_CHOICES[-1]:
             path.append(
                 {name: float(settings[name]) for name in ("repeats", "darks")}
-                | {f"{name}_percent": 100.0 * found.median(name) for name in NAMES}
+                | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORES}
             )
         chosen = settings
         if _good(found, best, wants, valid_share):
-            return _choice(rig, look, crossed_plan(rig, **chosen), chosen, wants, path=tuple(path))
+            return _choice(
+                rig, observation, crossed_plan(rig, **chosen), chosen, wants, path=tuple(path)
+            )
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
-    reasons = _out_of_reach(best, look, wants, valid_share)
+    reasons = _out_of_reach(best, observation, wants, valid_share)
     # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
     told = [name for name in wants if np.isfinite(best.median(name))]  # less tells nothing as well
     for settings in _candidates(rig) if told else ():
-        now = predict(look, **settings)
+        now = predict(observation, **settings)
         if all(now.median(name) <= 1.05 * best.median(name) for name in told):
             least = settings
             break
     return _choice(
-        rig, look, crossed_plan(rig, **least), least, wants, path=tuple(path), reasons=reasons
+        rig,
+        observation,
+        crossed_plan(rig, **least),
+        least,
+        wants,
+        path=tuple(path),
+        reasons=reasons,
     )
 
 
-def foresee(
+def forecast(
     rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
 ) -> Choice:
     """Return what a plan of the flash rig will give, in its first state.
@@ -264,7 +187,7 @@ def foresee(
         "darks": sum(step.kind == "dark" for step in plan.steps),
         "parallel": len(shots) > len(crossed),
     }
-    return _choice(rig, sight(rig, subject, seed=seed), plan, settings, wants)
+    return _choice(rig, simulate_observation(rig, subject, seed=seed), plan, settings, wants)
 
 
 def confirm(
@@ -291,7 +214,7 @@ def confirm(
     progress("reconstruct")
     pipeline.reconstruct(
         done.session,
-        want=NAMES,
+        want=CHROMOPHORES,
         out=out / "appearance",
         calibration=calibration,
         truth=done.truth.name if done.truth else "",
@@ -340,9 +263,9 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     """Yield settings, the quickest first, of those the darkest."""
     every: list[dict[str, Any]] = [
         {"repeats": repeats, "power": power, "darks": darks}
-        for repeats in REPEATS
-        for darks in DARKS
-        for power in POWERS
+        for repeats in REPEAT_CHOICES
+        for darks in DARK_CHOICES
+        for power in POWER_CHOICES
     ]
     yield from sorted(
         every,
@@ -362,7 +285,7 @@ def _good(
 
 def _choice(
     rig: Rig,
-    look: Sight,
+    observation: Observation,
     plan: Plan,
     settings: Mapping[str, Any],
     wants: Mapping[str, float],
@@ -372,17 +295,17 @@ def _choice(
 ) -> Choice:
     parallel = bool(settings.get("parallel", False))
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
-    found = predict(look, **own)
+    found = predict(observation, **own)
     full = flash_plan(rig, repeats=max(int(own["repeats"]), 1))
     forecasts = tuple(
         Forecast(
             name,
             "%",
             100.0 * found.median(name),
-            interval_of(100.0 * found.median(name), FORECAST_SPREAD[name]),
+            interval_of(100.0 * found.median(name), FORECAST_RELATIVE_SD[name]),
             wants.get(name),
         )
-        for name in NAMES
+        for name in CHROMOPHORES
     )
     left_out = []
     if not parallel:
@@ -428,7 +351,7 @@ def _choice(
         {
             **own,
             "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
-            "valid_share": {name: found.valid_share(name) for name in NAMES},
+            "valid_share": {name: found.valid_share(name) for name in CHROMOPHORES},
         },
         tuple(left_out),
         path,
@@ -438,7 +361,7 @@ def _choice(
 
 
 def _out_of_reach(
-    best: Prediction, look: Sight, wants: Mapping[str, float], valid_share: float
+    best: Prediction, observation: Observation, wants: Mapping[str, float], valid_share: float
 ) -> tuple[str, ...]:
     """Say why no number of frames gives what is wanted."""
     out = []
@@ -446,39 +369,17 @@ def _out_of_reach(
         now = 100.0 * best.median(name)
         if now <= value:
             continue
-        still = replace(look, gain=0.0, floor=0.0)
+        still = replace(observation, gain=0.0, floor=0.0)
         model = 100.0 * predict(still, repeats=1, power=1.0, darks=0).median(name)
         why = (
             "more frames will not help; a camera whose colors tell the two apart better might"
             if model > value
-            else f"more than {REPEATS[-1]} frames would be needed"
+            else f"more than {REPEAT_CHOICES[-1]} frames would be needed"
         )
         out.append(
-            f"{name}: {REPEATS[-1]} frames at full power leave {now:.3g} %, of which the model "
-            f"error alone, without any noise, leaves {model:.3g} %; {why}"
+            f"{name}: {REPEAT_CHOICES[-1]} frames at full power leave {now:.3g} %, of which the "
+            f"model error alone, without any noise, leaves {model:.3g} %; {why}"
         )
     if not out and not _good(best, best, wants, valid_share):
         out.append("valid_share: too little of the skin keeps an estimate")
     return tuple(out)
-
-
-def light_spread() -> float:
-    """Return how well the prior tells the log of a pixel's light: Fisher's information of it.
-
-    The prior has a steep edge, as hardly any skin gets more light than a tile in its place: it
-    tells more than its variance says.
-    """
-    prior = shading_prior.of_faces()
-    slope = np.gradient(prior.density, prior.step)
-    return float(1.0 / np.sqrt(np.sum(slope**2 / prior.density) * prior.step))
-
-
-def _shares(pattern: str) -> Float64Array:
-    """Return the variance of superpixels over that of the sensor's pixels, by channel, (3,)."""
-    from capture import raw
-
-    frame = raw.RawFrame(
-        cfa=np.full((8, 8), 500, np.uint16), pattern=pattern, black=(0.0,) * 4, white=1000
-    )
-    image = raw.linear_rgb(frame, demosaic="centered", gain=1.0, read_noise=0.0)
-    return np.asarray(image.variance[2, 2] / (0.5 / 1000.0), np.float64)

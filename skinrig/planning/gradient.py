@@ -20,51 +20,28 @@ from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
-from rigsim.scenes.gradient.truth import appearance as ground_truth
-from skinrig.arrays import Float32Array, Float64Array
+from skinrig.arrays import Float32Array
+from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
 
-Key = tuple[str, str]
-
-PATCH_PX = 96
-"""Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
-SETS: tuple[tuple[str, ...], ...] = (
+PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
     ("full", "x", "y", "z", "-x", "-y", "-z"),
     tuple(LIGHT_PATTERNS),
 )
 """Patterns that tell light and three gradients: one complement instead of full, which lowers the
 noise more; all complements; and dark."""
-EXPOSURES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
+EXPOSURE_CHOICES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Of the rig's own exposure."""
-SATURATED = 0.98
+MAX_SIGNAL_FRACTION = 0.98
 """Of full scale, in the brightest thousandth of the pixels."""
-BEYOND_RAD = math.radians(0.2)
+UNMODELED_TILT_RAD = math.radians(0.2)
 """Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
 is assumed; see docs/planning.md."""
-FORECAST_SPREAD = 0.2
+FORECAST_RELATIVE_SD = 0.2
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-BORDER_PX = 6
-"""That is not judged: the lens brings in what is beyond it."""
 WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
-
-    rates: Mapping[Key, Float32Array]
-    """By pattern and polarizer, (H, W), full scales per second at full level."""
-    told: Mapping[str, Any]
-    """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
-    chip: Any
-    """The sensor, see `rigsim.sensor.Sensor`."""
-    seen: Float64Array
-    """(H, W, 3) normals as the lens shows them."""
-    lost_rad: float
-    """Median angle between the relief's normals before and behind the lens."""
-    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,52 +65,13 @@ class Prediction:
     valid_share: float
 
 
-def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> Sight:
-    """Look at a patch of simulated skin, neutral, under all patterns.
-
-    Parameters
-    ----------
-    rig
-        The gradient sphere.
-    subject, seed
-        Pigment and relief of the forehead.
-    side_px
-        Pixels across.
-    """
-    from model.metrics import angular_error_rad
-    from rigsim.as_built.sphere import nominal_sphere
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.gradient.scene import GradientScene
-    from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
-
-    small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
-    size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
-    skin = subject_file.load_subject(subject).patch("forehead", seed=seed, size_mm=size_mm)
-    sphere = nominal_sphere(small)
-    scene = GradientScene(small, skin, sphere=sphere, seed=seed)
-    rates = {
-        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
-        for pattern in LIGHT_PATTERNS
-        if pattern != "dark"
-        for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
-    }
-    truth = ground_truth(scene, [NEUTRAL]).maps
-    seen, sharp = (
-        np.asarray(truth[name].values, np.float64) for name in ("normals_seen_a000_n0", "normals")
-    )
-    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
-    lost = float(np.median(angular_error_rad(seen[inner], sharp[inner])))
-    told = {"lights": lights_of(sphere), **pixel_geometry(small)}
-    return Sight(rates, told, scene.sensor(), seen, lost, seed)
-
-
-def predict(look: Sight, setting: Setting) -> Prediction:
+def predict(observation: Observation, setting: Setting) -> Prediction:
     """Return the errors that a scan of one state leaves.
 
     Parameters
     ----------
-    look
-        See `sight`.
+    observation
+        See `simulate_observation`.
     setting
         Patterns, exposure and darks.
     """
@@ -141,11 +79,11 @@ def predict(look: Sight, setting: Setting) -> Prediction:
     from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
     from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 
-    rng = np.random.default_rng([look.seed, 23])
-    gain, floor = look.chip.noise_profile(setting.exposure_s)
+    rng = np.random.default_rng([observation.seed, 23])
+    gain, floor = observation.chip.noise_profile(setting.exposure_s)
     values: dict[Key, Float32Array] = {}
     variance: dict[Key, Float32Array] = {}
-    for key, rate in look.rates.items():
+    for key, rate in observation.rates.items():
         if key[0] not in setting.patterns:
             continue
         light = (setting.level * setting.exposure_s * rate).astype(np.float64)
@@ -154,16 +92,16 @@ def predict(look: Sight, setting: Setting) -> Prediction:
         values[key] = noisy.astype(np.float32)
         dark = floor / setting.darks if setting.darks else 0.0
         variance[key] = (spread + dark).astype(np.float32)
-    told = dict(look.told)
+    known = dict(observation.known)
     alpha = estimate_roughness(
-        values, lights=told["lights"], view=told["view"], variance=variance, smooth_px=SMOOTH_PX
+        values, lights=known["lights"], view=known["view"], variance=variance, smooth_px=SMOOTH_PX
     )
-    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **told)
+    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **known)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
     return Prediction(
-        median_of_rayleigh(np.hypot(tilt, BEYOND_RAD)),
+        median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD)),
         median_of_rayleigh(tilt),
         float(valid.mean()),
     )
@@ -191,15 +129,15 @@ def choose(
     valid_share
         Of the patch so much must have normals.
     """
-    look = sight(rig, subject, seed=seed)
+    observation = simulate_observation(rig, subject, seed=seed)
     if not wants:
         plan = gradient_plan(rig)
-        return _choice(rig, look, plan, setting_of(plan), wants)
+        return _choice(rig, observation, plan, setting_of(plan), wants)
     tried: list[tuple[Setting, Plan, Prediction]] = []
     target = math.radians(wants.get("normals", 90.0))
     best: Prediction | None = None
-    for setting, plan in candidates(rig, look):
-        found = predict(look, setting)
+    for setting, plan in candidates(rig, observation):
+        found = predict(observation, setting)
         tried.append((setting, plan, found))
         best = found if best is None or found.median_rad < best.median_rad else best
         if found.median_rad <= target and found.valid_share >= valid_share:
@@ -220,19 +158,21 @@ def choose(
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if found.median_rad > target:
-        reasons = (_why(best, look),)
+        reasons = (_why(best, observation),)
         # the quickest of those that are nearly as good as it gets
         setting, plan, found = next(
             one for one in tried if one[2].median_rad <= 1.05 * best.median_rad
         )
-    return _choice(rig, look, plan, setting, wants, found=found, path=path, reasons=reasons)
+    return _choice(rig, observation, plan, setting, wants, found=found, path=path, reasons=reasons)
 
 
-def foresee(
+def forecast(
     rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
 ) -> Choice:
     """Return what a plan of the gradient sphere will give, in its neutral state."""
-    return _choice(rig, sight(rig, subject, seed=seed), plan, setting_of(plan), wants)
+    return _choice(
+        rig, simulate_observation(rig, subject, seed=seed), plan, setting_of(plan), wants
+    )
 
 
 def confirm(
@@ -290,22 +230,25 @@ def confirm(
     ]
 
 
-def candidates(rig: Rig, look: Sight | None = None) -> Iterator[tuple[Setting, Plan]]:
+def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tuple[Setting, Plan]]:
     """Yield scans of the neutral skin that the rig's limits allow, the quickest first.
 
     Parameters
     ----------
     rig
         The gradient sphere.
-    look
+    observation
         Skin that must not be saturated; None: any.
     """
     angle = _angles(rig)[0]
     found: list[tuple[float, int, Setting, Plan]] = []
-    for patterns in SETS:
-        for share in EXPOSURES:
+    for patterns in PATTERN_SETS:
+        for share in EXPOSURE_CHOICES:
             exposure_s = share * EXPOSURE_S
-            if look is not None and _brightest(look, exposure_s) > SATURATED:
+            if (
+                observation is not None
+                and _brightest(observation, exposure_s) > MAX_SIGNAL_FRACTION
+            ):
                 continue
             for darks in (0, 2):
                 try:
@@ -371,13 +314,13 @@ def _angles(rig: Rig) -> Sequence[float]:
     return rig.caliper.angles_deg
 
 
-def _brightest(look: Sight, exposure_s: float) -> float:
-    return exposure_s * max(float(np.quantile(rate, 0.999)) for rate in look.rates.values())
+def _brightest(observation: Observation, exposure_s: float) -> float:
+    return exposure_s * max(float(np.quantile(rate, 0.999)) for rate in observation.rates.values())
 
 
 def _choice(
     rig: Rig,
-    look: Sight,
+    observation: Observation,
     plan: Plan,
     setting: Setting,
     wants: Mapping[str, float],
@@ -386,11 +329,11 @@ def _choice(
     path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
 ) -> Choice:
-    found = predict(look, setting) if found is None else found
+    found = predict(observation, setting) if found is None else found
     full = gradient_plan(rig)
     value = math.degrees(found.median_rad)
-    forecast = Forecast(
-        "normals", "deg", value, interval_of(value, FORECAST_SPREAD), wants.get("normals")
+    predicted = Forecast(
+        "normals", "deg", value, interval_of(value, FORECAST_RELATIVE_SD), wants.get("normals")
     )
     left_out = []
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
@@ -423,7 +366,7 @@ def _choice(
         left_out.append(
             ("dark frames", "at this exposure the fixed pattern of the sensor is below its noise")
         )
-    lost = math.degrees(look.lost_rad)
+    lost = math.degrees(observation.lost_rad)
     reasons += (
         "normals are those that the lens shows; the relief's own are "
         f"{lost:.2g}° off them, which no pattern brings back",
@@ -431,7 +374,7 @@ def _choice(
     return Choice(
         rig,
         plan,
-        (forecast,),
+        (predicted,),
         plan.estimated_s(rig),
         full.estimated_s(rig),
         {
@@ -453,8 +396,8 @@ def _choice(
     )
 
 
-def _why(best: Prediction, look: Sight) -> str:
-    floor = math.degrees(BEYOND_RAD * math.sqrt(2.0 * math.log(2.0)))
+def _why(best: Prediction, observation: Observation) -> str:
+    floor = math.degrees(UNMODELED_TILT_RAD * math.sqrt(2.0 * math.log(2.0)))
     return (
         f"normals: the best scan leaves {math.degrees(best.median_rad):.2f}°; noise and "
         f"lost detail {math.degrees(best.noise_rad):.2f}°, shadows and lobes unlike the assumed "

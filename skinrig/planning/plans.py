@@ -27,7 +27,7 @@ from skinrig.written_units import written
 
 SCHEMA = "skinrig.plan-choice/1"
 
-UNITS: Mapping[str, Mapping[str, str]] = {
+WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
     "dome": {"normals": "deg", "r_d": "%"},
     "flash": {"melanin": "%", "hemoglobin": "%"},
     "gradient": {"normals": "deg"},
@@ -35,7 +35,7 @@ UNITS: Mapping[str, Mapping[str, str]] = {
 }
 """What can be wanted of each rig, and in which unit."""
 
-BY_SITE = "percent_by_site"
+PERCENT_BY_SITE = "percent_by_site"
 """Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
 
 _WANT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
@@ -137,7 +137,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     Returns
     -------
     dict
-        Error by name, in the unit of :data:`UNITS`.
+        Error by name, in the unit of :data:`WANTED_UNITS`.
 
     Raises
     ------
@@ -151,9 +151,9 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     >>> read_wants("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
-    units = UNITS.get(rig)
+    units = WANTED_UNITS.get(rig)
     if units is None:
-        raise PlanningError(f"rig: got {rig!r}, expected one of {', '.join(UNITS)}")
+        raise PlanningError(f"rig: got {rig!r}, expected one of {', '.join(WANTED_UNITS)}")
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):
@@ -164,7 +164,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
             hint = f"; did you mean {close[0]}?" if close else ""
-            others = [other for other, gives in UNITS.items() if name in gives]
+            others = [other for other, gives in WANTED_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
             raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
@@ -205,7 +205,7 @@ def choose(
     Parameters
     ----------
     rig_name
-        Out of :data:`UNITS`.
+        Out of :data:`WANTED_UNITS`.
     want
         See `read_wants`.
     subject, seed
@@ -242,7 +242,7 @@ def choose(
         plan = read_plan(forecast)
         if plan.rig != rig.name:
             raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
-        found: Choice = own.foresee(rig, plan, wants, subject=subject, seed=seed)
+        found: Choice = own.forecast(rig, plan, wants, subject=subject, seed=seed)
         return found
     options: dict[str, Any] = {"most_lights": most_lights} if rig_name == "dome" else {}
     chosen: Choice = own.choose(
@@ -274,7 +274,7 @@ def confirmed(
 
 
 def _planner(rig_name: str) -> Any:
-    """Return the module that plans for a rig: its `choose`, `foresee` and `confirm`."""
+    """Return the module that plans for a rig: its `choose`, `forecast` and `confirm`."""
     return importlib.import_module(f"skinrig.planning.{rig_name}")
 
 
@@ -333,7 +333,7 @@ def lines(choice: Choice) -> list[str]:
         )
     out += [f"why: {reason}" for reason in choice.reasons]
     for name, value in choice.knobs.items():
-        if name == BY_SITE:
+        if name == PERCENT_BY_SITE:
             out.append(f"percent by site: {_by_site(value)}")
             continue
         shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else ""

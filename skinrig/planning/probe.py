@@ -19,7 +19,7 @@ from capture.plan.probe import MAX_EXPOSURE_S, N_BRACKETS, exposure_series_s, pr
 from capture.plan.suction import placement_of
 from capture.rig import Rig
 from skinrig.planning.plans import (
-    BY_SITE,
+    PERCENT_BY_SITE,
     Choice,
     Forecast,
     PlanningError,
@@ -27,32 +27,32 @@ from skinrig.planning.plans import (
     median_of_normals,
 )
 from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
-from skinrig.planning.probe_sight import Sight, sight
+from skinrig.planning.probe_observation import Observation, simulate_observation
 
 __all__ = [
     "Memory",
+    "Observation",
     "Prediction",
     "Setting",
-    "Sight",
     "candidates",
     "choose",
     "confirm",
-    "foresee",
+    "forecast",
     "predict",
     "setting_of",
-    "sight",
+    "simulate_observation",
     "without_sites",
 ]
 
 
-SHORTEST_S = exposure_series_s()[0]
+MIN_EXPOSURE_S = exposure_series_s()[0]
 """Of the rig's own series: the nearest fibre must not saturate in it."""
-SERIES = (3, 4, 6, 8, 12, N_BRACKETS)
+BRACKET_CHOICES = (3, 4, 6, 8, 12, N_BRACKETS)
 """How many exposures a series may have."""
-LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, MAX_EXPOSURE_S)
+LONGEST_EXPOSURE_CHOICES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, MAX_EXPOSURE_S)
 """Its longest one, s."""
-REPEATS = (1, 2, 4)
-DARKS = (1, 2)
+REPEAT_CHOICES = (1, 2, 4)
+DARK_CHOICES = (1, 2)
 
 
 def choose(
@@ -77,13 +77,15 @@ def choose(
     valid_share
         Of the fits that the rig's own plan makes valid, so many must stay so.
     """
-    look = sight(rig, subject, seed=seed)
+    observation = simulate_observation(rig, subject, seed=seed)
     own = probe_plan(rig)
     if not wants:
-        return _choice(rig, look, own, setting_of(own), predict(look, setting_of(own)), wants)
+        return _choice(
+            rig, observation, own, setting_of(own), predict(observation, setting_of(own)), wants
+        )
     target = wants.get("sigma_tr", math.inf) / 100.0
     memory: Memory = {}
-    whole = predict(look, setting_of(own), memory=memory)
+    whole = predict(observation, setting_of(own), memory=memory)
 
     def good(found: Prediction) -> bool:
         left = found.sigma[~found.measured]
@@ -95,8 +97,8 @@ def choose(
         )
 
     tried: list[tuple[Setting, Plan, Prediction]] = []
-    for setting, plan in candidates(rig, look):
-        tried.append((setting, plan, predict(look, setting, memory=memory)))
+    for setting, plan in candidates(rig, observation):
+        tried.append((setting, plan, predict(observation, setting, memory=memory)))
         if good(tried[-1][2]):
             break
     path = tuple(
@@ -113,25 +115,25 @@ def choose(
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if good(found):
-        setting, plan = without_sites(look, setting, plan, good, memory=memory)
+        setting, plan = without_sites(observation, setting, plan, good, memory=memory)
     else:
-        reasons = (_why(look, whole, target),)
+        reasons = (_why(observation, whole, target),)
         least = valid_share * whole.valid_share
         best = min(one[2].median for one in tried if one[2].valid_share >= least)
         setting, plan, _ = next(
             one for one in tried if one[2].median <= 1.05 * best and one[2].valid_share >= least
         )
-    found = predict(look, setting, memory=memory)
-    return _choice(rig, look, plan, setting, found, wants, path=path, reasons=reasons)
+    found = predict(observation, setting, memory=memory)
+    return _choice(rig, observation, plan, setting, found, wants, path=path, reasons=reasons)
 
 
-def foresee(
+def forecast(
     rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
 ) -> Choice:
     """Return what a plan of the probe will give at its sites."""
     setting = setting_of(plan)
-    look = sight(rig, subject, seed=seed, sites=setting.sites)
-    return _choice(rig, look, plan, setting, predict(look, setting), wants)
+    observation = simulate_observation(rig, subject, seed=seed, sites=setting.sites)
+    return _choice(rig, observation, plan, setting, predict(observation, setting), wants)
 
 
 def confirm(
@@ -182,15 +184,17 @@ def confirm(
     ]
 
 
-def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
+def candidates(rig: Rig, observation: Observation) -> Iterator[tuple[Setting, Plan]]:
     """Yield plans of all sites in one direction that the rig allows, the quickest first."""
     found: list[tuple[float, Plan]] = []
-    for brackets, longest_s, repeats, darks in itertools.product(SERIES, LONGEST, REPEATS, DARKS):
-        step_ev = math.log2(longest_s / SHORTEST_S) / (brackets - 1)
+    for brackets, longest_s, repeats, darks in itertools.product(
+        BRACKET_CHOICES, LONGEST_EXPOSURE_CHOICES_S, REPEAT_CHOICES, DARK_CHOICES
+    ):
+        step_ev = math.log2(longest_s / MIN_EXPOSURE_S) / (brackets - 1)
         try:
             plan = probe_plan(
                 rig,
-                sites=look.sites,
+                sites=observation.sites,
                 repeats=repeats,
                 brackets=brackets,
                 longest_s=longest_s,
@@ -205,7 +209,7 @@ def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
 
 
 def without_sites(
-    look: Sight,
+    observation: Observation,
     setting: Setting,
     plan: Plan,
     good: Callable[[Prediction], bool],
@@ -216,8 +220,8 @@ def without_sites(
 
     Parameters
     ----------
-    look
-        See `sight`.
+    observation
+        See `simulate_observation`.
     setting, plan
         That reach what is wanted.
     good
@@ -228,7 +232,7 @@ def without_sites(
     while len(setting.sites) > 1:
         for site in setting.sites:
             rest = tuple(other for other in setting.sites if other != site)
-            if good(predict(look, replace(setting, sites=rest), memory=memory)):
+            if good(predict(observation, replace(setting, sites=rest), memory=memory)):
                 kept = tuple(s for s in plan.steps if s.index.get("site") != site)
                 setting, plan = replace(setting, sites=rest), replace(plan, steps=kept)
                 break
@@ -266,7 +270,7 @@ def setting_of(plan: Plan) -> Setting:
 
 def _choice(
     rig: Rig,
-    look: Sight,
+    observation: Observation,
     plan: Plan,
     setting: Setting,
     found: Prediction,
@@ -278,7 +282,7 @@ def _choice(
     full = probe_plan(rig, repeats=setting.repeats)
     value = 100.0 * found.median
     low, high = found.interval()
-    forecast = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
+    predicted = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
     left_out = []
     if len(setting.exposures_s) < N_BRACKETS:
         left_out.append(
@@ -294,7 +298,7 @@ def _choice(
                 "what the farthest fibres would add does not show beside misfit and certificate",
             )
         )
-    for k, site in enumerate(look.sites):
+    for k, site in enumerate(observation.sites):
         if not found.measured[k]:
             left_out.append(
                 (
@@ -309,12 +313,12 @@ def _choice(
         )
     by_site = {
         site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
-        for k, site in enumerate(look.sites)
+        for k, site in enumerate(observation.sites)
     }
     return Choice(
         rig,
         plan,
-        (forecast,),
+        (predicted,),
         plan.estimated_s(rig),
         full.estimated_s(rig),
         {
@@ -324,7 +328,7 @@ def _choice(
             "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
             "darks": setting.darks,
             "valid_share": found.valid_share,
-            BY_SITE: by_site,
+            PERCENT_BY_SITE: by_site,
         },
         tuple(left_out),
         path,
@@ -333,7 +337,7 @@ def _choice(
     )
 
 
-def _why(look: Sight, whole: Prediction, target: float) -> str:
+def _why(observation: Observation, whole: Prediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
     stays = 100.0 * median_of_normals(whole.misfit)
     calibration = 100.0 * median_of_normals(whole.common)
@@ -344,6 +348,6 @@ def _why(look: Sight, whole: Prediction, target: float) -> str:
         + (
             "more exposures or placements will not help"
             if stays > 100.0 * target
-            else f"more than {REPEATS[-1]} placements would be needed"
+            else f"more than {REPEAT_CHOICES[-1]} placements would be needed"
         )
     )

@@ -18,15 +18,15 @@ from capture.plan.probe import exposure_series_s
 from capture.plan.suction import Placement
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.planning.plans import median_of_normals
-from skinrig.planning.probe_sight import Sight, reading_variance
+from skinrig.planning.probe_observation import Observation, reading_variance
 
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
 """Standard error of the share of a fibre's light in a spot so many places away, the last of all
 farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
-FORECAST_SPREAD = 0.2
+FORECAST_RELATIVE_SD = 0.2
 """Relative deviation of standard errors that sessions state from those that were forecast: those
 of three sessions were 0.7 to 1.5 times as large, about two of it either way."""
-DRAWS = 40_000
+INTERVAL_DRAWS = 40_000
 """Of calibrations and readings, for the interval of a median."""
 MAP_PX = 32
 
@@ -89,11 +89,11 @@ class Prediction:
         shared = self.shared[:, good]
         own = np.sqrt(np.maximum(self.sigma[good] ** 2 - np.square(shared).sum(axis=0), 0.0))
         rng = np.random.default_rng(0)
-        off = rng.standard_normal((DRAWS, len(shared))) @ shared
-        off += own * rng.standard_normal((DRAWS, own.size))
+        off = rng.standard_normal((INTERVAL_DRAWS, len(shared))) @ shared
+        off += own * rng.standard_normal((INTERVAL_DRAWS, own.size))
         ends = np.quantile(np.median(np.abs(off), axis=1), (0.16, 0.84))
         # that, and how well a session's standard errors are known beforehand, as logarithms
-        low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_SPREAD))
+        low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_RELATIVE_SD))
         return self.median * math.exp(-low), self.median * math.exp(high)
 
     @property
@@ -103,11 +103,13 @@ class Prediction:
 
 
 Memory = dict[tuple[Any, ...], Sequence[Any]]
-"""Fits of one `Sight` by what they hang on: plans that differ in placements alone share them, and
-without noise nearly all do."""
+"""Fits of one `Observation` by what they hang on: plans that differ in placements alone share
+them, and without noise nearly all do."""
 
 
-def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> Prediction:
+def predict(
+    observation: Observation, setting: Setting, *, memory: Memory | None = None
+) -> Prediction:
     """Return the errors that a plan leaves.
 
     Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
@@ -115,22 +117,22 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
 
     Parameters
     ----------
-    look
-        See `sight`.
+    observation
+        See `simulate_observation`.
     setting
         Sites, exposures, placements and darks.
     memory
         Fits of earlier plans of the same sight, which is added to; None: none are kept.
     """
     memory = {} if memory is None else memory
-    shape = (len(look.sites), 3)
+    shape = (len(observation.sites), 3)
     sigma, shared = np.full(shape, np.inf), np.zeros((0, *shape))
     still, found = np.full(shape, np.inf), np.ones(shape)
     valid = np.zeros(shape, np.bool_)
-    measured = np.zeros(len(look.sites), np.bool_)
-    places = [k for k, site in enumerate(look.sites) if site in setting.sites]
+    measured = np.zeros(len(observation.sites), np.bool_)
+    places = [k for k, site in enumerate(observation.sites) if site in setting.sites]
     with_noise, without = (
-        _fits(look, setting, places, noise=noise, memory=memory) for noise in (True, False)
+        _fits(observation, setting, places, noise=noise, memory=memory) for noise in (True, False)
     )
     for k, fit, quiet in zip(places, with_noise, without, strict=True):
         measured[k] = True
@@ -145,18 +147,27 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
         noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
         still[k] = np.hypot(stays, common)
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
-    rest = _between(look, found, sigma, valid & measured[:, None])
+    rest = _between(observation, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, shared, still, valid, measured)
+    return Prediction(observation.sites, sigma, shared, still, valid, measured)
 
 
 def _fits(
-    look: Sight, setting: Setting, places: Sequence[int], *, noise: bool, memory: Memory
+    observation: Observation,
+    setting: Setting,
+    places: Sequence[int],
+    *,
+    noise: bool,
+    memory: Memory,
 ) -> Sequence[Any]:
     """Return the fits of each site's profile as a plan would read it, or without its noise."""
     read = [
         reading_variance(
-            look, look.reflectance[k], setting.exposures_s, setting.darks, setting.level
+            observation,
+            observation.reflectance[k],
+            setting.exposures_s,
+            setting.darks,
+            setting.level,
         )
         for k in places
     ]
@@ -165,43 +176,51 @@ def _fits(
     count = len(setting.exposures_s)
     key = (noise, tuple(places), count, told.tobytes())
     if key not in memory:
-        memory[key] = _fitted(look, read, places, count, noise=noise)
+        memory[key] = _fitted(observation, read, places, count, noise=noise)
     return memory[key]
 
 
 def _fitted(
-    look: Sight, read: Sequence[Float64Array], places: Sequence[int], exposures: int, *, noise: bool
+    observation: Observation,
+    read: Sequence[Float64Array],
+    places: Sequence[int],
+    exposures: int,
+    *,
+    noise: bool,
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fiber.probe_calibration import FiberReflectance
     from reconstruction.pipeline.probe.images import Measurement
     from reconstruction.pipeline.probe.stages import Profile, fit_profiles
 
-    names = tuple(fibre.name for fibre in look.probe.fibres)
-    radius = np.array(look.probe.radius_mm)
+    names = tuple(fibre.name for fibre in observation.probe.fibres)
+    radius = np.array(observation.probe.radius_mm)
     # gains are known from a series of all exposures on the phantom, as far as its light is known
-    gain = reading_variance(look, look.phantom, exposure_series_s(), 4, 1.0) / look.phantom**2
-    gain += look.phantom_error**2
+    gain = (
+        reading_variance(observation, observation.phantom, exposure_series_s(), 4, 1.0)
+        / observation.phantom**2
+    )
+    gain += observation.phantom_error**2
     mixed = _crosstalk(len(radius))
     profiles = []
     for k, own in zip(places, read, strict=True):
-        value = look.reflectance[k]
+        value = observation.reflectance[k]
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
-        told = (value, look.phantom, value / look.phantom)
+        told = (value, observation.phantom, value / observation.phantom)
         doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
         reflectance = FiberReflectance(
             names,
             radius,
             value,
             variance + gain * value**2 + doubt,
-            np.concatenate([value * look.common, shared]),
+            np.concatenate([value * observation.common, shared]),
             valid,
             ~valid,
         )
-        head = Measurement(Placement(look.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
+        head = Measurement(Placement(observation.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
         profiles.append(Profile(head, reflectance))
-    return fit_profiles(profiles, look.probe) if profiles else []
+    return fit_profiles(profiles, observation.probe) if profiles else []
 
 
 def _crosstalk(count: int) -> Any:
@@ -221,26 +240,26 @@ def _crosstalk(count: int) -> Any:
 
 
 def _between(
-    look: Sight, found: Float64Array, sigma: Float64Array, good: BoolArray
+    observation: Observation, found: Float64Array, sigma: Float64Array, good: BoolArray
 ) -> Float64Array:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
     from reconstruction.subsurface import translucency
     from reconstruction.subsurface.probe_sites import SITE_UV
 
-    known = [k for k, site in enumerate(look.sites) if site in SITE_UV]
+    known = [k for k, site in enumerate(observation.sites) if site in SITE_UV]
     measured = [k for k in known if good[k].any()]
     out = np.full(found.shape, np.inf)
     if not measured:
         return out
     made = translucency.interpolate(
-        [SITE_UV[look.sites[k]] for k in measured],
+        [SITE_UV[observation.sites[k]] for k in measured],
         np.where(good[measured], found[measured], 1.0),
         np.where(good[measured], sigma[measured] * found[measured], np.inf),
         (MAP_PX, MAP_PX),
         valid=good[measured],
     )
     for k in known:
-        u, v = SITE_UV[look.sites[k]]
+        u, v = SITE_UV[observation.sites[k]]
         at = min(int((1.0 - v) * MAP_PX), MAP_PX - 1), min(int(u * MAP_PX), MAP_PX - 1)
         out[k] = np.where(made.valid[at], made.log_stderr[at], np.inf)
     return out

@@ -236,7 +236,7 @@ def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]
 
     Examples
     --------
-    >>> spread(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
+    >>> farthest_point_sample(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
     [1, 0, 2]
     """
     way = places / np.linalg.norm(places, axis=1)[:, None]

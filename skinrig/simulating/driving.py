@@ -20,7 +20,7 @@ from model.skin import SkinAppearance
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
-from skinrig.simulating.orders import USES, Order, Simulated, SimulationError
+from skinrig.simulating.orders import SIMULATED_USES, Order, Simulated, SimulationError
 from skinrig.simulating.resumption import refusals
 from skinrig.simulating.shot_numbers import shots_made
 
@@ -55,7 +55,8 @@ def open_session(
             **{name: f"rigsim {name} box" for name in rig.boxes},
             **{view.name: view.serial for view in rig.views},
         },
-        subject=order.person or Subject(subject_records.pseudonym(order.subject, order.seed), USES),
+        subject=order.person
+        or Subject(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
         source="simulated",
         seed=order.seed,
         extra={"simulation": dict(asked), "effects": [dict(one) for one in effects_of(scene)]},

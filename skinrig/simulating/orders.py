@@ -18,8 +18,8 @@ from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError
 from skinrig.simulating.leaving_out import left_out_of
 
-SIZES = ("small", "full")
-USES = ("research", "publication")
+PICTURE_SIZES = ("small", "full")
+SIMULATED_USES = ("research", "publication")
 """What may be done with a face that is nobody's, unless said otherwise."""
 MIN_WIDTH_PX = 16
 _COUNTS = {"width_px": "width", "lights": "lights", "views": "views"}
@@ -55,6 +55,12 @@ class Simulated:
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
+
+
+def require_size(size: str) -> None:
+    """Raise for a size that no simulation has."""
+    if size not in PICTURE_SIZES:
+        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(PICTURE_SIZES)}")
 
 
 def truth_folder(session: Path) -> Path:
@@ -102,8 +108,8 @@ class Order:
     created: datetime | None = None
     """Date of the session; None: now."""
     person: Subject | None = None
-    """Pseudonym and consent to record; None: one who agreed to :data:`USES`, or, where a session
-    is gone on with, as it was begun. Others than it was begun with are refused."""
+    """Pseudonym and consent to record; None: one who agreed to :data:`SIMULATED_USES`, or, where a
+    session is gone on with, as it was begun. Others than it was begun with are refused."""
     progress: Callable[[str], None] | None = None
     """Called with one line a frame."""
 
@@ -112,8 +118,7 @@ class Order:
             number = getattr(self, name, None)
             if number is not None and number < 1:
                 raise SimulationError(f"{shown}: got {number}, expected a number above 0, or none")
-        if self.size not in SIZES:
-            raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
+        require_size(self.size)
         if self.seed < 0:
             raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
         width_px = getattr(self, "width_px", None)
@@ -332,7 +337,7 @@ class ProbeOrder(Order):
             self.refuse_beside("target of the probe", "sites", "angles")
 
 
-ORDERS: Mapping[str, type[Order]] = {
+ORDER_BY_RIG: Mapping[str, type[Order]] = {
     kind.rig: kind for kind in (FlashOrder, DomeOrder, GradientOrder, ProbeOrder)
 }
 """The class of each rig's orders."""
@@ -344,7 +349,7 @@ def order_for(rig: str, **options: Any) -> Order:
     Parameters
     ----------
     rig
-        A key of :data:`ORDERS`.
+        A key of :data:`ORDER_BY_RIG`.
     options
         Fields of its order; those of another rig's are refused, unless they ask for nothing.
 
@@ -360,13 +365,13 @@ def order_for(rig: str, **options: Any) -> Order:
     >>> order_for("dome", out=Path("session"), lights=12).rig
     'dome'
     """
-    if rig not in ORDERS:
-        raise SimulationError(f"rig: got {rig!r}, expected one of {', '.join(ORDERS)}")
-    own = {one.name for one in fields(ORDERS[rig])}
-    foreign = {one.name: one for kind in ORDERS.values() for one in fields(kind)}
+    if rig not in ORDER_BY_RIG:
+        raise SimulationError(f"rig: got {rig!r}, expected one of {', '.join(ORDER_BY_RIG)}")
+    own = {one.name for one in fields(ORDER_BY_RIG[rig])}
+    foreign = {one.name: one for kind in ORDER_BY_RIG.values() for one in fields(kind)}
     for name in sorted(options.keys() & foreign.keys() - own):
         default = foreign[name].default
         if options.pop(name) not in ({} if default is MISSING else default, None):
             shown = name.removesuffix("_mm")
             raise OptionsError(f"{shown}: the {rig} rig knows nothing of it; leave it out")
-    return ORDERS[rig](**options)
+    return ORDER_BY_RIG[rig](**options)

@@ -17,7 +17,7 @@ from skinrig.errors import INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
-from skinrig.simulating.orders import SIZES, OptionsError, SimulationError
+from skinrig.simulating.orders import OptionsError, SimulationError, require_size
 from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.subject_records import unused_subject_keys
 
@@ -52,8 +52,7 @@ class ServeOrder:
     drawn by the number of a shot, and shots are counted on from those. None: from 0 on."""
 
     def __post_init__(self) -> None:
-        if self.size not in SIZES:
-            raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
+        require_size(self.size)
         if not re.fullmatch(r".+:\d+", self.tcp):
             raise UsageError(f"--tcp: got {self.tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
 

@@ -55,7 +55,7 @@ def simulate_session(rig: str, out: str | Path, **options: Any) -> Simulated:
     Parameters
     ----------
     rig
-        A key of `skinrig.simulating.orders.ORDERS`.
+        A key of `skinrig.simulating.orders.ORDER_BY_RIG`.
     out
         The session's folder.
     options

@@ -75,7 +75,7 @@ def test_other_rigs_know_nothing_of_the_probe_s_options(capsys, tmp_path, option
     ("arguments", "match"),
     [
         (["--subject", "homogeneous:1"], "subject: got 'homogeneous:1'"),
-        (["--width", "64"], "width_px: the probe rig knows nothing"),
+        (["--width", "64"], "--width: the probe rig knows nothing"),
         (["--site", "cheek"], "site: the probe rig knows nothing"),
         (["--target", "chart"], "expected one of phantom, dark"),
         (["--target", "dark", "--sites", "cheek"], "sites: the target of the probe rig"),

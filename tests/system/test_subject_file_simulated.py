@@ -55,7 +55,7 @@ def killed(here, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("skinrig.simulating.simulation.run_plan", broken)
+        patch.setattr("skinrig.simulating.driving.run_plan", broken)
         assert main([*argv, "--consent", "research,teaching"]) == 130
     capsys.readouterr()
     return argv

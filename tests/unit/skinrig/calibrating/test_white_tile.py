@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skinrig.calibrating.white_tile import LEAST_EVEN, NoTileError, evenness, examine
+from skinrig.calibrating.white_tile import MIN_EVEN_FRACTION, NoTileError, evenness, examine
 
 
 def field(height=256, width=384):
@@ -47,13 +47,13 @@ def test_a_lit_ball_before_darkness_is_no_tile(rng):
     y, x = field()
     depth = np.sqrt(np.clip(0.36 - x**2 - y**2, 0, None))
     picture = depth[..., None] * (0.9, 0.6, 0.4) + 1e-4 * rng.standard_normal((256, 384, 3))
-    assert evenness(picture, np.ones((256, 384), bool)) < LEAST_EVEN
+    assert evenness(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
 
 
 def test_an_evenly_lit_chart_of_colors_is_no_tile(rng):
     patches = rng.uniform(0.05, 0.9, (8, 12, 3))
     picture = patches.repeat(32, axis=0).repeat(32, axis=1)
-    assert evenness(picture, np.ones((256, 384), bool)) < LEAST_EVEN
+    assert evenness(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
 
 
 def test_nothing_is_said_of_a_picture_that_is_saturated_all_over():
@@ -62,7 +62,7 @@ def test_nothing_is_said_of_a_picture_that_is_saturated_all_over():
 
 def test_pictures_of_a_few_pixels_are_judged(rng):
     assert evenness(np.ones((8, 8, 3)), np.ones((8, 8), bool)) == 1.0
-    assert evenness(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < LEAST_EVEN
+    assert evenness(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < MIN_EVEN_FRACTION
 
 
 def test_noise_of_a_thumbnail_is_no_unevenness(rng):

@@ -10,7 +10,7 @@ import pytest
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from skinrig.cli import main
-from skinrig.planning import flash, plans
+from skinrig.planning import flash, flash_observation, plans
 
 
 @pytest.fixture(scope="module")
@@ -21,13 +21,13 @@ def rig():
 @pytest.fixture(scope="module")
 def look(rig):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flash, "TEXTURE_PX", 128)
-        return flash.sight(rig, "III", width_px=96)
+        patch.setattr(flash_observation, "TEXTURE_TEXELS", 128)
+        return flash.simulate_observation(rig, "III", width_px=96)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(flash, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(flash, "simulate_observation", lambda *args, **kwargs: look)
 
 
 def test_more_light_frames_and_darks_leave_less_error_down_to_that_of_the_model(look):
@@ -70,7 +70,7 @@ def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path,
     told = plans.lines(plans.choose("flash", want))  # figures as people read them
     assert not any(re.search(r"\d\.\d{5}|[{}_]", line) for line in told), told
     # half the light would not have been enough
-    look = flash.sight(None, "III")
+    look = flash.simulate_observation(None, "III")
     power = document["knobs"]["power"] / 2
     dimmer = flash.predict(look, repeats=1, power=power, darks=0)
     assert dimmer.median("melanin") > 0.08 or dimmer.median("hemoglobin") > 0.2
@@ -110,7 +110,7 @@ def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, 
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
     )
     with pytest.raises(plans.PlanningError, match="no crossed frame"):
-        flash.foresee(rig, bare, {})
+        flash.forecast(rig, bare, {})
     file = tmp_path / "plan.json"
     file.write_text(json.dumps(whole.to_json()))
     assert main(["plan", "gradient", "--forecast", str(file)]) == 3

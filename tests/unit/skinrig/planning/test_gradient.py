@@ -13,7 +13,7 @@ from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from skinrig.cli import main
 from skinrig.planning import gradient, plans
-from skinrig.planning.gradient import SETS, Setting
+from skinrig.planning.gradient import PATTERN_SETS, Setting
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,13 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return gradient.sight(rig, "III", side_px=40)
+    return gradient.simulate_observation(rig, "III", side_px=40)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(gradient, "sight", lambda *args, **kwargs: look)
-    monkeypatch.setattr(gradient, "EXPOSURES", (0.25, 1.0))
+    monkeypatch.setattr(gradient, "simulate_observation", lambda *args, **kwargs: look)
+    monkeypatch.setattr(gradient, "EXPOSURE_CHOICES", (0.25, 1.0))
 
 
 @pytest.mark.long
@@ -37,9 +37,9 @@ def test_complements_and_longer_exposures_lower_the_error(look):
     def median(patterns, exposure_s):
         return gradient.predict(look, Setting(patterns, exposure_s, 2)).median_rad
 
-    least = median(SETS[0], 0.009)
-    assert median(SETS[0], 0.018) < least
-    assert median(SETS[1], 0.009) < least
+    least = median(PATTERN_SETS[0], 0.009)
+    assert median(PATTERN_SETS[0], 0.018) < least
+    assert median(PATTERN_SETS[1], 0.009) < least
 
 
 def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, capsys):
@@ -62,8 +62,8 @@ def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, caps
 
 
 def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
-    monkeypatch.setattr(gradient, "SETS", SETS[:1])
-    monkeypatch.setattr(gradient, "EXPOSURES", (1.0,))
+    monkeypatch.setattr(gradient, "PATTERN_SETS", PATTERN_SETS[:1])
+    monkeypatch.setattr(gradient, "EXPOSURE_CHOICES", (1.0,))
     assert main(["plan", "gradient", "--want", "normals<=0.1deg"]) == 1
     said = capsys.readouterr().out
     assert "the best scan leaves" in said
@@ -88,8 +88,8 @@ def test_patterns_that_do_not_tell_a_gradient_are_refused(rig):
 def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig, tmp_path):
     from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
 
-    look = gradient.sight(rig, "III", seed=3, side_px=96)
-    setting = Setting(SETS[0], 0.018, 0)
+    look = gradient.simulate_observation(rig, "III", seed=3, side_px=96)
+    setting = Setting(PATTERN_SETS[0], 0.018, 0)
     found = gradient.predict(look, setting)
     rng = np.random.default_rng(1)
     gain, floor = look.chip.noise_profile(setting.exposure_s)
@@ -100,13 +100,17 @@ def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig
             variance[key] = gain * np.maximum(light, 0) + floor
             values[key] = light + np.sqrt(variance[key]) * rng.standard_normal(light.shape)
     alpha = estimate_roughness(
-        values, lights=look.told["lights"], view=look.told["view"], variance=variance, smooth_px=1.0
+        values,
+        lights=look.known["lights"],
+        view=look.known["view"],
+        variance=variance,
+        smooth_px=1.0,
     )
-    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.told)
+    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.known)
     inner = (slice(6, -6),) * 2
     cosine = np.sum(made.normals[inner] * look.seen[inner], axis=-1)
     error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
     # the stated spread of forecasts
     ratio = float(np.median(error)) / found.median_rad
-    spread = gradient.FORECAST_SPREAD
+    spread = gradient.FORECAST_RELATIVE_SD
     assert 1.0 / (1.0 + spread) < ratio < 1.0 + spread, math.degrees(found.median_rad)

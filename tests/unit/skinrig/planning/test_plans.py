@@ -11,8 +11,7 @@ from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from reconstruction.photometric_stereo import light_selection
 from skinrig.cli import main
-from skinrig.planning import dome, plans
-from skinrig.planning import dome_observation as dome_sight
+from skinrig.planning import dome, dome_observation, plans
 
 
 @pytest.mark.parametrize(
@@ -38,7 +37,7 @@ def test_a_number_that_cannot_be_wanted_is_told_as_it_was_written():
 
 def test_errors_by_site_are_told_with_their_colors():
     rig = load_rig("flash")
-    knobs = {plans.BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
+    knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
     choice = plans.Choice(rig, flash_plan(rig), (), 1.0, 2.0, knobs, ())
     told = plans.lines(choice)
     assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
@@ -66,7 +65,7 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return dome_sight.sight(rig, "III", points=300)
+    return dome_observation.simulate_observation(rig, "III", points=300)
 
 
 def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
@@ -79,7 +78,7 @@ def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
 
 
 def test_darker_skin_and_fewer_cameras_tell_less(rig, look):
-    dark = dome_sight.sight(rig, "VI", points=300)
+    dark = dome_observation.simulate_observation(rig, "VI", points=300)
     every = look.information(range(16)).weight.sum()
     assert dark.information(range(16)).weight.sum() < every
     assert look.information(range(4)).weight.sum() < every
@@ -95,8 +94,10 @@ def test_albedo_is_forecast_by_the_subjects_own_detail_and_gloss(rig, look):
 
     assert look.unresolved.shape == look.r_d.shape == (300, 3)
     assert 0.015 < forecast(look) < 0.03
-    assert forecast(dome_sight.sight(rig, "VI", points=300)) > 1.1 * forecast(look)
-    fine = dome_sight.sight(rig.resized(1300), "III", points=300)
+    assert forecast(dome_observation.simulate_observation(rig, "VI", points=300)) > 1.1 * forecast(
+        look
+    )
+    fine = dome_observation.simulate_observation(rig.resized(1300), "III", points=300)
     assert np.abs(fine.unresolved).mean() < 0.6 * np.abs(look.unresolved).mean()
     assert forecast(fine) < 0.75 * forecast(look)
     even = dataclasses.replace(look, unresolved=0.0 * look.unresolved)
@@ -110,7 +111,7 @@ def test_the_median_of_errors_about_offsets_is_that_of_draws(rng):
 
 
 def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(dome_sight, "POINTS", 300)
+    monkeypatch.setattr(dome_observation, "FACE_POINTS", 300)
     file = tmp_path / "plan.json"
     code = main(
         [
@@ -144,7 +145,7 @@ def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, cap
 
 
 def test_what_is_out_of_reach_says_why(capsys, monkeypatch):
-    monkeypatch.setattr(dome_sight, "POINTS", 200)
+    monkeypatch.setattr(dome_observation, "FACE_POINTS", 200)
     assert (
         main(
             ["plan", "dome", "--want", "normals<=0.05deg", "--width", "320", "--most-lights", "25"]

@@ -10,7 +10,7 @@ from capture.plan import Plan
 from capture.plan.probe import exposure_series_s, probe_plan
 from capture.rig import load_rig
 from skinrig.cli import main
-from skinrig.planning import plans, probe, probe_forecast, probe_sight
+from skinrig.planning import plans, probe, probe_forecast, probe_observation
 from skinrig.planning.probe import Setting
 
 SITES = ("forehead", "cheek")
@@ -23,14 +23,14 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return probe.sight(rig, "homogeneous:0.05,1.2", sites=SITES)
+    return probe.simulate_observation(rig, "homogeneous:0.05,1.2", sites=SITES)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(probe, "sight", lambda *args, **kwargs: look)
-    monkeypatch.setattr(probe, "SERIES", (3, 6))
-    monkeypatch.setattr(probe, "LONGEST", (0.5, 4.0))
+    monkeypatch.setattr(probe, "simulate_observation", lambda *args, **kwargs: look)
+    monkeypatch.setattr(probe, "BRACKET_CHOICES", (3, 6))
+    monkeypatch.setattr(probe, "LONGEST_EXPOSURE_CHOICES_S", (0.5, 4.0))
 
 
 def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(look):
@@ -73,7 +73,7 @@ def test_the_interval_is_wide_where_all_fits_share_their_error_and_narrow_where_
 
     # one error alone: |z| over its median 0.6745, of which 68 % lie between 0.299 and 2.083
     # (|z| of 0.2019 and 1.4051), and what is not known of it beforehand
-    known = np.log(1.0 + probe_forecast.FORECAST_SPREAD)
+    known = np.log(1.0 + probe_forecast.FORECAST_RELATIVE_SD)
     exact = np.exp([-1.0, 1.0] * np.hypot(np.log([0.2019 / 0.6745, 1.4051 / 0.6745]), known))
     np.testing.assert_allclose(ends(one[None]), exact, rtol=0.04)
     low, high = ends(np.zeros((0, *shape)))
@@ -83,11 +83,11 @@ def test_the_interval_is_wide_where_all_fits_share_their_error_and_narrow_where_
 def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
-    assert np.isfinite(probe_sight.reading_variance(look, skin, series, 2, 1.0)).all()
+    assert np.isfinite(probe_observation.reading_variance(look, skin, series, 2, 1.0)).all()
     # shorter than the shortest exposure would be needed for so much light
-    assert np.isinf(probe_sight.reading_variance(look, 1e3 * skin, series, 2, 1.0)).any()
+    assert np.isinf(probe_observation.reading_variance(look, 1e3 * skin, series, 2, 1.0)).any()
     dim, four = (
-        np.sqrt(probe_sight.reading_variance(look, share * skin, series[:6], 2, 1.0)) / share
+        np.sqrt(probe_observation.reading_variance(look, share * skin, series[:6], 2, 1.0)) / share
         for share in (0.01, 0.04)
     )
     # four times the light: twice as precise by photons, four times by read noise

@@ -14,12 +14,12 @@ from capture.rig import Rig
 from skinrig.arrays import Float64Array
 from skinrig.planning.plans import PlanningError
 
-SATURATED = 0.95
+MAX_READ_FRACTION = 0.95
 """Of the full scale: what is above it is not read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class Observation:
     """What the fibres take from simulated skin, and what the camera makes of it."""
 
     sites: tuple[str, ...]
@@ -41,7 +41,9 @@ class Sight:
     probe: Any
 
 
-def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES) -> Sight:
+def simulate_observation(
+    rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES
+) -> Observation:
     """Look at simulated skin through the fibres.
 
     Parameters
@@ -73,7 +75,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE
 
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2
-    return Sight(
+    return Observation(
         tuple(sites),
         reflectance,
         block.per_mm2,
@@ -87,14 +89,18 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE
 
 
 def reading_variance(
-    look: Sight, value: Float64Array, exposures_s: Sequence[float], darks: int, level: float
+    observation: Observation,
+    value: Float64Array,
+    exposures_s: Sequence[float],
+    darks: int,
+    level: float,
 ) -> Float64Array:
     """Return the variance of readings in 1/mm^4, (F, 3); infinite where all are saturated.
 
     Parameters
     ----------
-    look
-        The skin's or the phantom's, see `sight`.
+    observation
+        The skin's or the phantom's, see `simulate_observation`.
     value
         Reflectance in the fibres, 1/mm^2, (F, 3).
     exposures_s
@@ -104,12 +110,12 @@ def reading_variance(
     level
         Of the light source, 0 to 1.
     """
-    rate = level * look.unit * value  # full scales per second
+    rate = level * observation.unit * value  # full scales per second
     told = np.zeros(rate.shape)
     for seconds in exposures_s:
-        gain, floor = look.chip.noise_profile(seconds)
+        gain, floor = observation.chip.noise_profile(seconds)
         light = rate * seconds
         spread = gain * np.maximum(light, 0.0) + floor * (1.0 + 1.0 / darks)
-        told += np.where(light < SATURATED, seconds**2 / spread, 0.0)
+        told += np.where(light < MAX_READ_FRACTION, seconds**2 / spread, 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / (told * look.pixels * np.square(level * look.unit)))
+        return np.asarray(1.0 / (told * observation.pixels * np.square(level * observation.unit)))

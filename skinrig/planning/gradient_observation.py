@@ -1,0 +1,79 @@
+"""What the gradient sphere's camera sees of a small patch of simulated skin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capture.plan.steps import LIGHT_PATTERNS
+from capture.rig import Rig
+from rigsim.scenes.gradient.truth import appearance as ground_truth
+from skinrig.arrays import Float32Array, Float64Array
+
+Key = tuple[str, str]
+
+PATCH_PX = 96
+"""Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
+BORDER_PX = 6
+"""That is not judged: the lens brings in what is beyond it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
+
+    rates: Mapping[Key, Float32Array]
+    """By pattern and polarizer, (H, W), full scales per second at full level."""
+    known: Mapping[str, Any]
+    """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
+    chip: Any
+    """The sensor, see `rigsim.sensor.Sensor`."""
+    seen: Float64Array
+    """(H, W, 3) normals as the lens shows them."""
+    lost_rad: float
+    """Median angle between the relief's normals before and behind the lens."""
+    seed: int
+
+
+def simulate_observation(
+    rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX
+) -> Observation:
+    """Look at a patch of simulated skin, neutral, under all patterns.
+
+    Parameters
+    ----------
+    rig
+        The gradient sphere.
+    subject, seed
+        Pigment and relief of the forehead.
+    side_px
+        Pixels across.
+    """
+    from model.metrics import angular_error_rad
+    from rigsim.as_built.sphere import nominal_sphere
+    from rigsim.population import files as subject_file
+    from rigsim.scenes.gradient.scene import GradientScene
+    from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
+
+    small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
+    size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
+    skin = subject_file.load_subject(subject).patch("forehead", seed=seed, size_mm=size_mm)
+    sphere = nominal_sphere(small)
+    scene = GradientScene(small, skin, sphere=sphere, seed=seed)
+    rates = {
+        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
+        for pattern in LIGHT_PATTERNS
+        if pattern != "dark"
+        for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
+    }
+    truth = ground_truth(scene, [NEUTRAL]).maps
+    seen, sharp = (
+        np.asarray(truth[name].values, np.float64) for name in ("normals_seen_a000_n0", "normals")
+    )
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    lost = float(np.median(angular_error_rad(seen[inner], sharp[inner])))
+    known = {"lights": lights_of(sphere), **pixel_geometry(small)}
+    return Observation(rates, known, scene.sensor(), seen, lost, seed)
