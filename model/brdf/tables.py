@@ -29,8 +29,8 @@ Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
 NODES_D, NODES_PHI, NODES_H = 32, 12, 90
-LANES = 16  # materials are padded to full vectors of float32
-LEAST = 1e-20
+VECTOR_LANES = 16  # materials are padded to full vectors of float32
+MIN_STORED_VALUE = 1e-20
 """Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
 LED_RADIUS_RAD = 10.0 / 700.0
 """Angular radius of the dome's lights (10 mm at 700 mm) seen from its centre."""
@@ -63,7 +63,7 @@ class BrdfBasis:
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
-        lanes = -(-len(self.names) // LANES) * LANES
+        lanes = -(-len(self.names) // VECTOR_LANES) * VECTOR_LANES
         expected = (NODES_D, NODES_PHI, NODES_H, lanes)
         if not self.names or self.table.shape != expected or self.table.dtype != np.float32:
             raise BasisError(
@@ -211,7 +211,7 @@ def _of_file(path: Path, light_radius_rad: float) -> Float32Array:
 
 def of_merl(table: merl.MerlTable) -> Brdf:
     """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
-    mean = np.where(table.measured, np.tensordot(merl.SCALE, table.stored, 1) / 3.0, np.nan)
+    mean = np.where(table.measured, np.tensordot(merl.BRDF_SCALE, table.stored, 1) / 3.0, np.nan)
     return _nearest_bin(mean)
 
 
@@ -284,9 +284,9 @@ def _filled(values: Float64Array) -> Float64Array:
 
 
 def _padded(columns: Float64Array, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
-    lanes = -(-len(names) // LANES) * LANES
+    lanes = -(-len(names) // VECTOR_LANES) * VECTOR_LANES
     table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
-    table[..., : len(names)] = np.where(columns < LEAST, 0.0, columns)
+    table[..., : len(names)] = np.where(columns < MIN_STORED_VALUE, 0.0, columns)
     return BrdfBasis(table, tuple(names), light_radius_rad)
 
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-TRIES = 24
+MAX_DRAWS = 24
 """Places drawn before a window with too many filled pixels is given up for another candidate."""
-_FAR = np.float32(3.0e38)
+_INFINITE_COST = np.float32(3.0e38)
 
 
 @njit(cache=True, nogil=True)
@@ -42,7 +42,7 @@ def _drawn(key: Any, sources: Any, filled: Any, window: Any, most_filled: Any) -
     Places are drawn as if windows might stand out of the source by half their size, and are then
     moved inside: pixels near its border are so used almost as often as those of the middle.
     """
-    for attempt in range(TRIES):
+    for attempt in range(MAX_DRAWS):
         at = mixed(key + np.uint64(attempt))
         total = 0
         for k in range(sources.shape[0]):
@@ -91,7 +91,7 @@ def _misfit_row(
         right = a[a0 + x + 1] - b[b0 + x + 1] - d
         down = a[a1 + x] - b[b1 + x] - d
         out[x] = per_step * d * d + right * right + down * down
-    out[count - 1] = _FAR
+    out[count - 1] = _INFINITE_COST
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -138,15 +138,15 @@ def cut_cost(
             before[x] = cost[x]
         for x in range(1, overlap - 1):
             cost[x] = row[x] + min(before[x], min(before[x - 1], before[x + 1]))
-        cost[0] = _FAR
-        cost[overlap - 1] = _FAR
+        cost[0] = _INFINITE_COST
+        cost[overlap - 1] = _INFINITE_COST
         if (y & 15) == 15:
-            least = _FAR
+            least = _INFINITE_COST
             for x in range(1, overlap - 1):
                 least = min(least, cost[x])
             if least >= bound:
                 return bound
-    least = _FAR
+    least = _INFINITE_COST
     for x in range(1, overlap - 1):
         least = min(least, cost[x])
     return min(float(least), bound)
@@ -169,13 +169,13 @@ def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
     cost = np.empty((length, overlap), np.float32)
     for x in range(overlap):
         inside = 0 < x < overlap - 1
-        cost[0, x] = misfit[0, x] if inside and (first < 0 or x == first) else _FAR
+        cost[0, x] = misfit[0, x] if inside and (first < 0 or x == first) else _INFINITE_COST
     for y in range(1, length):
-        cost[y, 0] = _FAR
-        cost[y, overlap - 1] = _FAR
+        cost[y, 0] = _INFINITE_COST
+        cost[y, overlap - 1] = _INFINITE_COST
         for x in range(1, overlap - 1):
             least = min(cost[y - 1, x], min(cost[y - 1, x - 1], cost[y - 1, x + 1]))
-            cost[y, x] = least + misfit[y, x] if least < _FAR else _FAR
+            cost[y, x] = least + misfit[y, x] if least < _INFINITE_COST else _INFINITE_COST
     low = 1 if last < 0 else max(last - 1, 1)
     high = overlap - 2 if last < 0 else min(last + 1, overlap - 2)
     x = low

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-SLIVER = 1e-6
+MIN_HEIGHT_RATIO = 1e-6
 """A triangle lower than this part of its longest edge is degenerate; so is one in the texture."""
-EVEN = 1e-6
+ISOTROPY_TOL = 1e-6
 """Relative difference of the two stretch ratios below which no axis is preferred."""
 FINE, DEGENERATE, NO_TEXTURE, TURNED = range(4)
 """What triangles are: usable, without area, without area in the texture, against their own."""
-BAND = 32
+BAND_ROWS = 32
 """Rows of the texture filled by one thread at a time."""
 EMPTY, COVERED, PADDED = range(3)
 
@@ -91,7 +91,7 @@ def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
         longest = max(aa, max(bb, _dot(c, c)))
         n = _cross(a, b)
         twice = math.sqrt(_dot(n, n))
-        if not twice > SLIVER * longest:
+        if not twice > MIN_HEIGHT_RATIO * longest:
             kind[f] = DEGENERATE
             continue
         # on axes e1 = a / |a|, e2 = n x e1: a = (x, 0), b = (u, v)
@@ -132,7 +132,7 @@ def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
         ub, vb = uv[k, 0] - uv[i, 0], uv[k, 1] - uv[i, 1]
         cu, cv = ub - ua, vb - va
         longest = max(ua * ua + va * va, max(ub * ub + vb * vb, cu * cu + cv * cv))
-        if not abs(ua * vb - va * ub) > SLIVER * longest:
+        if not abs(ua * vb - va * ub) > MIN_HEIGHT_RATIO * longest:
             kind[f] = NO_TEXTURE
             continue
         to_uv[f, 0, 0], to_uv[f, 1, 0] = ua / x, va / x
@@ -284,7 +284,7 @@ def vertex_strain(
         mean, h, ax, ay = principal(t[0], t[1], t[2])
         stretch[vertex, 0] = max(1.0 + mean + h, 0.0)
         stretch[vertex, 1] = max(1.0 + mean - h, 0.0)
-        even[vertex] = 2.0 * h <= EVEN * stretch[vertex, 0]
+        even[vertex] = 2.0 * h <= ISOTROPY_TOL * stretch[vertex, 0]
         if even[vertex]:
             vx, vy = 1.0, 0.0
         else:
@@ -339,9 +339,9 @@ def fill_texture(
         Pixels per length along s and t.
     """
     rows, columns = state.shape
-    bands = (rows + BAND - 1) // BAND
+    bands = (rows + BAND_ROWS - 1) // BAND_ROWS
     for band in prange(bands):
-        first, last = top + band * BAND, top + min(rows, (band + 1) * BAND) - 1
+        first, last = top + band * BAND_ROWS, top + min(rows, (band + 1) * BAND_ROWS) - 1
         for f in range(faces.shape[0]):
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             low, high = min(y[i], min(y[j], y[k])), max(y[i], max(y[j], y[k]))
@@ -389,7 +389,7 @@ def fill_texture(
                     s = values[i, 2] + wj * (values[j, 2] - values[i, 2])
                     s += wk * (values[k, 2] - values[i, 2])
                     mean, h, vx, vy = principal(p, q, s)
-                    if 2.0 * h <= EVEN * (1.0 + mean + h):
+                    if 2.0 * h <= ISOTROPY_TOL * (1.0 + mean + h):
                         vx, vy = 1.0, 0.0
                     p = values[i, 3] + wj * (values[j, 3] - values[i, 3])
                     p += wk * (values[k, 3] - values[i, 3])

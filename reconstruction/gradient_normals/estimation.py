@@ -60,13 +60,13 @@ _log = logging.getLogger(__name__)
 Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
 Valid = BoolArray | Mapping[Key, BoolArray] | None
 
-NEEDED = 3.0
+MIN_MOMENT_SIGMAS = 3.0
 """Length of the moment vector over its standard error, below which a pixel has no normal."""
-LEAKY = 0.02
+MAX_MEDIAN_LEAKAGE = 0.02
 """Median leakage from which polarizers do not cross well: 8 degrees off."""
-CONTRADICTION = 3.0
+MAX_RESIDUAL_RATIO = 3.0
 """Mean square of residuals over their variance from which pictures are said not to fit together."""
-ALPHAS = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
+ROUGHNESS_LADDER = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
 """Ladder on which a roughness is searched."""
 
 
@@ -308,7 +308,7 @@ def _reflection(
     if lights is not None:
         # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
         leakage = float(np.median(lights.leakage[lights.intensities > 0]))
-        if leakage > LEAKY:
+        if leakage > MAX_MEDIAN_LEAKAGE:
             _warn_of_leakage(round(leakage, 4))
     return prepare(
         with_shared_dark(stacks),
@@ -414,7 +414,7 @@ def _inverted(
         view,
         place,
         reflection.told > 0,
-        NEEDED,
+        MIN_MOMENT_SIGMAS,
         1e-5 if reflection.kind == np.float32 else 1e-9,
         out,
     )
@@ -464,11 +464,15 @@ def _roughness(
         )
         return float(each.sum() / max(light.sum(), 1e-300)), each / max(light.sum(), 1e-300)
 
-    ladder = np.log(ALPHAS)
+    ladder = np.log(ROUGHNESS_LADDER)
     steps = [excess(a) for a in ladder]
     pixels = max(len(each) for _, each in steps)
     if pixels == 0:
-        return Roughness(ALPHAS[len(ALPHAS) // 2], ALPHAS[len(ALPHAS) // 2], 0)
+        return Roughness(
+            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
+            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
+            0,
+        )
     values = np.array([value for value, _ in steps])
     change = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if change.size == 0:
@@ -476,11 +480,11 @@ def _roughness(
         _log.warning(
             "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
             "narrower" if values[best] > 0.0 else "wider",
-            ALPHAS[0],
-            ALPHAS[-1],
-            ALPHAS[best],
+            ROUGHNESS_LADDER[0],
+            ROUGHNESS_LADDER[-1],
+            ROUGHNESS_LADDER[best],
         )
-        return Roughness(ALPHAS[best], ALPHAS[best], pixels)
+        return Roughness(ROUGHNESS_LADDER[best], ROUGHNESS_LADDER[best], pixels)
     low, high = ladder[change[0]], ladder[change[0] + 1]
     root = float(brentq(lambda a: excess(a)[0], low, high, xtol=2e-3))
     value, each = excess(root)
@@ -550,7 +554,7 @@ def _maps(
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
             contradiction = list(map_tiles(solve, tiles, executor=pool))
     chi, free = (sum(part) for part in zip(*contradiction, strict=True))
-    if reflection.judged and free and chi > CONTRADICTION * free:
+    if reflection.judged and free and chi > MAX_RESIDUAL_RATIO * free:
         _log.warning(
             "patterns contradict each other: residuals of redundant pictures are %.1f times their"
             " noise; did subject or light change between them?",

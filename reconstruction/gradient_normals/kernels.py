@@ -25,14 +25,16 @@ NORMAL_COLUMNS = 9
 GOOD, DIM, LOST, HORIZON = 0.0, 1.0, 2.0, 3.0
 """Status: a normal; no signal above its noise; too few samples; no normal leads to what is seen."""
 
-_PASSES = 24
+_MAX_PASSES = 24
 _STEPS_BACK = 8
-_TOLERATED = 2e-3  # distance between what is seen and what the place found shows
-_ROUGHLY = 2e-3
-_UNSETTLED = 1e-2  # relative changes of the moment vector by the polarization of diffuse light
+_MAX_POSITION_ERROR = 2e-3  # distance between what is seen and what the place found shows
+_COARSE_TOL = 2e-3
+_MAX_MOMENT_CHANGE = (
+    1e-2  # relative changes of the moment vector by the polarization of diffuse light
+)
 _EXACT_TURNS = 8
 _STEEP, _UNLIKE = 0.866, 0.03
-_LEAST_FACING = 0.1  # cosine to the view, which tables end at
+_MIN_FACING = 0.1  # cosine to the view, which tables end at
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -298,7 +300,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
     v0, v1, j00, j01, j10, j11 = lookup(table, least, step, u0, u1, x, y)
     e0, e1 = s0 - v0, s1 - v1
     off = math.sqrt(e0 * e0 + e1 * e1)
-    for _ in range(_PASSES):
+    for _ in range(_MAX_PASSES):
         if off < close:
             break
         det = j00 * j11 - j01 * j10
@@ -311,7 +313,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
         part, better = 1.0, False
         for _ in range(_STEPS_BACK):
             t0, t1 = u0 + part * d0, u1 + part * d1
-            if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _LEAST_FACING):
+            if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _MIN_FACING):
                 v0, v1, k00, k01, k10, k11 = lookup(table, least, step, t0, t1, x, y)
                 f0, f1 = s0 - v0, s1 - v1
                 now = math.sqrt(f0 * f0 + f1 * f1)
@@ -338,11 +340,11 @@ def starts(table, least, step, out):  # type: ignore[no-untyped-def]
         for j in range(size):
             s0 = reach * (2.0 * j / (size - 1) - 1.0)
             out[i, j, 0], out[i, j, 1] = s0, s1
-            if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _LEAST_FACING):
+            if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _MIN_FACING):
                 u0, u1, off, _, _, _, _ = _settle(
                     table, least, step, s0, s1, s0, s1, 0.0, 0.0, 1e-6
                 )
-                if off < _TOLERATED:
+                if off < _MAX_POSITION_ERROR:
                     out[i, j, 0], out[i, j, 1] = u0, u1
 
 
@@ -521,7 +523,7 @@ def invert(  # type: ignore[no-untyped-def]
                     turned[2, j] = (half[2, j] - n2 * s) / size
             else:
                 turned[:] = half
-            if n2 < _LEAST_FACING:
+            if n2 < _MIN_FACING:
                 status = HORIZON
                 break
             scale = math.sqrt(2.0 / (1.0 + n2))
@@ -539,7 +541,7 @@ def invert(  # type: ignore[no-untyped-def]
                 u0, u1, off, j00, j01, j10, j11 = _settle(
                     table, least, step, s0, s1, u0, u1, x, y, close
                 )
-                if off > _TOLERATED:
+                if off > _MAX_POSITION_ERROR:
                     status = HORIZON
                     break
             if not polarized:
@@ -551,10 +553,10 @@ def invert(  # type: ignore[no-untyped-def]
             change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
             ratio = fresh
             if rough:
-                rough = change > _ROUGHLY and turn < last - _EXACT_TURNS
+                rough = change > _COARSE_TOL and turn < last - _EXACT_TURNS
             elif change < max(10.0 * close, 1e-7):
                 break
-            elif turn == last and change > _UNSETTLED:
+            elif turn == last and change > _MAX_MOMENT_CHANGE:
                 status = HORIZON
         if status != GOOD:
             out[p, STATUS] = status

@@ -23,9 +23,9 @@ from model import fresnel
 from model.brdf import microfacet
 from reconstruction.arrays import Float64Array
 
-REACH = 1.3
+TABLE_REACH = 1.3
 """Length of the places that tables are made for: tilts up to 81 degrees."""
-MARGIN = 4
+MARGIN_LINES = 4
 """Grid lines around them."""
 FINEST, COARSEST = 0.0125, 0.04
 """Distance of grid lines; a lobe's roughness has four of them in between."""
@@ -35,7 +35,7 @@ FIELD_MM = 1.0
 F_X, F_Y, SCALE, CONCENTRATION, SYS_XX, SYS_XY, SYS_YY = range(7)
 """Layers of a table: place seen (2); full light over a white diffuser's; length of the mean vector
 to the lights; covariance of the place seen from what is not known about the lights (3)."""
-LAYERS = 7
+TABLE_LAYERS = 7
 FIELD_LAYERS = 4
 """Further layers where the field counts: change of the place seen with the point, 1/mm."""
 
@@ -385,7 +385,7 @@ def _cached(
     lights, frame = _lights(key), frame_of(view)
     matte = np.isnan(alpha)
     step = 0.05 if matte else float(np.clip(alpha / 4.0, FINEST, COARSEST))
-    lines = int(np.ceil(REACH / step)) + MARGIN
+    lines = int(np.ceil(TABLE_REACH / step)) + MARGIN_LINES
     axis = step * np.arange(-lines, lines + 1)
     places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     # beyond the horizon's side of the disc: as at its end, so that splines stay calm
@@ -393,17 +393,17 @@ def _cached(
     places = places * np.minimum(1.0, 1.38 / np.maximum(length, 1e-9))
     normals = normal_at(places) @ frame
     see = _matte_sums(lights, frame, eta) if matte else _glossy_sums(lights, frame, alpha, eta)
-    layers = np.empty((len(places), LAYERS + (FIELD_LAYERS if near else 0)))
+    layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
         shift = np.zeros(3)
-        layers[part, :LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
+        layers[part, :TABLE_LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
         for k in (0, 1) if near else ():
             ends = [
                 _layers(lights, frame, see(normals[part], sign * FIELD_MM * frame[k]), not matte)
                 for sign in (-1.0, 1.0)
             ]
-            layers[part, LAYERS + 2 * k : LAYERS + 2 * k + 2] = (
+            layers[part, TABLE_LAYERS + 2 * k : TABLE_LAYERS + 2 * k + 2] = (
                 ends[1][:, :2] - ends[0][:, :2]
             ) / (2.0 * FIELD_MM)
         if alpha_stderr > 0.0:
@@ -502,7 +502,7 @@ def _layers(
     if mirror:
         passing = np.maximum(np.abs(1.0 - lights.leakage), 1e-9)
         doubt = doubt + (lights.leakage_stderr / passing) ** 2
-    out = np.zeros((len(each), LAYERS))
+    out = np.zeros((len(each), TABLE_LAYERS))
     out[:, [F_X, F_Y]] = place
     out[:, SCALE] = full
     out[:, CONCENTRATION] = np.linalg.norm(vector, axis=1) / np.maximum(full, 1e-300)

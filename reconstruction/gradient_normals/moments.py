@@ -15,9 +15,9 @@ from reconstruction.gradient_normals.patterns import GradientError, MissingPatte
 from reconstruction.gradient_normals.wiener import filtered
 
 TILE_PIXELS = 65_536
-_VALUES = slice(kernels.C_0, kernels.V_0)
-_SPREAD = slice(kernels.V_0, kernels.CHI)
-_VARIANCES = (
+_VALUE_ROWS = slice(kernels.C_0, kernels.V_0)
+_VARIANCE_ROWS = slice(kernels.V_0, kernels.CHI)
+_VARIANCE_PAIRS = (
     (kernels.V_0, 0, 0),
     (kernels.V_XX, 1, 1),
     (kernels.V_YY, 2, 2),
@@ -101,8 +101,10 @@ class Reflection:
             return parallel, crossed
         k = self.leakage / (1.0 - self.leakage)
         cleaned = crossed.copy()
-        cleaned[_VALUES] -= k * (parallel[_VALUES] - crossed[_VALUES])
-        cleaned[_SPREAD] = (1.0 + k) ** 2 * crossed[_SPREAD] + k**2 * parallel[_SPREAD]
+        cleaned[_VALUE_ROWS] -= k * (parallel[_VALUE_ROWS] - crossed[_VALUE_ROWS])
+        cleaned[_VARIANCE_ROWS] = (1.0 + k) ** 2 * crossed[_VARIANCE_ROWS] + k**2 * parallel[
+            _VARIANCE_ROWS
+        ]
         if self.clean is not None:
             self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
@@ -113,13 +115,13 @@ class Reflection:
             return
         lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
         a, b = (np.sqrt(share) for share in self.shares)
-        for row, i, j in _VARIANCES:
+        for row, i, j in _VARIANCE_PAIRS:
             first[row] *= a[i] * a[j]
             if second is not first:
                 first[row] += b[i] * b[j] * second[row]
                 second[row] = 0.0
         for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
-            moments[_VALUES] = clean[:, rows].reshape(4, -1)
+            moments[_VALUE_ROWS] = clean[:, rows].reshape(4, -1)
             moments[: kernels.CHI, lost] = np.nan
 
     def _of(self, stack: Stack, rows: slice, sigma: float) -> FloatArray:
@@ -258,7 +260,7 @@ def with_filter(reflection: Reflection) -> Reflection:
     count = 0
     for rows in reflection.tiles():
         for number, moments in enumerate(reflection.moments(rows)[: len(raw)]):
-            raw[number][:, rows] = moments[_VALUES].reshape(4, -1, width)
+            raw[number][:, rows] = moments[_VALUE_ROWS].reshape(4, -1, width)
             good = np.isfinite(moments[0])
             noise[number] += moments[kernels.V_0 : kernels.V_ZZ + 1][:, good].sum(axis=1)
             count += int(good.sum()) if number == 0 else 0

@@ -34,16 +34,16 @@ __all__ = [
 
 
 TILE_POINTS = 8192
-LEAST_SHARE = 0.5
+MIN_AGREEING_FRACTION = 0.5
 """Of the samples that are not dark, how many must agree with a robust fit."""
-TIGHT = 0.02
+TIGHT_RESIDUAL = 0.02
 """Standard deviation of a robust fit's residuals, over a bright sample, up to which it stands as
 it is: real matte surfaces depart from Lambert's law by more."""
-CLEAR = 0.2
+CLEAR_OUTLIER_RESIDUAL = 0.2
 """Residual over a bright sample from which a sample is a clear outlier."""
-LOOSE = 0.15
-"""Standard deviation as of `TIGHT` that asks for one more clear outlier as evidence."""
-FLATTEST = 3e-3
+LOOSE_RESIDUAL = 0.15
+"""Standard deviation as of `TIGHT_RESIDUAL` that asks for one more clear outlier as evidence."""
+MIN_SINGULAR_RATIO = 3e-3
 """Least over largest singular value of the light directions, below which they lie in a plane."""
 
 
@@ -204,17 +204,17 @@ def estimate_normals(
             1 / 8,
             3.0,
             1.5,
-            LEAST_SHARE,
+            MIN_AGREEING_FRACTION,
             chosen.few,
-            TIGHT,
-            CLEAR,
-            LOOSE,
+            TIGHT_RESIDUAL,
+            CLEAR_OUTLIER_RESIDUAL,
+            LOOSE_RESIDUAL,
         ],
         kind,
     )
     count = int(np.prod(shape))
     flat = samples.reshape(lights, count)
-    out = np.empty((count, kernels.ROWS), kind)
+    out = np.empty((count, kernels.RESULT_ROWS), kind)
     good = np.empty(count, bool)
     noise = _per_sample("variance", variance, lights, shape)
     mask = _usable(valid, lights, shape)
@@ -247,7 +247,7 @@ def estimate_normals(
     out[~good] = 0.0
     out[~good, kernels.STDERR] = np.pi
     out[~good, kernels.STDERR_ALBEDO] = np.inf
-    maps = out.reshape(*shape, kernels.ROWS)
+    maps = out.reshape(*shape, kernels.RESULT_ROWS)
     return NormalMaps(
         normals=np.ascontiguousarray(maps[..., :3]),
         albedo=maps[..., kernels.ALBEDO].copy(),
@@ -329,7 +329,7 @@ def require_spread(directions: FloatArray) -> None:
         Where no normal follows from lights in these directions.
     """
     *_, singular, axes = np.linalg.svd(np.asarray(directions, np.float64), full_matrices=True)
-    least = FLATTEST * singular[0]
+    least = MIN_SINGULAR_RATIO * singular[0]
     if len(singular) < 3 or singular[2] < least:
         unseen = axes[np.count_nonzero(singular >= least) :]
         ways = " and ".join(str(tuple(round(float(v), 2) + 0.0 for v in axis)) for axis in unseen)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, types, void
 
-BLOCK = 32
+BLOCK_POINTS = 32
 """Points gathered at once: rows of a stack are read in whole cache lines."""
-LANES = 32
+LIGHT_LANES = 32
 """Lights are filled up to a multiple with samples of no strength: vector loops have no rest."""
 SHARED, PER_POINT, NEAR = 0, 1, 2
 """How light vectors are given: one a light, one a light and point, or positions."""
@@ -26,19 +26,19 @@ MIN_SPREAD, BRIGHT_PART, DARK_SIGMAS, DARK_FIT, LEAST_SHARE = 6, 7, 8, 9, 10
 FEW, TIGHT, CLEAR, LOOSE = 11, 12, 13, 14
 # Rows of the table of results.
 NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
-ROWS = 9
+RESULT_ROWS = 9
 
 # Reordered sums, but NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
-_FASTER = _FAST | {"nnan", "ninf"}  # where nothing but finite numbers can come
+_FAST_MATH = {"reassoc", "contract", "nsz", "arcp"}
+_FINITE_MATH = _FAST_MATH | {"nnan", "ninf"}  # where nothing but finite numbers can come
 TUKEY_EFFICIENCY = 0.95  # of the biweight with c = 4.685 at the normal distribution
-VAGUE_RAD = 0.5
+MAX_STDERR_RAD = 0.5
 """Standard error from which a signal drowns in its noise."""
-_MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
-_BISECTIONS = 10
+NORMAL_MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
+_N_BISECTIONS = 10
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy", inline="always")
 def _solve(a, g):  # type: ignore[no-untyped-def]
     """Solve the symmetric system a = (xx, xy, xz, yy, yz, zz), g, in float64; singular gives 0."""
     xx, xy, xz, yy, yz, zz = a
@@ -60,7 +60,7 @@ def _solve(a, g):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
     """Return the Newton step of sum m |r| with |r| rounded off below ``soft``."""
     zero = x.dtype.type(0.0)
@@ -83,7 +83,7 @@ def _step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
     """Return the step to the least squares of the samples chosen by m."""
     zero = x.dtype.type(0.0)
@@ -105,7 +105,7 @@ def _step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignore[no-untyped-def]
     """Return the step of Tukey's biweight over the samples that the fit itself sees lit."""
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
@@ -130,7 +130,7 @@ def _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignor
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=_FASTER, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FINITE_MATH, error_model="numpy")
 def _kth_largest(q, rank):  # type: ignore[no-untyped-def]
     """Return about the rank-th largest of the values above 0, from above."""
     zero, one = q.dtype.type(0.0), q.dtype.type(1.0)
@@ -140,7 +140,7 @@ def _kth_largest(q, rank):  # type: ignore[no-untyped-def]
         total += max(q[k], zero)
     low, high = zero, min(top, total / q.dtype.type(rank))
     half = q.dtype.type(0.5)
-    for _ in range(_BISECTIONS):
+    for _ in range(_N_BISECTIONS):
         middle = half * (low + high)
         count = zero
         for k in range(q.size):
@@ -152,7 +152,7 @@ def _kth_largest(q, rank):  # type: ignore[no-untyped-def]
     return high
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _residuals(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-untyped-def]
     """Put |r| of the samples that are not dark into q, -1 for others; return their number.
 
@@ -168,17 +168,17 @@ def _residuals(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-untyp
     return int(count)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _noise(q, count):  # type: ignore[no-untyped-def]
     """Return the scale of residuals: their median without the three that any fit makes 0."""
     if count < 4:
         return q.dtype.type(0.0)
     rank = count - (3 + (count - 3 + 1) // 2) + 1  # from the largest
     # few residuals: Rousseeuw and Leroy (1987), chapter 5, eq. (1.3)
-    return _kth_largest(q, rank) / q.dtype.type(_MAD) * q.dtype.type(1.0 + 5.0 / (count - 3))
+    return _kth_largest(q, rank) / q.dtype.type(NORMAL_MAD) * q.dtype.type(1.0 + 5.0 / (count - 3))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST_MATH, error_model="numpy")
 def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
     """Sum what the standard errors need over the samples with weight; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
@@ -315,7 +315,7 @@ def _finish(  # type: ignore[no-untyped-def]
     if variance < math.inf:
         angle = math.sqrt(variance * across) / length
         error = math.sqrt(variance * max(along, 0.0))
-        if angle > VAGUE_RAD:
+        if angle > MAX_STDERR_RAD:
             return False
     elif free > 0:
         return False
@@ -504,14 +504,14 @@ def _fit_points(  # type: ignore[no-untyped-def]
     kind = out.dtype.type
     lights, count = intensity.shape
     zero, one = kind(0.0), kind(1.0)
-    lanes = (lights + LANES - 1) // LANES * LANES
-    v = np.zeros((BLOCK, lanes), out.dtype)
-    s = np.zeros((BLOCK, lanes), out.dtype)
+    lanes = (lights + LIGHT_LANES - 1) // LIGHT_LANES * LIGHT_LANES
+    v = np.zeros((BLOCK_POINTS, lanes), out.dtype)
+    s = np.zeros((BLOCK_POINTS, lanes), out.dtype)
     x, y, z = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
     q, m, e = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
     sums = np.empty(25, np.float64)
-    for start in range(0, count, BLOCK):
-        size = min(BLOCK, count - start)
+    for start in range(0, count, BLOCK_POINTS):
+        size = min(BLOCK_POINTS, count - start)
         for k in range(lights):
             for p in range(size):
                 value = kind(intensity[k, start + p])
@@ -556,7 +556,7 @@ def _fit_points(  # type: ignore[no-untyped-def]
                         x[k], y[k], z[k] = dx * scale, dy * scale, dz * scale
                     else:
                         x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
-            for row in range(ROWS):
+            for row in range(RESULT_ROWS):
                 out[place, row] = zero
             valid[place] = _fit_point(
                 x,

@@ -43,16 +43,18 @@ class Recipe:
 def _flash() -> Recipe:
     from reconstruction.pipeline.flash import sequence as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(
+        stages_of.MAP_NAMES, stages_of.graph, stages_of.FILE_NAMES, products=stages_of.products
+    )
 
 
 def _dome() -> Recipe:
     from reconstruction.pipeline.dome import stages as stages_of
 
     return Recipe(
-        stages_of.MAPS,
+        stages_of.MAP_NAMES,
         stages_of.graph,
-        stages_of.FILES,
+        stages_of.FILE_NAMES,
         ("position",),
         maps_of_rank=stages_of.maps_of,
     )
@@ -61,24 +63,28 @@ def _dome() -> Recipe:
 def _gradient() -> Recipe:
     from reconstruction.pipeline.gradient import stages as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(
+        stages_of.MAP_NAMES, stages_of.graph, stages_of.FILE_NAMES, products=stages_of.products
+    )
 
 
 def _probe() -> Recipe:
     from reconstruction.pipeline.probe import stages as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(
+        stages_of.MAP_NAMES, stages_of.graph, stages_of.FILE_NAMES, products=stages_of.products
+    )
 
 
 def light_list() -> Recipe:
     """Return the recipe of pictures under listed lights, imported without a rig."""
     from reconstruction.pipeline import light_stack as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph)
+    return Recipe(stages_of.MAP_NAMES, stages_of.graph)
 
 
 # kernels are compiled when a module is first imported: each rig imports its own only
-RECIPES: Mapping[str, Callable[[], Recipe]] = {
+RECIPE_OF_STEP: Mapping[str, Callable[[], Recipe]] = {
     "subject": _flash,
     "olat": _dome,
     "gradient": _gradient,
@@ -98,12 +104,12 @@ def recipe_of(session: Session) -> Recipe:
     if "light_list" in session.manifest.extra:
         return light_list()
     kinds = {step.kind for step in session.plan.steps}
-    for kind, recipe in RECIPES.items():
+    for kind, recipe in RECIPE_OF_STEP.items():
         if kind in kinds:
             return recipe()
     raise EvidenceError(
         f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
-        f"{' or '.join(RECIPES)}; `skinrig calibrate` takes sessions of targets"
+        f"{' or '.join(RECIPE_OF_STEP)}; `skinrig calibrate` takes sessions of targets"
     )
 
 
@@ -130,7 +136,7 @@ def reconstruct(
     session
         SESSION/ folder.
     want
-        Names of maps; which there are depends on the rig, see :data:`RECIPES`.
+        Names of maps; which there are depends on the rig, see :data:`RECIPE_OF_STEP`.
     out
         The folder. Maps in it that are still current, by the hash of all that they depend on,
         are kept and not computed again.
@@ -289,7 +295,7 @@ class _Kept:
 
 
 def _previous(out: Path) -> SkinAppearance | None:
-    if not (out / store.DOCUMENT).is_file():
+    if not (out / store.DOCUMENT_FILE).is_file():
         return None
     try:
         return store.read(out)

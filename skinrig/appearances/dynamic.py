@@ -153,7 +153,7 @@ def read(path: Path, *, parts: Sequence[str] = PARTS) -> tuple[SkinAppearance, d
 
 
 def _previous(out: Path) -> SkinAppearance | None:
-    if not (out / store.DOCUMENT).is_file():
+    if not (out / store.DOCUMENT_FILE).is_file():
         return None
     kind = store.read_document(out).parameters.get("kind")
     if kind != KIND:

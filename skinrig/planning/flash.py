@@ -18,7 +18,7 @@ from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.detectability import detectable
-from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
+from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
@@ -166,7 +166,7 @@ def predict(look: Sight, *, repeats: int, power: float, darks: int) -> Predictio
     variance = (frame / repeats + dark) * look.shares
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = variance / np.square(power * look.light)
-    skin = look.skin & (relative < 1.0 / DARKEST_SIGMAS**2).all(axis=-1)
+    skin = look.skin & (relative < 1.0 / MIN_SIGNAL_SIGMAS**2).all(axis=-1)
     bounds = relative_bounds(
         look.table,
         look.melanin[skin],

@@ -15,7 +15,7 @@ from reconstruction.scan.repair import TriangleMesh
 
 ALIGNING_LIGHTS: Final = 40
 """Lights whose images say where the mesh is."""
-SIGNAL: Final = 5.0
+MIN_SIGNAL_TO_NOISE: Final = 5.0
 """Times its noise from which on a pixel shows something."""
 
 
@@ -43,7 +43,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
             image = dome.image(view, capture)
             gray = image.rgb.mean(axis=-1)
             noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
-            seen = image.valid & (gray > SIGNAL * noise)
+            seen = image.valid & (gray > MIN_SIGNAL_TO_NOISE * noise)
             shares.append((np.mean(~image.valid), np.mean(seen)))
             layers.append(np.where(image.valid, gray, np.nan))
         return np.asarray(layers, np.float32)

@@ -36,18 +36,18 @@ from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 
-REVISION = 4
+STAGE_REVISION = 4
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-RANK: Final = 4
+BASIS_RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
-UNUSUAL: Final = 6.0
+MAX_RELATIVE_STRENGTH: Final = 6.0
 """Times the usual strength from which on a point's mixture is not used to find the common ones."""
-RANKS: Final = (1, 2, RANK, 2 * RANK, 24)
+RECORDED_RANKS: Final = (1, 2, BASIS_RANK, 2 * BASIS_RANK, 24)
 """Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
 BASIS_POINTS: Final = 5_000
 """Points, drawn at random, that the mixtures are found on."""
-SCAN: Final = "scan.ply"
+SCAN_FILE: Final = "scan.ply"
 MEMORY_BYTES: Final = 2**30
 """Size of the table of samples from which on it lies in files and not in memory."""
 FACE_MM2: Final = 60_000.0
@@ -56,7 +56,7 @@ POINT_LIMITS: Final = (8_000, 1_000_000)
 TEXTURE_LIMITS: Final = (128, 2048)
 
 
-def weight_names(rank: int = RANK) -> tuple[str, ...]:
+def weight_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps of shares of so many lobes.
 
     Examples
@@ -67,7 +67,7 @@ def weight_names(rank: int = RANK) -> tuple[str, ...]:
     return tuple(f"basis_weight_{k}" for k in range(rank))
 
 
-def maps_of(rank: int = RANK) -> tuple[str, ...]:
+def maps_of(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps that can be made of a dome session."""
     return (
         "position",
@@ -81,14 +81,14 @@ def maps_of(rank: int = RANK) -> tuple[str, ...]:
     )
 
 
-REFINEMENTS = 2
+N_REFINEMENTS = 2
 """Turns of fitting normals by the lobes, and the lobes at the normals."""
-WEIGHTS = weight_names()
-MAPS = maps_of()
+WEIGHT_NAMES = weight_names()
+MAP_NAMES = maps_of()
 """Maps that can be made of a dome session, unless another rank is asked for."""
 BASIS_FILE = "brdf_basis.npz"
 MESH_FILE = "mesh.obj"
-FILES = (MESH_FILE, BASIS_FILE)
+FILE_NAMES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
 
 
@@ -117,10 +117,13 @@ class Samples:
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(evidence)
-    base: dict[str, Any] = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base: dict[str, Any] = {
+        "revision": STAGE_REVISION,
+        "inputs": dict(sorted(evidence.hashes.items())),
+    }
     if evidence.hold_out:
         base["held_out"] = evidence.hold_out.record()
-    weights_made = weight_names(evidence.rank or RANK)
+    weights_made = weight_names(evidence.rank or BASIS_RANK)
 
     unscaled = (
         ""
@@ -195,7 +198,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             lambda lumitexels, point_normals, point_r_d: _lobes(
                 evidence, lumitexels, point_normals, point_r_d
             ),
-            ranks=list(RANKS),
+            ranks=list(RECORDED_RANKS),
         ),
         stage(
             "refined normals",
@@ -243,14 +246,14 @@ def _dome(evidence: Evidence) -> Dome:
 def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
     session = evidence.session
-    if evidence.scan is None and SCAN not in session.attachments():
+    if evidence.scan is None and SCAN_FILE not in session.attachments():
         raise EvidenceError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
-    mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
+    mesh = session.attachment(SCAN_FILE) if evidence.scan is None else evidence.scan
     scan = scan_mesh.prepare(mesh, points=points)
     fit = register(dome, scan.coarse)
     evidence.noted["registration"] = {
@@ -390,7 +393,7 @@ def _lobes(
     folder = evidence.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
     store = lumitexels.store
-    rank = evidence.rank or RANK
+    rank = evidence.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
         raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
@@ -410,13 +413,13 @@ def _lobes(
                 materials,
             ).weights
         )
-    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * RANK))
+    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * BASIS_RANK))
     most = min(shares.shape)
     if rank > most:
         raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
     mixes = {
         k: brdf_basis.reduce(shares, k, basis=materials)[1:]
-        for k in sorted({*RANKS, rank})
+        for k in sorted({*RECORDED_RANKS, rank})
         if k <= most
     }
     basis = materials.mixed(mixes[rank][0])
@@ -444,7 +447,7 @@ def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Fl
     total = shares @ materials.strength()
     some = total[total > 0]
     usual = float(np.median(some)) if len(some) else 0.0
-    kept = (total > 0) & (total < UNUSUAL * usual)
+    kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
     if np.count_nonzero(kept) < least:
         raise EvidenceError(
             f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
@@ -499,7 +502,7 @@ def _refined(
         known,
     )
     found, rank = inside, weights.shape[1]
-    for turn in range(REFINEMENTS):
+    for turn in range(N_REFINEMENTS):
         normals, shares = found, weights
         found = lumitexels.collect(
             lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
@@ -510,13 +513,13 @@ def _refined(
                 basis,
                 now=n.values[part],
             ),
-            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {REFINEMENTS}"),
+            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {N_REFINEMENTS}"),
         )
         fitted = lumitexels.collect(
             lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
                 samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis
             ),
-            progress=partial(dome.tell, f"lobes, {turn + 1} of {REFINEMENTS}"),
+            progress=partial(dome.tell, f"lobes, {turn + 1} of {N_REFINEMENTS}"),
         )
         weights = fitted.values[:, :rank]
     maps = {

@@ -18,7 +18,7 @@ import numpy as np
 
 from model import color_table
 from model.facial_color import HemoglobinRig
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error, shading_prior
@@ -32,7 +32,7 @@ from reconstruction.facial_color.shared_melanin import SharedMelanin
 from reconstruction.pipeline.flash.stages import EXPOSURE_SPREAD
 from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
 
-CORRELATED_PX: Final = 3.0
+NOISE_CORRELATION_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
 RADIUS_SHARE: Final = 1 / 32
 """Radius of the disc over the larger side of the map, where none is given."""
@@ -212,7 +212,7 @@ def fit(
     good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
     melanin = SkinMap(
         np.where(good, shared.melanin, 0.0),
-        UNITS["melanin"],
+        MAP_UNITS["melanin"],
         np.where(good, shared.stderr_melanin, 0.0),
         good,
         f"shared by {len(kept)} states",
@@ -286,7 +286,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     melanin, melanin_error, melanin_good = over("melanin")
     try:
         compared = repeatability.compare(
-            blood, states, stderr=blood_error, valid=blood_good, correlated_px=CORRELATED_PX
+            blood, states, stderr=blood_error, valid=blood_good, correlated_px=NOISE_CORRELATION_PX
         )
     except RepeatabilityError:
         return None
@@ -299,7 +299,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
             [one.image.captured_s for one in aligned],
             stderr=melanin_error,
             valid=melanin_good,
-            correlated_px=CORRELATED_PX,
+            correlated_px=NOISE_CORRELATION_PX,
         )
     except RepeatabilityError:
         drifts = ()
@@ -367,7 +367,7 @@ def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good &= detectable(shared.hemoglobin[k], shared.stderr_hemoglobin[k], good)
     return SkinMap(
         np.where(good, shared.hemoglobin[k], 0.0),
-        UNITS["hemoglobin"],
+        MAP_UNITS["hemoglobin"],
         np.where(good, shared.stderr_hemoglobin[k], 0.0),
         good,
         "given the melanin that all states share",
@@ -379,7 +379,7 @@ def _change(shared: SharedMelanin, k: int) -> SkinMap:
     good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
     return SkinMap(
         np.where(good, shared.change[k], 0.0),
-        UNITS["hemoglobin"],
+        MAP_UNITS["hemoglobin"],
         np.where(good, shared.stderr_change[k], 0.0),
         good,
         "less the neutral state; errors that both share are left out",

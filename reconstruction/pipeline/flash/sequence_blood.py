@@ -32,7 +32,7 @@ POSE_SHARE = 0.10
 light, shadows and what lies under a pixel change with the pose. Most likely of the cheeks, where
 the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of noses 0.03, of
 places that hardly move less than 0.02."""
-ALWAYS = 0.9
+MIN_VALID_FRAME_FRACTION = 0.9
 """Part of the frames in which a pixel must be usable."""
 
 
@@ -141,7 +141,7 @@ def _of_place(
         )
         good = blood.valid_states & ~blood.misfits & np.isfinite(blood.hemoglobin)
         # a pixel counts in nearly all frames or in none: who is in it would change the mean
-        good &= good.mean(axis=0) >= ALWAYS
+        good &= good.mean(axis=0) >= MIN_VALID_FRAME_FRACTION
         return disc_means(
             blood.hemoglobin, at, radius_px, stderr=blood.noise_stderr_hemoglobin, valid=good
         )

@@ -29,29 +29,29 @@ from reconstruction.pipeline.probe.images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit, translucency
 from reconstruction.subsurface import nearest as nearest_medium
 
-REVISION = 7
+STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older results are computed again."""
 
-MAPS = ("profiles", "subsurface", "anisotropy", "translucency")
+MAP_NAMES = ("profiles", "subsurface", "anisotropy", "translucency")
 """What can be made of a session of the fibre probe; see `products` for what it stands for."""
 PROFILE_FILE, SUBSURFACE_FILE = "profiles.json", "subsurface.json"
 ANISOTROPY_FILE = "anisotropy.json"
-FILES = (PROFILE_FILE, SUBSURFACE_FILE, ANISOTROPY_FILE)
+FILE_NAMES = (PROFILE_FILE, SUBSURFACE_FILE, ANISOTROPY_FILE)
 
-CHANNELS = ("red", "green", "blue")
-METHODS = ("photon_table", "diffusion", "dipole")
+CHANNEL_NAMES = ("red", "green", "blue")
+METHOD_NAMES = ("photon_table", "diffusion", "dipole")
 """The first is the recommended one; the others stand beside it."""
 MAP_SHAPE = (256, 256)
 FALSE_ALARMS = 0.01
 """Chance at which isotropic tissue is called anisotropic, per site and channel."""
 
-UNLIKE = 0.03
+MAX_HOMOGENEOUS_MISFIT = 0.03
 """Relative misfit from which a bent profile is that of no homogeneous medium, but of layered
 tissue. What each fibre has off by itself, as by dirt on it, bends none."""
 
 
 def products(_: Session) -> Mapping[str, tuple[str, ...]]:
-    """Return the maps and files that each name of :data:`MAPS` stands for."""
+    """Return the maps and files that each name of :data:`MAP_NAMES` stands for."""
     return {
         "profiles": (PROFILE_FILE,),
         "subsurface": (SUBSURFACE_FILE,),
@@ -135,7 +135,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     sensor = evidence.load("sensor", [serial], nominal)
     fibres = _fibres(evidence)
     places = _places(evidence)
-    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     return [
         stages.Stage(
             "profiles",
@@ -226,7 +226,7 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
                         "stderr_own": np.sqrt(profile.reflectance.variance[:, c]),
                         "valid": profile.reflectance.valid[:, c],
                     }
-                    for c, channel in enumerate(CHANNELS)
+                    for c, channel in enumerate(CHANNEL_NAMES)
                 },
             }
             for profile in profiles
@@ -235,36 +235,36 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
 
 
 def _subsurface(profiles: Sequence[Profile], probe: Probe) -> Mapping[str, Any]:
-    fits = {method: fit_profiles(profiles, probe, method) for method in METHODS}
-    sites = site_values(fits[METHODS[0]])
+    fits = {method: fit_profiles(profiles, probe, method) for method in METHOD_NAMES}
+    sites = site_values(fits[METHOD_NAMES[0]])
     document = {
         "schema": "skinrig.subsurface/1",
         "unit": "1/mm",
         "eta": ETA_SKIN,
-        "methods": METHODS,
-        "recommended": METHODS[0],
+        "methods": METHOD_NAMES,
+        "recommended": METHOD_NAMES[0],
         "measurements": [
             {
                 **_head(profile.measurement),
                 "fits": [
                     _fit_document(fits[method][number], c)
-                    for c in range(len(CHANNELS))
-                    for method in METHODS
+                    for c in range(len(CHANNEL_NAMES))
+                    for method in METHOD_NAMES
                 ],
             }
             for number, profile in enumerate(profiles)
         ],
-        "sites": [_site_document(site, c) for site in sites for c in range(len(CHANNELS))],
+        "sites": [_site_document(site, c) for site in sites for c in range(len(CHANNEL_NAMES))],
     }
     return {
-        "_fits": fits[METHODS[0]],
+        "_fits": fits[METHOD_NAMES[0]],
         "_sites": sites,
         SUBSURFACE_FILE: stages.document_bytes(document),
     }
 
 
 def fit_profiles(
-    profiles: Sequence[Profile], probe: Probe, method: Any = METHODS[0]
+    profiles: Sequence[Profile], probe: Probe, method: Any = METHOD_NAMES[0]
 ) -> list[ProfileFit]:
     """Fit all profiles and channels, also with each common error at its uncertainty."""
     first = profiles[0].reflectance
@@ -282,8 +282,8 @@ def fit_profiles(
         "source_core_mm": probe.source_core_mm,
     }
     fit = subsurface.invert(first.radius_mm, every, method=method, **told)
-    if np.any(unlike := fit.bent[0] & (fit.model_error[0] > UNLIKE)):
-        if method == METHODS[0]:
+    if np.any(unlike := fit.bent[0] & (fit.model_error[0] > MAX_HOMOGENEOUS_MISFIT)):
+        if method == METHOD_NAMES[0]:
             other = subsurface.nearest_medium(first.radius_mm, every, **told)
         else:
             other = subsurface.invert(
@@ -389,7 +389,7 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
     with np.errstate(invalid="ignore"):
         interval = sigma_tr * (fit.interval_per_mm[c] / sigma_tr) ** widen
     return {
-        "channel": CHANNELS[c],
+        "channel": CHANNEL_NAMES[c],
         "method": fit.method,
         "sigma_tr_per_mm": sigma_tr,
         "sigma_tr_stderr": sigma_tr * total,
@@ -421,7 +421,7 @@ def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
     sigma_tr, stderr = float(site.sigma_tr_per_mm[c]), float(site.stderr_per_mm[c])
     return {
         "site": site.site,
-        "channel": CHANNELS[c],
+        "channel": CHANNEL_NAMES[c],
         "measurements": site.measurements[c],
         "sigma_tr_per_mm": sigma_tr,
         "sigma_tr_stderr": stderr,
@@ -451,7 +451,7 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
         )
         bias = one_direction_bias(found, angle)
         off = np.maximum(np.abs(bias.lowest), np.abs(bias.highest))
-        for c, channel in enumerate(CHANNELS):
+        for c, channel in enumerate(CHANNEL_NAMES):
             rows.append(
                 {
                     "site": site,

@@ -10,7 +10,7 @@ import numpy as np
 from model import microstructure
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.appearances.dynamic import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.appearances.front_view import WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import folders, verdict
@@ -26,7 +26,7 @@ def maps(tmp_path):
         store.write(
             tmp_path / name,
             SkinAppearance(
-                {"melanin": SkinMap(melanin, UNITS["melanin"], np.full(melanin.shape, 0.001))},
+                {"melanin": SkinMap(melanin, MAP_UNITS["melanin"], np.full(melanin.shape, 0.001))},
                 "measured",
             ),
         )
