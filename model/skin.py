@@ -79,6 +79,11 @@ class SkinMap:
         if not np.isfinite(shown).all():
             raise ValueError("values: got NaN or infinity at a valid pixel, expected finite values")
 
+    @property
+    def mask(self) -> BoolArray:
+        """Return the valid pixels, (H, W) bool; all of them where ``valid`` is None."""
+        return np.ones(self.values.shape[:2], np.bool_) if self.valid is None else self.valid
+
 
 @dataclass(frozen=True, slots=True)
 class SkinAppearance:

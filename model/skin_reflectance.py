@@ -181,7 +181,7 @@ def assemble(
             raise SkinReflectanceError(
                 f"{name}: got shape {one.values.shape[:2]}, expected {shape} as of position"
             )
-        valid &= _valid(one)
+        valid &= one.mask
     position, r_d, normals, *shares = maps
     # shares are at least 0 at the points; drawn into texels beyond the rim they can undershoot
     weights = np.maximum(np.stack([one.values for one in shares], axis=-1), 0.0)
@@ -379,17 +379,13 @@ def _normals(appearance: SkinAppearance) -> SkinMap:
     if len(there) == 1 or there[0].values.shape != there[1].values.shape:
         return there[0]
     best, other = there
-    good = _valid(best)
+    good = best.mask
     return SkinMap(
         np.where(good[..., None], best.values, other.values),
         best.unit,
-        valid=good | _valid(other),
+        valid=good | other.mask,
         description=best.description,
     )
-
-
-def _valid(one: SkinMap) -> BoolArray:
-    return np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
 
 
 def _rows(model: SkinReflectance, rows: ArrayLike) -> NDArray[np.intp]:
@@ -413,7 +409,7 @@ def _over_texture(
             raise SkinReflectanceError(
                 f"translucency: got shape {given.values.shape}, expected (H, W, 3)"
             )
-        known = _resampled(_valid(given).astype(np.float32)[..., None], shape)[..., 0] > 0.999
+        known = _resampled(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
         stderr = None if given.stderr is None else _resampled(given.stderr, shape)
         return _resampled(given.values, shape), stderr, known
     values = np.asarray(given, np.float32)

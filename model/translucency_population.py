@@ -351,13 +351,10 @@ def table(
     n = good.sum(axis=0)
     some = np.maximum(n, 1)
     # squares and fourth powers in a unit that keeps them from vanishing and from overflowing
-    unit, noise_unit = (
-        int(np.frexp(np.where(good, of, 0.0).max(initial=0.0))[1]) for of in (values, noise)
-    )
-    values, noise = (
-        np.ldexp(np.where(good, of, 0.0), -by) for of, by in ((values, unit), (noise, noise_unit))
-    )
-    mean = np.where(good, values, 0.0).sum(axis=0) / some
+    values, noise = np.where(good, values, 0.0), np.where(good, noise, 0.0)
+    unit, noise_unit = (int(np.frexp(of.max(initial=0.0))[1]) for of in (values, noise))
+    values, noise = np.ldexp(values, -unit), np.ldexp(noise, -noise_unit)
+    mean = values.sum(axis=0) / some
     off = np.where(good, values - mean, 0.0)
     variance = np.where(n > 1, (off**2).sum(axis=0) / np.maximum(n - 1, 1), 0.0)
     fourth = (off**4).sum(axis=0) / some
@@ -398,10 +395,6 @@ def summarize(
         Places to list; by default those of the table that were measured, in its order, then
         others by name.
     channels : sequence of str
-
-    Returns
-    -------
-    PopulationTable
 
     Raises
     ------

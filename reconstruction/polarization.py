@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.fresnel import ETA_SKIN
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 __all__ = ["PolarizerAxes", "Separation", "separate"]
 
-
-ETA_SKIN = 1.4  # refractive index of skin over that of air, Tuchin 2007 (doi 10.1117/3.684093)
 MIN_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
 
 
@@ -265,8 +265,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _normalized(a: FloatArray) -> FloatArray:
-    length = np.linalg.norm(a, axis=-1, keepdims=True)
-    return np.asarray(a / np.maximum(length, np.finfo(a.dtype).tiny))
+    return unit_vectors(a, min_length=np.finfo(a.dtype).tiny)
 
 
 def _passed_field(absorbing: FloatArray, direction: FloatArray) -> FloatArray:

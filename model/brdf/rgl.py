@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import Float32Array, Float64Array
 from model.brdf import tensor_file
+from model.vectors import unit_vectors
 
 N_ELEVATIONS = 45
 TABLE_SIDE = 90
@@ -114,8 +115,7 @@ class RglTable:
         )
         above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
         to, at = light[above], view[above]
-        half = to + at
-        half /= np.linalg.norm(half, axis=-1, keepdims=True)
+        half = unit_vectors(to + at)
         turn = np.arctan2(half[:, 1], half[:, 0]) - np.arctan2(at[:, 1], at[:, 0])
         square = np.stack(
             [np.sqrt(_elevation(half) * (2.0 / np.pi)), np.mod(turn / (2.0 * np.pi) + 0.5, 1.0)], -1
@@ -168,7 +168,7 @@ def of_brdf(
         along = half @ view
         light = 2.0 * along[..., None] * half - view
         seen = (along > 0.0) & (light[..., 2] > 0.0)
-        to = light[seen] / np.linalg.norm(light[seen], axis=-1, keepdims=True)
+        to = unit_vectors(light[seen])
         found = np.asarray(brdf(to, np.broadcast_to(view, to.shape)), np.float64)
         if not np.all((found >= 0.0) & (found < np.inf)):
             raise ValueError("brdf: got negative or non-finite values, expected 1/sr")

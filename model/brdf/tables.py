@@ -24,6 +24,7 @@ from scipy.ndimage import distance_transform_edt
 from model import merl
 from model.arrays import Float32Array, Float64Array
 from model.brdf import recipe as brdf_recipe
+from model.vectors import unit_vectors
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
@@ -253,16 +254,14 @@ def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
         return _filled(np.asarray(brdf(light, view)))
     # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
     helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
-    u = np.cross(helper, light)
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    u = unit_vectors(np.cross(helper, light))
     v = np.cross(light, u)
     total = np.zeros(d.shape)
     weight = np.zeros(d.shape)
     for point in range(7):
         turn = point * np.pi / 3.0
         reach = 0.0 if point == 6 else np.tan(radius_rad) * np.sqrt(2.0 / 3.0)
-        to = light + reach * (np.cos(turn) * u + np.sin(turn) * v)
-        to /= np.linalg.norm(to, axis=-1, keepdims=True)
+        to = unit_vectors(light + reach * (np.cos(turn) * u + np.sin(turn) * v))
         value = np.asarray(brdf(to, view))
         share = (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)
         known = np.isfinite(value)

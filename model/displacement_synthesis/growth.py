@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from model.displacement_synthesis import kernels
+from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
 from model.displacement_synthesis.sources import Sources, SynthesisError, gather, leveled
@@ -314,7 +314,7 @@ def _choose(
         )
 
     def cut_columns(row: int) -> None:
-        kernels.cut_columns(
+        cut_kernels.cut_columns(
             row,
             cells,
             grid.lines_x,
@@ -328,7 +328,7 @@ def _choose(
         )
 
     def cut_rows(line: int) -> None:
-        kernels.cut_rows(
+        cut_kernels.cut_rows(
             line,
             cells,
             grid.lines_y,

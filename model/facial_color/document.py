@@ -111,7 +111,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
             _map(maps, f"{kind}_{name}", stored, unit)
             for kind, unit in (("scale", "1"), ("bias", _BLOOD_UNIT), ("misfit", _BLOOD_UNIT))
         )
-        valid = _valid(scale)
+        valid = scale.mask
         states[name] = StateMaps(
             scale=_double(scale.values, valid),
             bias=_double(bias.values, valid),
@@ -124,12 +124,12 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
             storage_largest=number["storage_largest"],
         )
     mean = _map(maps, f"bias_{NEUTRAL}", stored, _BLOOD_UNIT)
-    held = _valid(neutral)
+    held = neutral.mask
     return HemoglobinRig(
         neutral=np.where(held, neutral.values, np.float32(0)),
         valid=held,
         neutral_stderr=np.where(held, _stderr(neutral), np.float32(0)),
-        neutral_mean=_double(mean.values, _valid(mean)),
+        neutral_mean=_double(mean.values, mean.mask),
         states=states,
         radius_px=radius,
         global_states=tuple(listed),
@@ -142,12 +142,6 @@ def _single(values: FloatArray) -> Float32Array:
 
 def _double(values: Float32Array, valid: BoolArray) -> Float64Array:
     return np.where(valid, values, 0.0).astype(np.float64)
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    if skin_map.valid is None:
-        return np.ones(skin_map.values.shape, np.bool_)
-    return skin_map.valid
 
 
 def _stderr(skin_map: SkinMap) -> Float32Array:

@@ -69,8 +69,8 @@ class KernelTableError(ValueError):
 def gaussian_weights(sigma_px: float) -> Float64Array:
     """Return the right half of the normalised discrete Gaussian, its centre first.
 
-    The continuous Gaussian at whole pixels up to ``TRUNCATE_SIGMAS`` sigmas, divided by its sum. Far
-    below one pixel it is the delta function to machine precision, and blurs nothing.
+    The continuous Gaussian at whole pixels up to ``TRUNCATE_SIGMAS`` sigmas, divided by its sum.
+    Far below one pixel it is the delta function to machine precision, and blurs nothing.
 
     Parameters
     ----------

@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.arrays import BoolArray, FloatArray
+from model.vectors import unit_vectors
 from model.wrinkles import kernels
 from model.wrinkles.expressions import (
     JIMENEZ2011_TABLE,
@@ -180,8 +181,7 @@ def _decoded_huge(d: FloatArray) -> FloatArray:
     good = np.asarray(np.isfinite(d).all(axis=-1))
     d = np.where(good[:, None], d, 0.0)
     scale = np.maximum(np.abs(d).max(axis=-1, keepdims=True), d.dtype.type(1.0))
-    n = np.concatenate([d / scale, 1.0 / scale], axis=-1)
-    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    n = unit_vectors(np.concatenate([d / scale, 1.0 / scale], axis=-1))
     return np.where(good[:, None], n, 0.0)
 
 

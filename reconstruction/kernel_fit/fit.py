@@ -199,7 +199,7 @@ def fit_relief(
             relief, buckets, strengths, widths, first_sample=first_sample, rng=rng
         )
     with kernels.threads_for(500 * relief.places.size):
-        return kernel_outcome.described(
+        return kernel_outcome.summarize_search(
             relief,
             buckets,
             strengths,

@@ -102,7 +102,7 @@ class KernelFit:
     reason: str = ""
 
 
-def described(
+def summarize_search(
     relief: Relief,
     buckets: Buckets,
     alphas: Float64Array,

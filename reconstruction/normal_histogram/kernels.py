@@ -104,7 +104,9 @@ def count_in_groups(p: Any, q: Any, group: Any, groups: Any, bins: Any, limit: A
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def leans(height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b: Any) -> None:
+def negative_slopes(
+    height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b: Any
+) -> None:
     """Write minus the slopes of the samples, row by row, into `a` and `b`.
 
     Parameters
@@ -168,7 +170,7 @@ def windows(
     Parameters
     ----------
     height, code, right, down
-        As of `leans`.
+        As of `negative_slopes`.
     places : (m,) int64
         Pixels, y * W + x.
     along, across : (blocks, R, B) float32, written
@@ -206,7 +208,7 @@ def windows(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def weighed(along: Any, across: Any, weights: Any, da: Any, db: Any) -> None:
-    """Write the sums of windows over k, weighed: what `leans` of G * h - h are at the samples."""
+    """Write the weighted sums of windows over k: `negative_slopes` of G * h - h at the samples."""
     blocks, _, size = along.shape
     for block in prange(blocks):
         count = min(size, da.size - block * size)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 MAX_GAIN = 4.0
@@ -185,8 +186,7 @@ def restore(
     restored = [
         np.where(known, filtered(s, wiener) + m, 0.0) for s, m in zip(slopes, means, strict=True)
     ]
-    found = np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1)
-    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    found = unit_vectors(np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1))
     found[~known] = (0.0, 0.0, 1.0)
     noise = math.sqrt(noise_power / power.size)
     applied = wiener * smoothing

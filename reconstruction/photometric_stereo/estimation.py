@@ -21,6 +21,7 @@ from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
 from reconstruction.photometric_stereo.refinement import refine
+from reconstruction.photometric_stereo.solver_kernels import Settings
 from reconstruction.tiles import map_tiles
 
 __all__ = [
@@ -91,6 +92,27 @@ class Robustness:
                 raise PhotometricStereoError(
                     f"Robustness.{name}: got {getattr(self, name)}, expected {expected}"
                 )
+
+    def settings(self, kind: Any) -> Settings:
+        """Return the limits of a fit in the data's type."""
+        limits = Settings(
+            shadow=self.shadow,
+            grazing=self.grazing,
+            tuning=self.tuning,
+            tolerance=1e-3,
+            floor=1e-6 if kind is np.float32 else 1e-13,
+            l1_soft=0.01,
+            min_spread=1e-5,
+            bright_part=1 / 8,
+            dark_sigmas=3.0,
+            dark_fit=1.5,
+            min_agreeing=MIN_AGREEING_FRACTION,
+            few=self.few,
+            tight=TIGHT_RESIDUAL,
+            clear=CLEAR_OUTLIER_RESIDUAL,
+            loose=LOOSE_RESIDUAL,
+        )
+        return Settings(*(kind(limit) for limit in limits))
 
 
 def estimate_normals(
@@ -192,26 +214,7 @@ def estimate_normals(
     way, geometry = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
     strength = _strength(light_intensity, geometry if way == kernels.NEAR else None, lights, shape)
     chosen = robustness or Robustness()
-    settings = np.array(
-        [
-            chosen.shadow,
-            chosen.grazing,
-            chosen.tuning,
-            1e-3,
-            1e-6 if kind is np.float32 else 1e-13,
-            0.01,
-            1e-5,
-            1 / 8,
-            3.0,
-            1.5,
-            MIN_AGREEING_FRACTION,
-            chosen.few,
-            TIGHT_RESIDUAL,
-            CLEAR_OUTLIER_RESIDUAL,
-            LOOSE_RESIDUAL,
-        ],
-        kind,
-    )
+    settings = chosen.settings(kind)
     count = int(np.prod(shape))
     flat = samples.reshape(lights, count)
     out = np.empty((count, kernels.RESULT_ROWS), kind)

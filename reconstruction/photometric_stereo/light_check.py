@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo.estimation import estimate_normals
@@ -193,8 +194,9 @@ def _fit(
     """Return the shading fitted under living lights (N, P), and the points that have it."""
     alive = ~dead
     found = estimate_normals(samples[alive], directions[alive], valid=usable[alive], robust=True)
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.maximum(unit @ (found.normals * found.albedo[:, None]).T, 0.0), found.valid
+    return np.maximum(
+        unit_vectors(directions) @ (found.normals * found.albedo[:, None]).T, 0.0
+    ), found.valid
 
 
 def _misfit(

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array
 
 UNKNOWN_ERROR_RAD = np.radians(10.0)
@@ -163,8 +164,7 @@ def information(
     n = np.asarray(normals, np.float64)
     way = np.broadcast_to(np.asarray(to_light, np.float64), (len(n), *np.shape(to_light)[-2:]))
     helper = np.where(np.abs(n[:, [0]]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(n, helper)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    first = unit_vectors(np.cross(n, helper))
     second = np.cross(n, first)
     cosine = np.einsum("plk,pk->pl", way, n)
     with np.errstate(divide="ignore", invalid="ignore"):

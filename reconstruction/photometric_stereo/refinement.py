@@ -9,6 +9,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.tiles import map_tiles
@@ -143,8 +144,7 @@ def _dots(directions: Float64Array, normals: Float64Array) -> Float64Array:
 def _turned(
     normals: Float64Array, s: Float64Array, t: Float64Array, a: Float64Array, b: Float64Array
 ) -> Float64Array:
-    moved = normals + a[:, None] * s + b[:, None] * t
-    return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
+    return unit_vectors(normals + a[:, None] * s + b[:, None] * t)
 
 
 def _tangents(normals: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -180,8 +180,7 @@ def _refine_tile(
     samples = np.where(good, samples, 0.0)
     length = np.linalg.norm(start, axis=-1)
     begun = np.isfinite(length) & (length > 0)
-    n = np.where(begun[:, None], start, [0.0, 0.0, 1.0])
-    n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+    n = unit_vectors(np.where(begun[:, None], start, [0.0, 0.0, 1.0]))
     first, factor = n, np.ones(len(n))
     unknowns = 3 if free_scale else 2
     known = noise is not None

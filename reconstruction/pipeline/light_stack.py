@@ -14,6 +14,7 @@ from capture import raw
 from capture.session import Session
 from capture.session.frames import FrameRecord
 from model.skin import MAP_UNITS, SkinMap
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
@@ -158,7 +159,7 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )
-    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = unit_vectors(vectors)
     near = bool(listed.get("near", False))
     scale = float(listed.get("mm_per_px") or 1.0)
     alive = np.ones(len(vectors), bool)

@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
-from reconstruction.pipeline.probe.stages import (
-    CHANNEL_NAMES,
-    METHOD_NAMES,
-    PROFILE_FILE,
-    SUBSURFACE_FILE,
-)
+from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
+from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
 
 MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08

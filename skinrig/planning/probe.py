@@ -140,7 +140,7 @@ def confirm(
     """Simulate the skin of a choice and the phantom, reconstruct, compare with the truth."""
     from model import store
     from reconstruction.pipeline import recipes as pipeline
-    from reconstruction.pipeline.probe.stages import METHOD_NAMES
+    from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.evaluating import subsurface
     from skinrig.simulating.simulation import simulate_session

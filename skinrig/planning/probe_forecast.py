@@ -175,7 +175,7 @@ def _fitted(
     """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fiber.gains import FibreReflectance
     from reconstruction.pipeline.probe.images import Measurement
-    from reconstruction.pipeline.probe.stages import Profile, fit_profiles
+    from reconstruction.pipeline.probe.profile_fits import Profile, fit_profiles
 
     names = tuple(fibre.name for fibre in look.probe.fibres)
     radius = np.array(look.probe.radius_mm)

@@ -6,8 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.pipeline.dome.calibrated import Dome, rows
+from reconstruction.pipeline.dome.calibrated import Dome, reorder_lights
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.scan import registration as scan_registration
 from reconstruction.scan.registration import RigidFit
@@ -34,7 +35,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
     EvidenceError
         No light stands before the face, or the mesh is not found in the images.
     """
-    chosen = spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+    chosen = farthest_point_sample(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
     shares = []
 
     def stacks(view: int) -> Float32Array:
@@ -52,7 +53,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         return scan_registration.align(
             mesh,
             cameras=dome.cameras,
-            lights=rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+            lights=reorder_lights(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
             stacks=stacks,
             binning=2,
             rng=np.random.default_rng(0),
@@ -65,9 +66,9 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         ) from exc
 
 
-def spread(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
+def farthest_point_sample(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
     """Choose lights that light the face, each next one the farthest from those before."""
-    way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
+    way = unit_vectors(position_mm)
     front = np.flatnonzero(usable & (way[:, 2] > -0.1))
     if not len(front):
         raise EvidenceError("lights: none that can be used stands before the face")

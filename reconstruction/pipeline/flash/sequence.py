@@ -156,13 +156,7 @@ def _places(
     evidence: Evidence, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
     """Return where the places lie on the face at rest, px."""
-    skin = (
-        np.mean(
-            [sequence_blood.usable(m) for m, rest in zip(maps, at_rest, strict=True) if rest],
-            axis=0,
-        )
-        > 0.5
-    )
+    skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
     if evidence.landmarks is None:
         evidence.assumed.append(
             "places: by the face's outline; a table of landmarks says where they are"
@@ -217,14 +211,14 @@ def _laid_over_rest(
 
 def _mean(maps: Sequence[SkinMap], chosen: BoolArray) -> tuple[Float32Array, BoolArray]:
     picked = [m for m, take in zip(maps, chosen, strict=True) if take]
-    valid = np.logical_and.reduce([sequence_blood.usable(m) for m in picked])
+    valid = np.logical_and.reduce([m.mask for m in picked])
     mean = np.asarray(np.mean([m.values for m in picked], axis=0, dtype=np.float64), np.float32)
     return mean, np.asarray(valid, bool)
 
 
 def _more_like(image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray) -> bool:
     """Tell whether a frame is more like one picture than like another, in red: blood's least."""
-    good = both & sequence_blood.usable(image)
+    good = both & image.mask
     if not good.any():
         return False
 

@@ -103,12 +103,6 @@ def blood_of_discs(
     return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 
-def usable(skin_map: SkinMap) -> BoolArray:
-    """Return where a map means something, (H, W)."""
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
-
-
 def _of_place(
     maps: Sequence[SkinMap],
     name: str,
@@ -123,7 +117,7 @@ def _of_place(
     top, left = (max(0, int(p.min() - 2 * window_px)) for p in (rows, columns))
     bottom, right = (int(p.max() + 2 * window_px) + 1 for p in (rows, columns))
     patch = np.s_[top:bottom, left:right]
-    valid = np.array([usable(m)[patch] for m in maps])
+    valid = np.array([m.mask[patch] for m in maps])
     rgb = np.array([m.values[patch] for m in maps])
     errors = [np.zeros_like(m.values) if m.stderr is None else m.stderr for m in maps]
     variance = np.square([error[patch] for error in errors])

@@ -338,11 +338,6 @@ def _map3(
     )
 
 
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
-
-
 def _stderr(skin_map: SkinMap) -> Float32Array:
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
@@ -352,9 +347,9 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     prior = shading_prior.of_faces()
     if inputs.white is None:
         prior = prior.broadened(EXPOSURE_SPREAD)
-    rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
+    rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(_stderr(diffuse))
-    errors = model_error.of_picture(diffuse.values, variance, _valid(diffuse))
+    errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
     # of a face in light of unknown strength its pixels together tell no more
     face = (
         None
@@ -414,7 +409,7 @@ EXPOSURE_SPREAD = 1.0
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    valid = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
+    valid = diffuse.mask & (diffuse.values > 0).all(axis=-1)
     found = tsumura.tsumura_ica(diffuse.values, valid)
     note = "independent component of optical density, no absolute scale"
     return {

@@ -15,9 +15,10 @@ from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
 from model.skin import MAP_UNITS, SkinMap
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
-from reconstruction.gradient_normals.lobe_response import SphereLights
+from reconstruction.gradient_normals.sphere_lights import SphereLights
 from reconstruction.normal_integration import integrate_map, relief_errors
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.lens_restoration import Aperture, Restored, restore
@@ -95,7 +96,7 @@ class Rig:
         points = self.points_mm(shape)
         way = np.concatenate([-points, np.zeros((*shape, 1), np.float32)], axis=-1)
         way += self.camera_mm.astype(np.float32)
-        return way / np.linalg.norm(way, axis=-1, keepdims=True)
+        return unit_vectors(way)
 
     def perspective(self, shape: tuple[int, int]) -> Perspective:
         """Return the camera's rays."""

@@ -58,7 +58,7 @@ def count_normals(
     found: dict[str, NormalStatistics] = {}
     for each in strains:
         height = heights[each.state.name]
-        both = _valid(height) & _common(each, strains[0], heights, there=True)
+        both = height.mask & _common(each, strains[0], heights, there=True)
         if np.count_nonzero(both) >= MIN_SAMPLES:
             found[each.state.name] = measure(
                 height.values, pixel=pixel_um, valid=both, angle_rad=each.state.angle_rad
@@ -117,7 +117,7 @@ def _common(
     shape = both[0].values.shape[:2]
     if not each.usable:
         return np.ones(shape, bool)
-    seen = _valid(both[0 if there else 1]).astype(np.uint8)
+    seen = both[0 if there else 1].mask.astype(np.uint8)
     affine = each.strain.affine_px((shape[0], shape[1]))
     # a pixel of the state shows what the neutral picture has where the map leads back to
     back = affine if not there else _inverse(affine)
@@ -235,12 +235,12 @@ def fit_kernels(
     fits = []
     for number, each in enumerate(todo):
         tell(number / len(todo))
-        seen = _valid(height) & _common(each, neutral, heights, there=False)
+        seen = height.mask & _common(each, neutral, heights, there=False)
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
         if np.count_nonzero(inside) < MIN_SAMPLES:
             continue
         target, strained = statistics[each.state.name], heights[each.state.name]
-        there = _valid(strained) & _common(each, neutral, heights, there=True)
+        there = strained.mask & _common(each, neutral, heights, there=True)
         every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSE_GRID_STEP
         fit = fit_kernel(
             turned,
@@ -363,8 +363,3 @@ def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
         "p_alpha": found.p_alpha,
         "p_sigma": found.p_sigma,
     }
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -12,7 +12,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.probe.stages import METHOD_NAMES
+from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.calibrating.calibrate import calibrate

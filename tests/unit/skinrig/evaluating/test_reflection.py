@@ -6,7 +6,9 @@ import pytest
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.dome.stages import BASIS_FILE, BASIS_RANK, WEIGHT_NAMES, _basis_bytes
+from model.skin_reflectance import BASIS_FILE
+from reconstruction.pipeline.dome.lobes import BASIS_RANK, _basis_bytes
+from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
 from skinrig.evaluating import reflection as evaluation
 from skinrig.evaluating import reflection_truth
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from capture.plan.gradient import state_name
 from model.skin import SkinMap
 from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, block_of, grid_of
-from reconstruction.pipeline.gradient.images import SkinState, state_name
+from reconstruction.pipeline.gradient.images import SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
     HIDDEN_VARIANCE_RATIO,
