@@ -14,7 +14,7 @@ from model import spectra
 from model.arrays import Float64Array
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import two_layer_reflectance
-from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX, OXYGENATION
+from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX, OXYGEN_SATURATION
 
 SPECTRAL_NODES = 41
 """Nodes along each axis of the stored spectral table, see tools/make_reflectance_table.py."""
@@ -22,7 +22,7 @@ LIVE_NODES = 29
 """Nodes along each axis when the spectral table must be computed first."""
 STORED_ANISOTROPIES = (0.0, 0.8)
 """Mean cosines g of scattering for which the spectral table is stored."""
-_SMALLEST_SIZE = 8
+_MIN_SIZE = 8
 _POINTS_AT_ONCE = 32_768
 
 
@@ -59,9 +59,9 @@ class ColorTable:
         """Refuse a table that is not one, and work out its cells."""
         rgb = np.asarray(self.rgb, dtype=np.float64)
         size = rgb.shape[0] if rgb.ndim else 0
-        if rgb.shape != (size, size, 3) or size < _SMALLEST_SIZE:
+        if rgb.shape != (size, size, 3) or size < _MIN_SIZE:
             raise ColorTableError(
-                f"rgb: expected (size, size, 3) with size >= {_SMALLEST_SIZE}, got {rgb.shape}"
+                f"rgb: expected (size, size, 3) with size >= {_MIN_SIZE}, got {rgb.shape}"
             )
         if not (np.isfinite(rgb).all() and (rgb > 0.0).all()):
             raise ColorTableError("rgb: expected finite positive colors at every node")
@@ -159,7 +159,7 @@ def build(
     size: int = 128,
     anisotropy: float = 0.0,
     beta_m: float = BETA_M,
-    oxygenation: float = OXYGENATION,
+    oxygenation: float = OXYGEN_SATURATION,
     eta: float = ETA_SKIN,
 ) -> ColorTable:
     """Build the color table of a camera under a light.
@@ -202,9 +202,9 @@ def build(
     >>> table.lookup(0.02, 0.02).round(2).tolist()
     [0.27, 0.2, 0.18]
     """
-    if not isinstance(size, int | np.integer) or size < _SMALLEST_SIZE:
+    if not isinstance(size, int | np.integer) or size < _MIN_SIZE:
         raise ColorTableError(
-            f"size: expected a whole number of nodes, at least {_SMALLEST_SIZE}, got {size}"
+            f"size: expected a whole number of nodes, at least {_MIN_SIZE}, got {size}"
         )
     weights = spectra.band_weights(camera, illuminant)
     log_reflectance = _log_spectra(anisotropy, beta_m, oxygenation, eta)
@@ -251,7 +251,7 @@ def spectral_reflectance(
             raise ColorTableError(
                 f"{name}: got {values.min():g} to {values.max():g}, expected 0 to {most:g}"
             )
-    log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGENATION, ETA_SKIN)
+    log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGEN_SATURATION, ETA_SKIN)
     axes = spectral_axes(log_reflectance.shape[0])
     place = np.cbrt(melanin).reshape(-1), np.cbrt(blood).reshape(-1)
     found = np.empty((melanin.size, log_reflectance.shape[2]))
@@ -270,7 +270,7 @@ def spectral_axes(nodes: int) -> tuple[Float64Array, Float64Array]:
 @lru_cache(maxsize=8)
 def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: float) -> Float64Array:
     """Return log reflectance over (C_m, C_hd, wavelength), stored or computed."""
-    paper = (beta_m, oxygenation, eta) == (BETA_M, OXYGENATION, ETA_SKIN)
+    paper = (beta_m, oxygenation, eta) == (BETA_M, OXYGEN_SATURATION, ETA_SKIN)
     if paper and anisotropy in STORED_ANISOTROPIES and C_HE_PER_C_HD == 0.25:
         source = resources.files("model").joinpath("data", "two_layer_reflectance.npz")
         with source.open("rb") as stream, np.load(stream) as stored:

@@ -15,9 +15,9 @@ ETA_SKIN = 1.4
 Jimenez 2010 gives none (Donner 2008 has 1.4); Weyrich 2005 writes "about 1.3".
 """
 
-LARGEST_INDEX = 100.0
+MAX_INDEX = 100.0
 """Largest relative index of averages over directions: beyond it 1 - F_dr vanishes in rounding."""
-_POINTS = 96  # the external average is smooth: 96 Gauss points are exact to rounding
+_GAUSS_POINTS = 96  # the external average is smooth: 96 Gauss points are exact to rounding
 
 
 def reflectance(cos_incident: ArrayLike, eta: float) -> Float64Array:
@@ -156,9 +156,9 @@ def _require_index(eta: float) -> None:
 
 
 def _denser(eta: float) -> float:
-    if not 1.0 <= eta <= LARGEST_INDEX:
+    if not 1.0 <= eta <= MAX_INDEX:
         raise ValueError(
-            f"eta: expected a relative refractive index of at least 1, up to {LARGEST_INDEX:g}, "
+            f"eta: expected a relative refractive index of at least 1, up to {MAX_INDEX:g}, "
             f"got {eta}"
         )
     return float(eta)
@@ -166,5 +166,5 @@ def _denser(eta: float) -> float:
 
 @lru_cache(maxsize=1)
 def _gauss_unit() -> tuple[Float64Array, Float64Array]:
-    node, weight = np.polynomial.legendre.leggauss(_POINTS)
+    node, weight = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
     return 0.5 * (node + 1.0), 0.5 * weight

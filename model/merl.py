@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float64Array
 
-SHAPE = (90, 90, 180)
+TABLE_SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
-SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
+BRDF_SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 """BRDF in 1/sr of a stored 1, red, green, blue."""
 NOT_MEASURED = -1.0
 """Stored where there is no value; readers take anything negative."""
@@ -40,7 +40,7 @@ class MerlTable:
     Attributes
     ----------
     stored : ndarray of float64, shape (3, 90, 90, 180)
-        As in the file: times :data:`SCALE` it is the BRDF in 1/sr; channels red, green, blue;
+        As in the file: times :data:`BRDF_SCALE` it is the BRDF in 1/sr; channels red, green, blue;
         then theta_h, theta_d, phi_d. Negative: not measured.
     """
 
@@ -48,8 +48,10 @@ class MerlTable:
 
     def __post_init__(self) -> None:
         """Check the shape."""
-        if self.stored.shape != (3, *SHAPE):
-            raise ValueError(f"MerlTable.stored: got {self.stored.shape}, expected {(3, *SHAPE)}")
+        if self.stored.shape != (3, *TABLE_SHAPE):
+            raise ValueError(
+                f"MerlTable.stored: got {self.stored.shape}, expected {(3, *TABLE_SHAPE)}"
+            )
 
     @classmethod
     def of_values(cls, values: ArrayLike) -> MerlTable:
@@ -57,10 +59,10 @@ class MerlTable:
 
         What is negative, in any channel, was not measured: -1 is stored for all three.
         """
-        brdf = np.broadcast_to(np.asarray(values, dtype=np.float64), (*SHAPE, 3))
+        brdf = np.broadcast_to(np.asarray(values, dtype=np.float64), (*TABLE_SHAPE, 3))
         none = np.any(brdf < 0.0, axis=-1)
-        stored = np.empty((3, *SHAPE))
-        for channel, scale in enumerate(SCALE):
+        stored = np.empty((3, *TABLE_SHAPE))
+        for channel, scale in enumerate(BRDF_SCALE):
             np.divide(brdf[..., channel], scale, out=stored[channel])
             stored[channel][none] = NOT_MEASURED
         return cls(stored)
@@ -94,7 +96,7 @@ class MerlTable:
                 f"theta_h, theta_d, phi_d: got shapes {h.shape}, {d.shape} and {phi.shape}, "
                 f"expected ones that broadcast"
             ) from None
-        return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * SCALE)
+        return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * BRDF_SCALE)
 
     @property
     def measured(self) -> BoolArray:
@@ -121,17 +123,19 @@ def bins(
     if not np.all(np.isfinite(azimuth)):
         raise ValueError("phi_d: got a value that is not finite, expected rad")
     phi = np.mod(azimuth, np.pi)
-    index_h = np.minimum((SHAPE[0] * np.sqrt(h / _HALF_PI)).astype(np.intp), SHAPE[0] - 1)
-    index_d = np.minimum((SHAPE[1] * d / _HALF_PI).astype(np.intp), SHAPE[1] - 1)
-    index_phi = np.minimum((SHAPE[2] * phi / np.pi).astype(np.intp), SHAPE[2] - 1)
+    index_h = np.minimum(
+        (TABLE_SHAPE[0] * np.sqrt(h / _HALF_PI)).astype(np.intp), TABLE_SHAPE[0] - 1
+    )
+    index_d = np.minimum((TABLE_SHAPE[1] * d / _HALF_PI).astype(np.intp), TABLE_SHAPE[1] - 1)
+    index_phi = np.minimum((TABLE_SHAPE[2] * phi / np.pi).astype(np.intp), TABLE_SHAPE[2] - 1)
     return index_h, index_d, index_phi
 
 
 def bin_centers() -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return theta_h (90), theta_d (90) and phi_d (180) at the middles of the bins, rad."""
-    h = ((np.arange(SHAPE[0]) + 0.5) / SHAPE[0]) ** 2 * _HALF_PI
-    d = (np.arange(SHAPE[1]) + 0.5) / SHAPE[1] * _HALF_PI
-    phi = (np.arange(SHAPE[2]) + 0.5) / SHAPE[2] * np.pi
+    h = ((np.arange(TABLE_SHAPE[0]) + 0.5) / TABLE_SHAPE[0]) ** 2 * _HALF_PI
+    d = (np.arange(TABLE_SHAPE[1]) + 0.5) / TABLE_SHAPE[1] * _HALF_PI
+    phi = (np.arange(TABLE_SHAPE[2]) + 0.5) / TABLE_SHAPE[2] * np.pi
     return h, d, phi
 
 
@@ -228,8 +232,8 @@ def read_mean(path: str | os.PathLike[str]) -> Float64Array:
     MerlFileError
         As `read`.
     """
-    mean = np.zeros(SHAPE)
-    for plane, scale in zip(_planes(Path(path)), SCALE, strict=True):
+    mean = np.zeros(TABLE_SHAPE)
+    for plane, scale in zip(_planes(Path(path)), BRDF_SCALE, strict=True):
         plane[plane < 0.0] = np.nan
         plane *= scale / 3.0
         mean += plane
@@ -244,19 +248,19 @@ def _planes(file: Path) -> Iterator[Float64Array]:
         if len(start) < 12:
             raise MerlFileError(f"{file}: got {size} bytes, expected {FILE_BYTES}")
         header = np.frombuffer(start, dtype="<i4")
-        if tuple(header) != SHAPE:
+        if tuple(header) != TABLE_SHAPE:
             got = " x ".join(str(int(n)) for n in header)
             raise MerlFileError(f"{file}: got a table of {got} bins, expected 90 x 90 x 180")
         if size != FILE_BYTES:
             word = "truncated" if size < FILE_BYTES else "followed by something else"
             raise MerlFileError(f"{file}: {word}: got {size} bytes, expected {FILE_BYTES}")
         for _ in range(3):
-            plane = np.fromfile(stream, dtype="<f8", count=int(np.prod(SHAPE)))
+            plane = np.fromfile(stream, dtype="<f8", count=int(np.prod(TABLE_SHAPE)))
             if not np.all(np.isfinite(plane)):
                 raise MerlFileError(
                     f"{file}: got values that are not finite, expected negative for none"
                 )
-            yield plane.astype(np.float64, copy=False).reshape(SHAPE)
+            yield plane.astype(np.float64, copy=False).reshape(TABLE_SHAPE)
 
 
 def write(path: str | os.PathLike[str], table: MerlTable) -> None:
@@ -270,5 +274,5 @@ def write(path: str | os.PathLike[str], table: MerlTable) -> None:
     if not np.all(np.isfinite(table.stored)):
         raise ValueError("MerlTable.stored: got values that are not finite")
     with Path(path).open("wb") as stream:
-        stream.write(np.array(SHAPE, dtype="<i4").tobytes())
+        stream.write(np.array(TABLE_SHAPE, dtype="<i4").tobytes())
         table.stored.astype("<f8", copy=False).tofile(stream)

@@ -11,9 +11,9 @@ import numpy as np
 
 from model.arrays import BoolArray, Float32Array
 
-_FILE = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
+_FILE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
 
-UNITS: Mapping[str, str] = MappingProxyType(
+MAP_UNITS: Mapping[str, str] = MappingProxyType(
     {
         "melanin": "volume fraction of the epidermis",
         "hemoglobin": "volume fraction of blood in the dermis",
@@ -79,6 +79,11 @@ class SkinMap:
         if not np.isfinite(shown).all():
             raise ValueError("values: got NaN or infinity at a valid pixel, expected finite values")
 
+    @property
+    def mask(self) -> BoolArray:
+        """Return the valid pixels, (H, W) bool; all of them where ``valid`` is None."""
+        return np.ones(self.values.shape[:2], np.bool_) if self.valid is None else self.valid
+
 
 @dataclass(frozen=True, slots=True)
 class SkinAppearance:
@@ -87,7 +92,7 @@ class SkinAppearance:
     Attributes
     ----------
     maps
-        By name, see :data:`UNITS` for names with a fixed unit.
+        By name, see :data:`MAP_UNITS` for names with a fixed unit.
     source
         "measured" or "simulated".
     parameters, inputs, versions
@@ -101,7 +106,7 @@ class SkinAppearance:
 
     Examples
     --------
-    >>> maps = {"melanin": SkinMap(np.full((2, 2), 0.05), UNITS["melanin"])}
+    >>> maps = {"melanin": SkinMap(np.full((2, 2), 0.05), MAP_UNITS["melanin"])}
     >>> SkinAppearance(maps, "simulated").maps["melanin"].values.dtype
     dtype('float32')
     """
@@ -120,11 +125,11 @@ class SkinAppearance:
         if self.source not in ("measured", "simulated"):
             raise ValueError(f"source: got {self.source!r}, expected 'measured' or 'simulated'")
         for name in self.files:
-            if _FILE.fullmatch(name) is None or name.endswith((".exr", "appearance.json")):
+            if _FILE_PATTERN.fullmatch(name) is None or name.endswith((".exr", "appearance.json")):
                 raise ValueError(
                     f"files: got name {name!r}, expected a-z 0-9 _ and an extension, not .exr"
                 )
         for name, skin_map in self.maps.items():
-            expected = UNITS.get(name)
+            expected = MAP_UNITS.get(name)
             if expected is not None and skin_map.unit != expected:
                 raise ValueError(f"{name}: got unit {skin_map.unit!r}, expected {expected!r}")

@@ -27,12 +27,12 @@ from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 
 BASIS_FILE = "brdf_basis.npz"
-WEIGHT = "basis_weight_"
+WEIGHT_PREFIX = "basis_weight_"
 """Maps of lobe shares are called by this and their number, from 0 on."""
-TRANSLUCENCY = "translucency"
-NORMALS = ("normals_refined", "normals")
+TRANSLUCENCY_MAP = "translucency"
+NORMAL_MAPS = ("normals_refined", "normals")
 """Maps of normals, the better one first."""
-_CHUNK = 1 << 16  # directions that are looked up at a time
+_CHUNK_DIRECTIONS = 1 << 16  # directions that are looked up at a time
 
 
 class SkinReflectanceError(ValueError):
@@ -161,15 +161,15 @@ def assemble(
     SkinReflectanceError
         Naming the map or file that is missing or does not fit.
     """
-    needed = ("position", "r_d", f"{WEIGHT}0")
+    needed = ("position", "r_d", f"{WEIGHT_PREFIX}0")
     for name in needed:
         _map(dome, name)
     lobes = lobes_of(dome)
-    names = [f"{WEIGHT}{k}" for k in range(lobes.size)]
-    found = next((name for name in NORMALS if name in dome.maps), None)
+    names = [f"{WEIGHT_PREFIX}{k}" for k in range(lobes.size)]
+    found = next((name for name in NORMAL_MAPS if name in dome.maps), None)
     if found is None:
         raise SkinReflectanceError(
-            f"maps: got none of {' and '.join(NORMALS)}; `skinrig reconstruct --want normals` "
+            f"maps: got none of {' and '.join(NORMAL_MAPS)}; `skinrig reconstruct --want normals` "
             "makes them"
         )
     used = ["position", "r_d", found, *names]
@@ -181,15 +181,15 @@ def assemble(
             raise SkinReflectanceError(
                 f"{name}: got shape {one.values.shape[:2]}, expected {shape} as of position"
             )
-        valid &= _valid(one)
+        valid &= one.mask
     position, r_d, normals, *shares = maps
     # shares are at least 0 at the points; drawn into texels beyond the rim they can undershoot
     weights = np.maximum(np.stack([one.values for one in shares], axis=-1), 0.0)
     length = np.linalg.norm(normals.values, axis=-1, keepdims=True)
     valid &= (length[..., 0] > 0.5) & np.isfinite(r_d.values).all(-1)
     assumed: tuple[str, ...] = ()
-    if translucency is None and TRANSLUCENCY in dome.maps:
-        translucency = dome.maps[TRANSLUCENCY]
+    if translucency is None and TRANSLUCENCY_MAP in dome.maps:
+        translucency = dome.maps[TRANSLUCENCY_MAP]
         told = dome.parameters.get("assumed", [])
         assumed = tuple(str(one) for one in told) if isinstance(told, list | tuple) else ()
     if translucency is None:
@@ -232,7 +232,7 @@ def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
     """
     if BASIS_FILE not in appearance.files:
         raise SkinReflectanceError(
-            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT}0` makes it"
+            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT_PREFIX}0` makes it"
         )
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
@@ -247,7 +247,7 @@ def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
         raise SkinReflectanceError(
             f"{BASIS_FILE}: got a table of shape {table.shape}, expected lobes on its last axis"
         )
-    names = [f"{WEIGHT}{k}" for k in range(table.shape[-1])]
+    names = [f"{WEIGHT_PREFIX}{k}" for k in range(table.shape[-1])]
     for name in names:
         _map(appearance, name)
     return brdf_tables.of_columns(table, names, light_radius_rad=radius)
@@ -293,8 +293,8 @@ def lobe_brdf(
     share = np.asarray(weights, np.float64)
     to = [np.broadcast_to(v, (len(share), 3)) for v in (light_dir, view_dir, normals)]
     found = np.empty(len(share))
-    for start in range(0, len(share), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(share), _CHUNK_DIRECTIONS):
+        part = slice(start, start + _CHUNK_DIRECTIONS)
         found[part] = np.einsum("nk,nk->n", lobes.evaluate(*(v[part] for v in to)), share[part])
     return found
 
@@ -375,21 +375,17 @@ def _map(appearance: SkinAppearance, name: str) -> SkinMap:
 
 def _normals(appearance: SkinAppearance) -> SkinMap:
     """Return the better normals, and the others where those could not be had."""
-    there = [appearance.maps[name] for name in NORMALS if name in appearance.maps]
+    there = [appearance.maps[name] for name in NORMAL_MAPS if name in appearance.maps]
     if len(there) == 1 or there[0].values.shape != there[1].values.shape:
         return there[0]
     best, other = there
-    good = _valid(best)
+    good = best.mask
     return SkinMap(
         np.where(good[..., None], best.values, other.values),
         best.unit,
-        valid=good | _valid(other),
+        valid=good | other.mask,
         description=best.description,
     )
-
-
-def _valid(one: SkinMap) -> BoolArray:
-    return np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
 
 
 def _rows(model: SkinReflectance, rows: ArrayLike) -> NDArray[np.intp]:
@@ -413,7 +409,7 @@ def _over_texture(
             raise SkinReflectanceError(
                 f"translucency: got shape {given.values.shape}, expected (H, W, 3)"
             )
-        known = _resampled(_valid(given).astype(np.float32)[..., None], shape)[..., 0] > 0.999
+        known = _resampled(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
         stderr = None if given.stderr is None else _resampled(given.stderr, shape)
         return _resampled(given.values, shape), stderr, known
     values = np.asarray(given, np.float32)

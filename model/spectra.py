@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
 
-LONGEST_NM = 1e6
+MAX_WAVELENGTH_NM = 1e6
 """Longest wavelength that is one of light, nm."""
 
 WAVELENGTH_NM: Float64Array = np.arange(400.0, 701.0, 10.0)
@@ -380,10 +380,10 @@ def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> Floa
 
 def _wavelengths(wavelength_nm: ArrayLike) -> Float64Array:
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
-    if not np.all((wavelength > 0.0) & (wavelength <= LONGEST_NM)):
+    if not np.all((wavelength > 0.0) & (wavelength <= MAX_WAVELENGTH_NM)):
         raise ValueError(
             f"wavelength_nm: got a smallest of {np.min(wavelength):g} and a largest of "
-            f"{np.max(wavelength):g}, expected above 0, up to {LONGEST_NM:g} nm"
+            f"{np.max(wavelength):g}, expected above 0, up to {MAX_WAVELENGTH_NM:g} nm"
         )
     return wavelength
 

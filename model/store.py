@@ -24,8 +24,8 @@ from model.arrays import Float32Array
 from model.skin import SkinAppearance, SkinMap
 
 SCHEMA = "skinrig.appearance/1"
-DOCUMENT = "appearance.json"
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+DOCUMENT_FILE = "appearance.json"
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class StoreError(ValueError):
@@ -86,7 +86,7 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
     target = Path(path)
     require_free(target)
     for name in appearance.maps:
-        if not _NAME.fullmatch(name):
+        if not _NAME_PATTERN.fullmatch(name):
             raise StoreError(f"map name: got {name!r}, expected lower case letters, digits and _")
     target.parent.mkdir(parents=True, exist_ok=True)
     fresh = target.with_name(f".{target.name}.{uuid.uuid4().hex}.part")
@@ -108,7 +108,7 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
             text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise StoreError(f"parameters: cannot be written as JSON: {error}") from error
-        _write_synced(fresh / DOCUMENT, text.encode("utf-8") + b"\n")
+        _write_synced(fresh / DOCUMENT_FILE, text.encode("utf-8") + b"\n")
         _replace(fresh, target)
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
@@ -130,7 +130,7 @@ def require_free(path: str | Path) -> None:
         When ``path`` exists and is something else, or nothing can be written beside it.
     """
     target = Path(path)
-    if target.exists() and not (target / DOCUMENT).is_file() and any(_entries(target)):
+    if target.exists() and not (target / DOCUMENT_FILE).is_file() and any(_entries(target)):
         raise StoreError(
             f"{target}: exists and is no APPEARANCE/ folder; nothing was written: name another"
         )
@@ -183,12 +183,12 @@ def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppear
 
 def read_document(folder: Path) -> _Document:
     """Read and check ``appearance.json`` without loading any map."""
-    path = folder / DOCUMENT
+    path = folder / DOCUMENT_FILE
     try:
         raw = path.read_bytes()
     except OSError as error:
         raise StoreError(
-            f"{folder}: is no APPEARANCE/ folder ({error.strerror}: {DOCUMENT}); "
+            f"{folder}: is no APPEARANCE/ folder ({error.strerror}: {DOCUMENT_FILE}); "
             "`skinrig reconstruct` makes one"
         ) from error
     try:

@@ -35,9 +35,9 @@ from model.arrays import BoolArray, Float64Array, Int64Array
 
 Reading: TypeAlias = Literal["deviation", "variance"]
 
-SITES = ("cheek", "forehead", "neck")
+SITE_NAMES = ("cheek", "forehead", "neck")
 """Places of table 2, in its order; its neck is measured below the chin."""
-CHANNELS = ("red", "green", "blue")
+CHANNEL_NAMES = ("red", "green", "blue")
 SITE_OF_LABEL: Mapping[str, str] = {"chin": "neck", "below the chin": "neck"}
 """Labels of sessions that name a place of the table by another word."""
 SITE_CORRELATION = 0.25
@@ -72,8 +72,8 @@ class TranslucencyPopulation:
 
     mean_per_mm: Float64Array
     deviation_per_mm: Float64Array
-    sites: tuple[str, ...] = SITES
-    channels: tuple[str, ...] = CHANNELS
+    sites: tuple[str, ...] = SITE_NAMES
+    channels: tuple[str, ...] = CHANNEL_NAMES
     site_correlation: float = SITE_CORRELATION
     channel_correlation: tuple[tuple[float, ...], ...] = CHANNEL_CORRELATION
     source: str = ""
@@ -172,9 +172,9 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
         raise PopulationError(f'reading: got {reading!r}, expected "deviation" or "variance"')
     text = resources.files("model").joinpath("data/weyrich2005_table2.csv").read_text("utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
-    mean, printed = np.zeros((2, len(SITES), len(CHANNELS)))
+    mean, printed = np.zeros((2, len(SITE_NAMES), len(CHANNEL_NAMES)))
     for row in rows:
-        at = SITES.index(row["site"]), CHANNELS.index(row["channel"])
+        at = SITE_NAMES.index(row["site"]), CHANNEL_NAMES.index(row["channel"])
         mean[at], printed[at] = float(row["mean"]), float(row["var"])
     return TranslucencyPopulation(
         mean,
@@ -304,8 +304,8 @@ class PopulationTable:
 def table(
     sigma_tr_per_mm: ArrayLike,
     *,
-    sites: Sequence[str] = SITES,
-    channels: Sequence[str] = CHANNELS,
+    sites: Sequence[str] = SITE_NAMES,
+    channels: Sequence[str] = CHANNEL_NAMES,
     stderr_per_mm: ArrayLike | None = None,
     valid: ArrayLike | None = None,
 ) -> PopulationTable:
@@ -351,13 +351,10 @@ def table(
     n = good.sum(axis=0)
     some = np.maximum(n, 1)
     # squares and fourth powers in a unit that keeps them from vanishing and from overflowing
-    unit, noise_unit = (
-        int(np.frexp(np.where(good, of, 0.0).max(initial=0.0))[1]) for of in (values, noise)
-    )
-    values, noise = (
-        np.ldexp(np.where(good, of, 0.0), -by) for of, by in ((values, unit), (noise, noise_unit))
-    )
-    mean = np.where(good, values, 0.0).sum(axis=0) / some
+    values, noise = np.where(good, values, 0.0), np.where(good, noise, 0.0)
+    unit, noise_unit = (int(np.frexp(of.max(initial=0.0))[1]) for of in (values, noise))
+    values, noise = np.ldexp(values, -unit), np.ldexp(noise, -noise_unit)
+    mean = values.sum(axis=0) / some
     off = np.where(good, values - mean, 0.0)
     variance = np.where(n > 1, (off**2).sum(axis=0) / np.maximum(n - 1, 1), 0.0)
     fourth = (off**4).sum(axis=0) / some
@@ -383,7 +380,7 @@ def summarize(
     measurements: Iterable[SiteMeasurement],
     *,
     sites: Sequence[str] | None = None,
-    channels: Sequence[str] = CHANNELS,
+    channels: Sequence[str] = CHANNEL_NAMES,
 ) -> PopulationTable:
     """Tabulate measured people in table 2's layout.
 
@@ -398,10 +395,6 @@ def summarize(
         Places to list; by default those of the table that were measured, in its order, then
         others by name.
     channels : sequence of str
-
-    Returns
-    -------
-    PopulationTable
 
     Raises
     ------
@@ -426,7 +419,7 @@ def summarize(
         by_person.setdefault(one.subject, {}).setdefault(place, []).append(one)
     found = {place for places in by_person.values() for place in places}
     if sites is None:
-        sites = [s for s in SITES if s in found] + sorted(found - set(SITES))
+        sites = [s for s in SITE_NAMES if s in found] + sorted(found - set(SITE_NAMES))
     if not found & set(sites):
         raise PopulationError(f"measurements: got none at {', '.join(sites) or 'any place'}")
     shape = (len(by_person), len(sites), len(channels))

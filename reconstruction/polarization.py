@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.fresnel import ETA_SKIN
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 __all__ = ["PolarizerAxes", "Separation", "separate"]
 
-
-ETA_SKIN = 1.4  # refractive index of skin over that of air, Tuchin 2007 (doi 10.1117/3.684093)
-LEAST_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
+MIN_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,13 +170,13 @@ def separate(
         w_p, w_c = w_p * entry, w_c * entry
         facing = facing & lit
     contrast = w_c - leak * w_p
-    if float(np.max(contrast)) < LEAST_CONTRAST:
+    if float(np.max(contrast)) < MIN_CONTRAST:
         raise ValueError(
             f"extinction: got a leak of {float(np.min(leak)):.3g}, the two images do not differ"
             " enough to be separated; check the polarizers"
         )
     good = facing & np.isfinite(p).all(axis=-1) & np.isfinite(c).all(axis=-1)
-    good &= np.broadcast_to((contrast >= LEAST_CONTRAST).all(axis=-1), good.shape)
+    good &= np.broadcast_to((contrast >= MIN_CONTRAST).all(axis=-1), good.shape)
     if valid is not None:
         good &= valid
     if saturation is not None:
@@ -184,7 +184,7 @@ def separate(
             good &= (p < saturation).all(axis=-1) & (c < saturation).all(axis=-1)
     blank = kind.type(np.nan)
     mask = good[..., None]
-    safe = np.where(contrast >= LEAST_CONTRAST, contrast, kind.type(1.0))
+    safe = np.where(contrast >= MIN_CONTRAST, contrast, kind.type(1.0))
     p, c = np.where(mask, p, 0).astype(kind), np.where(mask, c, 0).astype(kind)
     diffuse = 2 * (c - leak * p) / safe
     specular = (w_c * p - w_p * c) / safe
@@ -265,8 +265,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _normalized(a: FloatArray) -> FloatArray:
-    length = np.linalg.norm(a, axis=-1, keepdims=True)
-    return np.asarray(a / np.maximum(length, np.finfo(a.dtype).tiny))
+    return unit_vectors(a, min_length=np.finfo(a.dtype).tiny)
 
 
 def _passed_field(absorbing: FloatArray, direction: FloatArray) -> FloatArray:

@@ -34,7 +34,7 @@ import numpy as np
 from model.brdf import tables as brdf_tables
 from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace, cosine
-from model.traits.storage import PACKAGED, TraitLibrary, from_bytes
+from model.traits.storage import PACKAGED_FILE, TraitLibrary, from_bytes
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
 from rigsim.population.conditions import CONDITION_NAMES
@@ -237,7 +237,7 @@ def albedo_truth(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("model/data") / PACKAGED)
+    parser.add_argument("--out", type=Path, default=Path("model/data") / PACKAGED_FILE)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=256, help="texels a side of the faces")
     parser.add_argument("--common", type=int, default=192, help="pixels a side of the common map")

@@ -23,7 +23,7 @@ from model.arrays import Float64Array
 
 Distribution = Literal["ggx", "beckmann", "blinn"]
 
-LEAST_COSINE = 1e-3
+MIN_COSINE = 1e-3
 """Cosines to the horizon below this count as this: the BRDF is finite everywhere."""
 
 ROUGHNESS_RANGE = (1e-6, 1e6)
@@ -73,10 +73,10 @@ def visibility(
 ) -> Float64Array:
     """Return G / (4 cos cos), height-correlated Smith shadowing and masking.
 
-    Cosines below :data:`LEAST_COSINE`, behind the surface too, count as that.
+    Cosines below :data:`MIN_COSINE`, behind the surface too, count as that.
     """
     mu_l, mu_v = (
-        np.clip(np.asarray(mu, dtype=np.float64), LEAST_COSINE, 1.0) for mu in (cos_light, cos_view)
+        np.clip(np.asarray(mu, dtype=np.float64), MIN_COSINE, 1.0) for mu in (cos_light, cos_view)
     )
     hidden = _lambda(mu_l, roughness, kind) + _lambda(mu_v, roughness, kind)
     return np.asarray(1.0 / ((1.0 + hidden) * 4.0 * mu_l * mu_v))

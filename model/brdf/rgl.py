@@ -27,13 +27,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import Float32Array, Float64Array
 from model.brdf import tensor_file
+from model.vectors import unit_vectors
 
-ELEVATIONS = 45
-SIDE = 90
-LAST_RAD = np.deg2rad(89.0)
+N_ELEVATIONS = 45
+TABLE_SIDE = 90
+MAX_ELEVATION_RAD = np.deg2rad(89.0)
 """View elevation of the last table; lower views take it."""
-_LEAST_JACOBIAN = 1e-6  # as the readers have it, at the pole of the half vector
-_LEAST_SHARE = 1e-3  # of the mean density: no direction is without
+_MIN_JACOBIAN = 1e-6  # as the readers have it, at the pole of the half vector
+_MIN_DENSITY_RATIO = 1e-3  # of the mean density: no direction is without
 
 
 class RglFileError(ValueError):
@@ -114,8 +115,7 @@ class RglTable:
         )
         above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
         to, at = light[above], view[above]
-        half = to + at
-        half /= np.linalg.norm(half, axis=-1, keepdims=True)
+        half = unit_vectors(to + at)
         turn = np.arctan2(half[:, 1], half[:, 0]) - np.arctan2(at[:, 1], at[:, 0])
         square = np.stack(
             [np.sqrt(_elevation(half) * (2.0 / np.pi)), np.mod(turn / (2.0 * np.pi) + 0.5, 1.0)], -1
@@ -137,7 +137,7 @@ def of_brdf(
     brdf: Callable[[Float64Array, Float64Array], Float64Array],
     *,
     description: str,
-    side: int = SIDE,
+    side: int = TABLE_SIDE,
 ) -> RglTable:
     """Tabulate a BRDF.
 
@@ -157,32 +157,32 @@ def of_brdf(
     ValueError
         When the BRDF is negative or not finite somewhere.
     """
-    theta_i = np.linspace(0.0, LAST_RAD, ELEVATIONS)
+    theta_i = np.linspace(0.0, MAX_ELEVATION_RAD, N_ELEVATIONS)
     u, v = np.meshgrid(np.linspace(0.0, 1.0, side), np.linspace(0.0, 1.0, side))
     theta, phi = u**2 * (np.pi / 2.0), (2.0 * v - 1.0) * np.pi
     half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    values = np.zeros((ELEVATIONS, 3, side, side), np.float32)
-    luminance = np.zeros((ELEVATIONS, side, side), np.float32)
+    values = np.zeros((N_ELEVATIONS, 3, side, side), np.float32)
+    luminance = np.zeros((N_ELEVATIONS, side, side), np.float32)
     for k, elevation in enumerate(theta_i):
         view = np.array([np.sin(elevation), 0.0, np.cos(elevation)])
         along = half @ view
         light = 2.0 * along[..., None] * half - view
         seen = (along > 0.0) & (light[..., 2] > 0.0)
-        to = light[seen] / np.linalg.norm(light[seen], axis=-1, keepdims=True)
+        to = unit_vectors(light[seen])
         found = np.asarray(brdf(to, np.broadcast_to(view, to.shape)), np.float64)
         if not np.all((found >= 0.0) & (found < np.inf)):
             raise ValueError("brdf: got negative or non-finite values, expected 1/sr")
         rgb = np.broadcast_to(found.reshape(len(to), -1), (len(to), 3)) * to[:, 2:]
         values[k][:, seen] = rgb.T
-        jacobian = np.maximum(2.0 * np.pi**2 * u * np.sin(theta), _LEAST_JACOBIAN) * 4.0 * along
+        jacobian = np.maximum(2.0 * np.pi**2 * u * np.sin(theta), _MIN_JACOBIAN) * 4.0 * along
         density = np.where(seen, values[k].mean(0) * jacobian, 0.0)
-        luminance[k] = density + (_LEAST_SHARE * density.mean() or 1.0)
+        luminance[k] = density + (_MIN_DENSITY_RATIO * density.mean() or 1.0)
     flat = np.ones((2, 2), np.float32)
     return RglTable(
         theta_i.astype(np.float32),
         flat,
         0.25 * flat,
-        np.ones((ELEVATIONS, 2, 2), np.float32),
+        np.ones((N_ELEVATIONS, 2, 2), np.float32),
         luminance,
         values,
         np.zeros(0, np.float32),

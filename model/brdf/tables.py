@@ -24,13 +24,14 @@ from scipy.ndimage import distance_transform_edt
 from model import merl
 from model.arrays import Float32Array, Float64Array
 from model.brdf import recipe as brdf_recipe
+from model.vectors import unit_vectors
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
 NODES_D, NODES_PHI, NODES_H = 32, 12, 90
-LANES = 16  # materials are padded to full vectors of float32
-LEAST = 1e-20
+VECTOR_LANES = 16  # materials are padded to full vectors of float32
+MIN_STORED_VALUE = 1e-20
 """Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
 LED_RADIUS_RAD = 10.0 / 700.0
 """Angular radius of the dome's lights (10 mm at 700 mm) seen from its centre."""
@@ -63,7 +64,7 @@ class BrdfBasis:
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
-        lanes = -(-len(self.names) // LANES) * LANES
+        lanes = -(-len(self.names) // VECTOR_LANES) * VECTOR_LANES
         expected = (NODES_D, NODES_PHI, NODES_H, lanes)
         if not self.names or self.table.shape != expected or self.table.dtype != np.float32:
             raise BasisError(
@@ -211,7 +212,7 @@ def _of_file(path: Path, light_radius_rad: float) -> Float32Array:
 
 def of_merl(table: merl.MerlTable) -> Brdf:
     """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
-    mean = np.where(table.measured, np.tensordot(merl.SCALE, table.stored, 1) / 3.0, np.nan)
+    mean = np.where(table.measured, np.tensordot(merl.BRDF_SCALE, table.stored, 1) / 3.0, np.nan)
     return _nearest_bin(mean)
 
 
@@ -253,16 +254,14 @@ def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
         return _filled(np.asarray(brdf(light, view)))
     # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
     helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
-    u = np.cross(helper, light)
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    u = unit_vectors(np.cross(helper, light))
     v = np.cross(light, u)
     total = np.zeros(d.shape)
     weight = np.zeros(d.shape)
     for point in range(7):
         turn = point * np.pi / 3.0
         reach = 0.0 if point == 6 else np.tan(radius_rad) * np.sqrt(2.0 / 3.0)
-        to = light + reach * (np.cos(turn) * u + np.sin(turn) * v)
-        to /= np.linalg.norm(to, axis=-1, keepdims=True)
+        to = unit_vectors(light + reach * (np.cos(turn) * u + np.sin(turn) * v))
         value = np.asarray(brdf(to, view))
         share = (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)
         known = np.isfinite(value)
@@ -284,9 +283,9 @@ def _filled(values: Float64Array) -> Float64Array:
 
 
 def _padded(columns: Float64Array, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
-    lanes = -(-len(names) // LANES) * LANES
+    lanes = -(-len(names) // VECTOR_LANES) * VECTOR_LANES
     table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
-    table[..., : len(names)] = np.where(columns < LEAST, 0.0, columns)
+    table[..., : len(names)] = np.where(columns < MIN_STORED_VALUE, 0.0, columns)
     return BrdfBasis(table, tuple(names), light_radius_rad)
 
 

@@ -21,11 +21,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-MAGIC = b"tensor_file\0"
-VERSION = (1, 0)
-ALIGNMENT = 8
-MOST_FIELDS = 4096
-TYPES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
+TENSOR_MAGIC = b"tensor_file\0"
+FILE_VERSION = (1, 0)
+ALIGNMENT_BYTES = 8
+MAX_FIELDS = 4096
+TYPE_NAMES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
 """NumPy's names of the types, whose numbers in the file start at 1."""
 
 
@@ -49,14 +49,14 @@ def read(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     file = Path(path)
     size = file.stat().st_size
     with file.open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
+        if stream.read(len(TENSOR_MAGIC)) != TENSOR_MAGIC:
             raise TensorFileError(f"{file}: is no tensor file: it does not begin with tensor_file")
         version = _unpack(stream, "<BB", file)
-        if version != VERSION:
-            raise TensorFileError(f"{file}: got version {version}, expected {VERSION}")
+        if version != FILE_VERSION:
+            raise TensorFileError(f"{file}: got version {version}, expected {FILE_VERSION}")
         (count,) = _unpack(stream, "<I", file)
-        if count > MOST_FIELDS:
-            raise TensorFileError(f"{file}: got {count} fields, expected at most {MOST_FIELDS}")
+        if count > MAX_FIELDS:
+            raise TensorFileError(f"{file}: got {count} fields, expected at most {MAX_FIELDS}")
         heads = [_head(stream, file) for _ in range(count)]
         arrays: dict[str, NDArray[Any]] = {}
         for name, dtype, offset, shape in heads:
@@ -82,18 +82,18 @@ def write(path: str | os.PathLike[str], fields: Mapping[str, NDArray[Any]]) -> N
     arrays = {}
     for name, array in fields.items():
         stored = np.dtype(array.dtype).newbyteorder("<")
-        if stored not in [np.dtype(known) for known in TYPES]:
+        if stored not in [np.dtype(known) for known in TYPE_NAMES]:
             raise TensorFileError(f"{name}: got type {array.dtype}, expected integers or floats")
         arrays[name] = np.ascontiguousarray(array, stored)
     labels = {name: name.encode() for name in arrays}
-    place = len(MAGIC) + 6 + sum(13 + len(labels[n]) + 8 * a.ndim for n, a in arrays.items())
+    place = len(TENSOR_MAGIC) + 6 + sum(13 + len(labels[n]) + 8 * a.ndim for n, a in arrays.items())
     with Path(path).open("wb") as stream:
-        stream.write(MAGIC + struct.pack("<BBI", *VERSION, len(arrays)))
+        stream.write(TENSOR_MAGIC + struct.pack("<BBI", *FILE_VERSION, len(arrays)))
         places = []
         for name, array in arrays.items():
-            place = -(-place // ALIGNMENT) * ALIGNMENT
+            place = -(-place // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
             places.append(place)
-            number = [np.dtype(known) for known in TYPES].index(array.dtype) + 1
+            number = [np.dtype(known) for known in TYPE_NAMES].index(array.dtype) + 1
             label = labels[name]
             stream.write(struct.pack("<H", len(label)) + label)
             stream.write(struct.pack(f"<HBQ{array.ndim}Q", array.ndim, number, place, *array.shape))
@@ -108,9 +108,11 @@ def _head(stream: BinaryIO, file: Path) -> tuple[str, np.dtype[Any], int, tuple[
     label = stream.read(length)
     dimensions, number, offset = _unpack(stream, "<HBQ", file)
     shape = _unpack(stream, f"<{dimensions}Q", file)
-    if not 1 <= number <= len(TYPES):
-        raise TensorFileError(f"{file}: {label!r}: got type {number}, expected 1 to {len(TYPES)}")
-    return label.decode("utf-8", "replace"), np.dtype(TYPES[number - 1]), offset, shape
+    if not 1 <= number <= len(TYPE_NAMES):
+        raise TensorFileError(
+            f"{file}: {label!r}: got type {number}, expected 1 to {len(TYPE_NAMES)}"
+        )
+    return label.decode("utf-8", "replace"), np.dtype(TYPE_NAMES[number - 1]), offset, shape
 
 
 def _unpack(stream: BinaryIO, layout: str, file: Path) -> tuple[int, ...]:

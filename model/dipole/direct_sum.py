@@ -27,18 +27,18 @@ from model import fresnel
 from model.arrays import Float64Array
 from model.dipole import profile as dipole
 
-REACH = 2.0714
+SOURCE_RADIUS_PER_SIDE = 2.0714
 """Reach of a source in sides of a square of its area, so that thirteen sources tell the light at a
 point. Of a square lattice the bumps add up to 1 within 0.5 % anywhere: their Fourier transform, of
 Bessel's J3, is 0 at the lattice's frequency (third zero over 2 pi)."""
-OWN = 0.25
+SELF_RADIUS_FRACTION = 0.25
 """Part of its reach, half a source's side, within which a source counts as the exit point's own."""
-FINE = 1e-4
+MIN_RADIUS_PER_DEPTH = 1e-4
 """Below this part of the source's depth a reach changes nothing, and rounding would."""
-UNREACHED = 1e-10
+MIN_RELATIVE_LIGHT = 1e-10
 """Share of even light below which a point is beyond all sources' light."""
 _CHUNK_BYTES = 1 << 25
-_DEEPEST = float(np.sqrt(3.0))
+_MAX_DEPTH_RATIO = float(np.sqrt(3.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +84,7 @@ class Media:
 @lru_cache(maxsize=8)
 def _inverse(eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d, rising, and sqrt(3 (1 - alpha')) at nodes, for linear interpolation."""
-    q = _DEEPEST * np.linspace(0.0, 1.0, 8193) ** 3
+    q = _MAX_DEPTH_RATIO * np.linspace(0.0, 1.0, 8193) ** 3
     return dipole.absorbed_fraction(np.minimum(q**2 / 3.0, 1.0), eta), q
 
 
@@ -150,11 +150,11 @@ def kernel_parts(
     r, a = np.asarray(radius_mm, np.float64), np.asarray(reach_mm, np.float64)
     # a reach whose square is no number is that of a point
     a = np.where(a > 1e-150, a, 0.0)
-    inside = (r < a) & (a > FINE * media.depth_mm)
+    inside = (r < a) & (a > MIN_RADIUS_PER_DEPTH * media.depth_mm)
     a = np.where(a > 0.0, a, 1.0)
     edge, missing = profile(a, media), _missing(a, media)
     shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
-    own = _missing(OWN * a, media)
+    own = _missing(SELF_RADIUS_FRACTION * a, media)
     far = np.where(inside, edge, profile(r, media))
     return np.asarray(far + shape * (missing - own)), np.asarray(shape * own)
 
@@ -185,7 +185,7 @@ def exitance_directly(
     albedo = np.broadcast_to(np.asarray(r_d, np.float64), (len(at), 3))
     length = np.broadcast_to(np.asarray(translucency_mm, np.float64), (len(at), 3))
     own = None if entered_at is None else np.asarray(entered_at, np.float64)
-    reach = REACH * np.sqrt(area)
+    reach = SOURCE_RADIUS_PER_SIDE * np.sqrt(area)
     found = np.zeros((len(at), 3))
     if not len(source):
         return found
@@ -203,7 +203,7 @@ def exitance_directly(
             mass, total = (carried + near).sum(axis=1), carried @ light[:, c]
             total += near @ light[:, c] if own is None else near.sum(axis=1) * own[part, c]
             if normalize:
-                reached = mass > UNREACHED
+                reached = mass > MIN_RELATIVE_LIGHT
                 total = np.where(reached, total / np.where(reached, mass, 1.0), nearest[:, c])
             found[part, c] = albedo[part, c] * total
     return found

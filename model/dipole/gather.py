@@ -29,14 +29,14 @@ from model import fresnel
 from model.arrays import Float32Array, Float64Array, Int32Array
 from model.dipole import gather_kernels as dipole_gather_kernels
 from model.dipole import source_tree_kernels
-from model.dipole.direct_sum import REACH, Media
+from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, Media
 
-TOLERANCE = 0.1
+GATHER_TOL = 0.1
 """Largest error that exit points may have over the brightest light that entered, if all nodes erred
 to the same side by as much as they can. Measured errors are a hundred times smaller."""
-NODES = 30.0
+NODES_SHARING_TOL = 30.0
 """Nodes that share the tolerance: so many come near their bounds."""
-_CHUNK = 1 << 14
+_CHUNK_POINTS = 1 << 14
 
 
 class GatherError(ValueError):
@@ -101,12 +101,12 @@ class SourceTree:
         near = (place - center).astype(np.float32)
         if not len(some):
             none = np.zeros(0, np.int32)
-            seen = np.zeros((0, source_tree_kernels.VISITED), np.float32)
+            seen = np.zeros((0, source_tree_kernels.NODE_COLUMNS), np.float32)
             empty = np.zeros(0, np.float32)
             return SourceTree(center, some, near, empty, empty, seen, none, none, none, size)
-        order, low, high, skip = source_tree_kernels.split(near, source_tree_kernels.LEAF)
+        order, low, high, skip = source_tree_kernels.split(near, source_tree_kernels.LEAF_SIZE)
         near, area = near[order], area[order].astype(np.float32)
-        reach = (REACH * np.sqrt(area)).astype(np.float32)
+        reach = (SOURCE_RADIUS_PER_SIDE * np.sqrt(area)).astype(np.float32)
         seen = source_tree_kernels.summarize(near, area, reach, low, high)
         return SourceTree(center, some[order], near, reach, area, seen, low, high, skip, size)
 
@@ -141,7 +141,7 @@ def exitance(
     *,
     eta: float = fresnel.ETA_SKIN,
     normalize: bool = True,
-    tolerance: float = TOLERANCE,
+    tolerance: float = GATHER_TOL,
     entered_at: ArrayLike | None = None,
     workers: int = 1,
 ) -> Float64Array:
@@ -166,7 +166,7 @@ def exitance(
     normalize
         Divide by what even light would bring: see above.
     tolerance
-        Worst error over the brightest light that entered, see `TOLERANCE`, above 0.
+        Worst error over the brightest light that entered, see `GATHER_TOL`, above 0.
     entered_at
         What enters at the exit points themselves, (Q, 3): taken for the light that comes out
         nearer than the sources can tell. None: what enters at the sources near by.
@@ -216,7 +216,7 @@ def gather(
     *,
     eta: float = fresnel.ETA_SKIN,
     normalize: bool = True,
-    tolerance: float = TOLERANCE,
+    tolerance: float = GATHER_TOL,
     entered_at: ArrayLike | None = None,
     workers: int = 1,
 ) -> Gathered:
@@ -250,7 +250,7 @@ def gather(
     own = np.broadcast_to(own, at.shape)
 
     def one(start: int) -> None:
-        part = slice(start, start + _CHUNK)
+        part = slice(start, start + _CHUNK_POINTS)
         media = Media.of(albedo[part], length[part], eta=eta)
         here = np.ascontiguousarray(own[part]).view()
         here.flags.writeable = False  # what may be written would have the kernel compiled anew
@@ -261,7 +261,7 @@ def gather(
             media.height_mm,
             media.scale,
             here,
-            tolerance / NODES,
+            tolerance / NODES_SHARING_TOL,
             normalize,
             tree.place,
             tree.reach,
@@ -278,7 +278,7 @@ def gather(
         )
         found[part] *= albedo[part]
 
-    starts = range(0, len(at), _CHUNK)
+    starts = range(0, len(at), _CHUNK_POINTS)
     if workers == 1:
         for start in starts:
             one(start)

@@ -11,12 +11,12 @@ import math
 import numpy as np
 from numba import float32, njit
 
-from model.dipole.direct_sum import FINE, OWN, UNREACHED
+from model.dipole.direct_sum import MIN_RADIUS_PER_DEPTH, MIN_RELATIVE_LIGHT, SELF_RADIUS_FRACTION
 from model.dipole.source_tree_kernels import AREA, RADIUS, REACH, SPREAD
 
-BUFFER = 512
-NEAR = 64
-_FAST = {"contract", "reassoc", "nsz", "arcp"}
+BUFFER_SIZE = 512
+NEAR_SIZE = 64
+_FAST_MATH = {"contract", "reassoc", "nsz", "arcp"}
 _TWO_PI = 2.0 * math.pi
 
 
@@ -38,7 +38,7 @@ def _decay(x):  # type: ignore[no-untyped-def]
     return p * p
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy")
 def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  # type: ignore[no-untyped-def]
     """Add light and mass of a buffer in one channel, first moments of the light included."""
     s = float32(sigma)
@@ -84,7 +84,7 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
     """
     for i in range(count):
         a = reach[i]
-        fine = a <= FINE * depth
+        fine = a <= MIN_RADIUS_PER_DEPTH * depth
         r2 = float(away2[i]) if fine else a * a
         value, within = _disc(r2, sigma, depth, height, scale)
         total[1] += value * area[i]
@@ -96,7 +96,7 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
             total[1] += shape * missing * area[i]
             total[0] += shape * missing * light[i]
             if own == own:
-                r2 *= OWN * OWN
+                r2 *= SELF_RADIUS_FRACTION * SELF_RADIUS_FRACTION
                 value, within = _disc(r2, sigma, depth, height, scale)
                 missing = within - math.pi * r2 * value
                 total[0] += shape * missing * (own * area[i] - light[i])
@@ -171,12 +171,16 @@ def gather(  # type: ignore[no-untyped-def]
     work
         (Q,) nodes and sources that were summed.
     """
-    away2 = np.empty(BUFFER, np.float32)
-    mass = np.empty(BUFFER, np.float32)
-    light = np.empty((3, BUFFER), np.float32)
-    pull = np.empty((3, BUFFER), np.float32)
-    near_away2, near_reach, near_area = np.empty(NEAR), np.empty(NEAR), np.empty(NEAR)
-    near_light = np.empty((3, NEAR))
+    away2 = np.empty(BUFFER_SIZE, np.float32)
+    mass = np.empty(BUFFER_SIZE, np.float32)
+    light = np.empty((3, BUFFER_SIZE), np.float32)
+    pull = np.empty((3, BUFFER_SIZE), np.float32)
+    near_away2, near_reach, near_area = (
+        np.empty(NEAR_SIZE),
+        np.empty(NEAR_SIZE),
+        np.empty(NEAR_SIZE),
+    )
+    near_light = np.empty((3, NEAR_SIZE))
     total = np.zeros((3, 2))
     nodes = len(skip)
     for q in range(len(at)):
@@ -215,7 +219,7 @@ def gather(  # type: ignore[no-untyped-def]
                 if strays <= limit * room:
                     opened = False
             if not opened:
-                if count == BUFFER:
+                if count == BUFFER_SIZE:
                     for c in range(3):
                         _far(
                             count,
@@ -250,7 +254,7 @@ def gather(  # type: ignore[no-untyped-def]
                     r2 = x * x + y * y + z * z
                     used += 1
                     if r2 < reach[i] * reach[i]:
-                        if close == NEAR:
+                        if close == NEAR_SIZE:
                             for c in range(3):
                                 _near(
                                     close,
@@ -273,7 +277,7 @@ def gather(  # type: ignore[no-untyped-def]
                             near_light[c, close] = area[i] * entered[i, c]
                         close += 1
                     else:
-                        if count == BUFFER:
+                        if count == BUFFER_SIZE:
                             for c in range(3):
                                 _far(
                                     count,
@@ -325,7 +329,7 @@ def gather(  # type: ignore[no-untyped-def]
         for c in range(3):
             if not normalize:
                 found[q, c] = total[c, 0]
-            elif total[c, 1] > UNREACHED:
+            elif total[c, 1] > MIN_RELATIVE_LIGHT:
                 found[q, c] = total[c, 0] / total[c, 1]
             else:
                 if nearest < 0:

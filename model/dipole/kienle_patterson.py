@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from model import fresnel
 from model.arrays import Float64Array
 
-LARGEST = 1e100
+MAX_COEFFICIENT = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
 
 
@@ -101,7 +101,7 @@ def derivatives(
     scatters = scattering > 0.0
     unit = np.where(scatters, absorption + scattering, 1.0)
     # in transport lengths, so that no size of the medium overflows
-    rho = np.minimum(radius * unit, LARGEST)
+    rho = np.minimum(radius * unit, MAX_COEFFICIENT)
     sigma_a, sigma_s = absorption / unit, scattering / unit
     k = np.sqrt(3.0 * sigma_a)
     z_1, z_2 = 1.0, image_depth(eta)
@@ -170,8 +170,9 @@ def image_depth(eta: float) -> float:
 
 def _not_negative(name: str, value: ArrayLike) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array <= LARGEST)):
+    if not np.all((array >= 0.0) & (array <= MAX_COEFFICIENT)):
         raise ValueError(
-            f"{name}: got negative, non-finite or too large values, expected 0 to {LARGEST:g}"
+            f"{name}: got negative, non-finite or too large values, expected 0 to "
+            f"{MAX_COEFFICIENT:g}"
         )
     return array

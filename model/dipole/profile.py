@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from model import fresnel
 from model.arrays import BoolArray, Float64Array
 
-LARGEST = 1e100
+MAX_COEFFICIENT = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still a number."""
-_STEPS = 80  # bisection alone needs 60 for all digits; Newton steps are usually 5
+_MAX_STEPS = 80  # bisection alone needs 60 for all digits; Newton steps are usually 5
 
 
 class ReflectanceOutlierError(ValueError):
@@ -62,7 +62,7 @@ def reflectance(
         "sigma_a_per_mm": sigma_a_per_mm,
         "sigma_s_prime_per_mm": sigma_s_prime_per_mm,
     }
-    arrays = [_not_negative(name, value, most=LARGEST) for name, value in given.items()]
+    arrays = [_not_negative(name, value, most=MAX_COEFFICIENT) for name, value in given.items()]
     try:
         r, sigma_a, sigma_s = np.broadcast_arrays(*arrays)
     except ValueError:
@@ -75,7 +75,7 @@ def reflectance(
     sigma_t = np.where(scatters, sigma_a + sigma_s, 1.0)
     # in transport lengths, so that no size of the medium overflows
     decay = np.sqrt(3.0 * (sigma_a / sigma_t))
-    far = np.minimum(r * sigma_t, LARGEST)
+    far = np.minimum(r * sigma_t, MAX_COEFFICIENT)
     profile = np.zeros(r.shape)
     for z in (1.0, 1.0 + 4.0 / 3.0 * A):
         d = np.hypot(far, z)
@@ -269,7 +269,7 @@ def _solve(r_d: Float64Array, eta: float) -> Float64Array:
     wanted = np.where(outlier, 0.5, 1.0 - r_d)  # exact for r_d >= 0.5
     low, high = np.zeros(r_d.shape), np.full(r_d.shape, np.sqrt(3.0))
     q = np.minimum(wanted / (1.0 + 2.0 / 3.0 * fresnel.boundary_factor(eta)), high)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         lost, slope = _lost(q, eta)
         below = lost < wanted
         low, high = np.where(below, q, low), np.where(below, high, q)

@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numba import njit
 
-LEAF = 8
+LEAF_SIZE = 8
 """Most sources of a node that is not halved."""
 
 # columns of what a walk reads of each node
 CENTER, RADIUS, REACH, AREA, SPREAD = 0, 3, 4, 5, 6
 """Centroid (3), distance of its farthest source, the farthest that a source reaches from it, area,
 and area's second moment about it."""
-VISITED = 8
+NODE_COLUMNS = 8
 
 
 @njit(cache=True, nogil=True)
@@ -87,7 +87,7 @@ def _select(place, order, axis, lo, hi, middle):  # type: ignore[no-untyped-def]
 def summarize(place, area, reach, low, high):  # type: ignore[no-untyped-def]
     """Return what a walk reads of each node, (N, 8), from sources in the tree's order."""
     nodes = len(low)
-    found = np.zeros((nodes, VISITED), np.float32)
+    found = np.zeros((nodes, NODE_COLUMNS), np.float32)
     for node in range(nodes):
         total = x = y = z = 0.0
         for i in range(low[node], high[node]):

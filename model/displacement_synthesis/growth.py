@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from model.displacement_synthesis import kernels
+from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
 from model.displacement_synthesis.sources import Sources, SynthesisError, gather, leveled
@@ -38,7 +38,7 @@ Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
 
 MAX_SIDE_PX = 65_536
-MOST_FILLED = 0.1
+MAX_FILLED_FRACTION = 0.1
 """Share of a window's pixels that may be without a measured height."""
 SCALE_STEP = 1.04
 """Scales of one map are whole powers of this, so that features are at most 2 % off their size."""
@@ -314,7 +314,7 @@ def _choose(
         )
 
     def cut_columns(row: int) -> None:
-        kernels.cut_columns(
+        cut_kernels.cut_columns(
             row,
             cells,
             grid.lines_x,
@@ -328,7 +328,7 @@ def _choose(
         )
 
     def cut_rows(line: int) -> None:
-        kernels.cut_rows(
+        cut_kernels.cut_rows(
             line,
             cells,
             grid.lines_y,
@@ -354,7 +354,7 @@ def _choose(
         if (cells[..., 0] == -1).any():
             raise SynthesisError(
                 f"patches: got no window with at most {allowed} filled pixels in "
-                f"{candidates * kernels.TRIES} draws, expected fewer holes or more candidates"
+                f"{candidates * kernels.MAX_DRAWS} draws, expected fewer holes or more candidates"
             )
         list(pool.map(cut_columns, range(ny)))
         list(pool.map(cut_rows, range(0 if wrap_y else 1, ny)))
@@ -367,7 +367,7 @@ def _allowance(sources: Sources, window: int) -> int:
     Raises
     ------
     SynthesisError
-        When that is more than `MOST_FILLED` of a window.
+        When that is more than `MAX_FILLED_FRACTION` of a window.
     """
     most = 0
     for level in range(sources.level_first.size - 1):
@@ -380,10 +380,11 @@ def _allowance(sources: Sources, window: int) -> int:
             inside = s[window:, window:] - s[:-window, window:] - s[window:, :-window]
             counts.append((inside + s[:-window, :-window]).reshape(-1))
         most = max(most, int(np.quantile(np.concatenate(counts), 0.05)))
-    if most > MOST_FILLED * window**2:
+    if most > MAX_FILLED_FRACTION * window**2:
         raise SynthesisError(
             f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
-            f"in its best places, expected at most {100 * MOST_FILLED:.0f} %: give patches with "
+            f"in its best places, expected at most {100 * MAX_FILLED_FRACTION:.0f} %: give "
+            "patches with "
             "larger whole parts, or smaller cell_px, overlap_px"
         )
     return most

@@ -17,7 +17,7 @@ from model.displacement_synthesis.sources import Sources, SynthesisError
 
 TILE_PX = 1024
 """Side of the tiles that steps are closed in; part of the result's definition."""
-REACH = 8.0
+MARGIN_RANGES = 8.0
 """A tile's margin in ranges of the screened Poisson equation: e^-8 of a step is left there."""
 
 
@@ -179,7 +179,7 @@ class Layout:
         return out, labels, pixels
 
     def _relief(self, site: SiteLayout, top: int, left: int, size: tuple[int, int]) -> Float32Array:
-        margin = math.ceil(REACH * self.range_px)
+        margin = math.ceil(MARGIN_RANGES * self.range_px)
         out, labels, pixels = self._laid_down(
             site, top - margin, left - margin, (size[0] + 2 * margin, size[1] + 2 * margin)
         )

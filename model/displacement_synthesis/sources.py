@@ -22,7 +22,7 @@ MAX_SOURCE_PX = 150_000_000
 """Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
 
 
-FARTHEST_UM = 1e30
+MAX_HEIGHT_UM = 1e30
 """Heights beyond have no sums in single precision."""
 
 
@@ -100,8 +100,10 @@ def _checked(
     if not known.any():
         raise SynthesisError(f"{name}: got no valid height")
     most = float(np.abs(values[known]).max())
-    if most > FARTHEST_UM:
-        raise SynthesisError(f"{name}: got a height of {most:g} um, expected up to {FARTHEST_UM:g}")
+    if most > MAX_HEIGHT_UM:
+        raise SynthesisError(
+            f"{name}: got a height of {most:g} um, expected up to {MAX_HEIGHT_UM:g}"
+        )
     return values, known
 
 

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
 
-CHUNK = 512
+CHUNK_POINTS = 512
 """Points whose sums stay in the cache while all waves pass over them."""
-_NODES = 2001
+_RADIAL_NODES = 2001
 
 
 class VolumeNoiseError(ValueError):
@@ -43,10 +43,10 @@ def _sum_of_waves(points: Any, waves: Any, phases: Any, amplitude: Any, out: Any
     amplitude : float
     out : (N,) float64, written
     """
-    x, y, z = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
-    total = np.empty(CHUNK)
-    for begin in range(0, out.size, CHUNK):
-        count = min(CHUNK, out.size - begin)
+    x, y, z = np.empty(CHUNK_POINTS), np.empty(CHUNK_POINTS), np.empty(CHUNK_POINTS)
+    total = np.empty(CHUNK_POINTS)
+    for begin in range(0, out.size, CHUNK_POINTS):
+        count = min(CHUNK_POINTS, out.size - begin)
         for i in range(count):
             x[i], y[i], z[i] = points[begin + i, 0], points[begin + i, 1], points[begin + i, 2]
             total[i] = 0.0
@@ -214,7 +214,7 @@ class VolumeNoise:
         """
         distance = np.asarray(distance_mm, np.float64)
         low, high = self.band_per_mm
-        log_k = np.linspace(math.log(low), math.log(high), _NODES)
+        log_k = np.linspace(math.log(low), math.log(high), _RADIAL_NODES)
         density = np.exp((self.slope + 1.0) * (log_k - log_k[-1]))
         density /= np.trapezoid(density, log_k)
         values = density * np.sinc(2.0 * np.exp(log_k) * distance[..., None])

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.facial_color import coarse_maps, deviation_ratio, disc_statistics
-from model.facial_color.deviation_ratio import ROUNDING
+from model.facial_color.deviation_ratio import ROUNDING_ERROR
 from model.facial_color.disc_statistics import DiscStatistics
 from model.facial_color.state_maps import (
     GLOBAL_STATES,
@@ -20,8 +20,8 @@ from model.facial_color.state_maps import (
     check_name,
 )
 
-TRANSFERS = ("ratio", "difference", "absolute")
-_LINES = 256
+TRANSFER_METHODS = ("ratio", "difference", "absolute")
+_MAX_TEXTURE_LINES = 256
 """Rows and columns that the size of a map's texture is taken from."""
 
 
@@ -170,7 +170,9 @@ def _deviation_variance(
     with np.errstate(invalid="ignore", divide="ignore"):
         own = np.where(sigma > 0.0, (0.5 * e2 / np.where(sigma > 0.0, sigma, 1.0)) ** 2, 0.0)
     own += e2 / draws
-    return np.minimum(own, sigma**2) + (ROUNDING * np.where(stats.valid, stats.mean, 0.0)) ** 2
+    return (
+        np.minimum(own, sigma**2) + (ROUNDING_ERROR * np.where(stats.valid, stats.mean, 0.0)) ** 2
+    )
 
 
 def texture_area_px(base: Float64Array, valid: BoolArray) -> float:
@@ -194,7 +196,7 @@ def texture_area_px(base: Float64Array, valid: BoolArray) -> float:
     area = 1.0
     values = np.where(valid, base, 0.0)
     for lines, mask in ((values, valid), (values.T, valid.T)):
-        step = max(lines.shape[0] // _LINES, 1)
+        step = max(lines.shape[0] // _MAX_TEXTURE_LINES, 1)
         z, v = lines[::step], mask[::step].astype(np.float64)
         power = float(np.sum(z * z)) / max(float(v.sum()), 1.0)
         length = 1.0
@@ -219,8 +221,8 @@ def transferred(
     transfer: str,
 ) -> RigMaps:
     """Do the work of `HemoglobinRig.applied_to`."""
-    if transfer not in TRANSFERS:
-        raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFERS}")
+    if transfer not in TRANSFER_METHODS:
+        raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFER_METHODS}")
     base = _image(NEUTRAL, neutral)
     images = {NEUTRAL: base}
     held = _masks(valid, images)[NEUTRAL]
@@ -245,7 +247,7 @@ def transferred(
         if transfer == "difference":
             maps["bias"] = mean + maps["bias"] - source_mean
         elif transfer == "ratio":
-            variance = maps["bias_stderr"] ** 2 + (ROUNDING * maps["bias"]) ** 2
+            variance = maps["bias_stderr"] ** 2 + (ROUNDING_ERROR * maps["bias"]) ** 2
             change = deviation_ratio.estimate(maps["bias"], source_mean, variance, both)
             known = both & (source_mean > 0.0)
             maps["bias"] = mean * change.value

@@ -24,7 +24,7 @@ import numpy as np
 
 from model.arrays import BoolArray, Float64Array
 
-ROUNDING = float(np.finfo(np.float32).eps)
+ROUNDING_ERROR = float(np.finfo(np.float32).eps)
 """Relative error below which no map is trusted: that of the float32 it is stored in."""
 
 

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from model.facial_color import disc_kernels
 
-TRUSTED: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
+MAX_VARIANCE_ERROR: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
 """Relative error of a variance by running sums, by the type of the map, above which a disc is
 summed by itself; half of it is that of the deviation."""
 
-_WIDE: Final = 512
+_TILE_COLUMNS: Final = 512
 """Columns that share a value to sum about; the sums of a tile fit a core's cache."""
-_SMALL_PX: Final = 6.0
+_MIN_SUM_RADIUS_PX: Final = 6.0
 """A disc of smaller radius has too few digits left in float32 sums of its whole tile."""
 
 
@@ -123,7 +123,7 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     h = np.asarray(h)
     if h.ndim < 2 or 0 in h.shape[-2:]:
         raise DiscStatisticsError(f"h: got shape {h.shape}, expected (..., H, W) with pixels")
-    if h.dtype != np.float32 or radius_px < _SMALL_PX:
+    if h.dtype != np.float32 or radius_px < _MIN_SUM_RADIUS_PX:
         h = np.asarray(h, np.float64)
     if valid is not None:
         valid = np.asarray(valid)
@@ -155,9 +155,9 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
             high,
             inner,
             64 if radius_px <= 32.0 else 128,
-            _WIDE,
+            _TILE_COLUMNS,
             4 * get_num_threads(),
-            TRUSTED[h.dtype],
+            MAX_VARIANCE_ERROR[h.dtype],
             mean[at],
             deviation[at],
             count[at],

@@ -11,12 +11,12 @@ import numpy as np
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 
 SCHEMA: Final = "skinrig.facial-color/1"
-DOCUMENT: Final = "facial_color.json"
-_BLOOD: Final = UNITS["hemoglobin"]
-_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
+RIG_DOCUMENT: Final = "facial_color.json"
+_BLOOD_UNIT: Final = MAP_UNITS["hemoglobin"]
+_DOCUMENT_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
 _STATE_KEYS: Final = {"prior", "storage_rms", "storage_largest"}
 
 
@@ -25,14 +25,14 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
     maps = {
         "hemoglobin": SkinMap(
             _single(rig.neutral),
-            _BLOOD,
+            _BLOOD_UNIT,
             _single(rig.neutral_stderr),
             rig.valid,
             "neutral state; linear volume fraction",
         ),
         f"bias_{NEUTRAL}": SkinMap(
             _single(rig.neutral_mean),
-            _BLOOD,
+            _BLOOD_UNIT,
             None,
             rig.neutral_mean_valid,
             "mean of the neutral state in a disc",
@@ -48,11 +48,15 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
             "deviation in a disc over that of the neutral state",
         )
         maps[f"bias_{name}"] = SkinMap(
-            _single(state.bias), _BLOOD, _single(state.bias_stderr), state.valid, "mean in a disc"
+            _single(state.bias),
+            _BLOOD_UNIT,
+            _single(state.bias_stderr),
+            state.valid,
+            "mean in a disc",
         )
         maps[f"misfit_{name}"] = SkinMap(
             _single(state.misfit),
-            _BLOOD,
+            _BLOOD_UNIT,
             None,
             state.valid,
             "deviation in a disc of the measured state from scale and bias",
@@ -84,30 +88,30 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     try:
         loaded = json.loads(document)
     except ValueError as error:
-        raise FacialColorError(f"{DOCUMENT}: is not JSON ({error})") from error
+        raise FacialColorError(f"{RIG_DOCUMENT}: is not JSON ({error})") from error
     version = loaded.get("schema") if isinstance(loaded, dict) else None
     if version != SCHEMA:
-        raise FacialColorError(f"{DOCUMENT}: got schema {version!r}, expected {SCHEMA!r}")
-    _exactly("", loaded, _KEYS)
+        raise FacialColorError(f"{RIG_DOCUMENT}: got schema {version!r}, expected {SCHEMA!r}")
+    _exactly("", loaded, _DOCUMENT_KEYS)
     shape, stored = (_size(key, loaded[key]) for key in ("shape", "stored"))
     radius = _number("radius_px", loaded["radius_px"])
     listed = loaded["global_states"]
     if not (isinstance(listed, list) and all(isinstance(name, str) for name in listed)):
-        raise FacialColorError(f"{DOCUMENT}: global_states: got {listed!r}, expected names")
+        raise FacialColorError(f"{RIG_DOCUMENT}: global_states: got {listed!r}, expected names")
     if not isinstance(loaded["states"], dict):
-        raise FacialColorError(f"{DOCUMENT}: states: expected an object by name")
-    neutral = _map(maps, "hemoglobin", shape, _BLOOD)
+        raise FacialColorError(f"{RIG_DOCUMENT}: states: expected an object by name")
+    neutral = _map(maps, "hemoglobin", shape, _BLOOD_UNIT)
     states = {}
     for name, entry in loaded["states"].items():
         if not isinstance(entry, dict):
-            raise FacialColorError(f"{DOCUMENT}: states.{name}: expected an object")
+            raise FacialColorError(f"{RIG_DOCUMENT}: states.{name}: expected an object")
         _exactly(f"states.{name}.", entry, _STATE_KEYS)
         number = {key: _number(f"states.{name}.{key}", entry[key]) for key in _STATE_KEYS}
         scale, bias, misfit = (
             _map(maps, f"{kind}_{name}", stored, unit)
-            for kind, unit in (("scale", "1"), ("bias", _BLOOD), ("misfit", _BLOOD))
+            for kind, unit in (("scale", "1"), ("bias", _BLOOD_UNIT), ("misfit", _BLOOD_UNIT))
         )
-        valid = _valid(scale)
+        valid = scale.mask
         states[name] = StateMaps(
             scale=_double(scale.values, valid),
             bias=_double(bias.values, valid),
@@ -119,13 +123,13 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
             storage_rms=number["storage_rms"],
             storage_largest=number["storage_largest"],
         )
-    mean = _map(maps, f"bias_{NEUTRAL}", stored, _BLOOD)
-    held = _valid(neutral)
+    mean = _map(maps, f"bias_{NEUTRAL}", stored, _BLOOD_UNIT)
+    held = neutral.mask
     return HemoglobinRig(
         neutral=np.where(held, neutral.values, np.float32(0)),
         valid=held,
         neutral_stderr=np.where(held, _stderr(neutral), np.float32(0)),
-        neutral_mean=_double(mean.values, _valid(mean)),
+        neutral_mean=_double(mean.values, mean.mask),
         states=states,
         radius_px=radius,
         global_states=tuple(listed),
@@ -140,12 +144,6 @@ def _double(values: Float32Array, valid: BoolArray) -> Float64Array:
     return np.where(valid, values, 0.0).astype(np.float64)
 
 
-def _valid(skin_map: SkinMap) -> BoolArray:
-    if skin_map.valid is None:
-        return np.ones(skin_map.values.shape, np.bool_)
-    return skin_map.valid
-
-
 def _stderr(skin_map: SkinMap) -> Float32Array:
     if skin_map.stderr is None:
         return np.zeros(skin_map.values.shape, np.float32)
@@ -154,7 +152,7 @@ def _stderr(skin_map: SkinMap) -> Float32Array:
 
 def _map(maps: Mapping[str, SkinMap], name: str, shape: tuple[int, int], unit: str) -> SkinMap:
     if name not in maps:
-        raise FacialColorError(f"maps: {name!r} is missing, which {DOCUMENT} needs")
+        raise FacialColorError(f"maps: {name!r} is missing, which {RIG_DOCUMENT} needs")
     found = maps[name]
     if found.values.shape != shape:
         raise FacialColorError(f"{name}: got shape {found.values.shape}, expected {shape}")
@@ -165,14 +163,14 @@ def _map(maps: Mapping[str, SkinMap], name: str, shape: tuple[int, int], unit: s
 
 def _exactly(where: str, got: Mapping[str, Any], expected: set[str]) -> None:
     for key in sorted(expected - set(got)):
-        raise FacialColorError(f"{DOCUMENT}: {where}{key} is missing")
+        raise FacialColorError(f"{RIG_DOCUMENT}: {where}{key} is missing")
     for key in sorted(set(got) - expected):
-        raise FacialColorError(f"{DOCUMENT}: {where}{key} is unknown")
+        raise FacialColorError(f"{RIG_DOCUMENT}: {where}{key} is unknown")
 
 
 def _number(where: str, got: object) -> float:
     if isinstance(got, bool) or not isinstance(got, int | float) or not np.isfinite(got):
-        raise FacialColorError(f"{DOCUMENT}: {where}: got {got!r}, expected a finite number")
+        raise FacialColorError(f"{RIG_DOCUMENT}: {where}: got {got!r}, expected a finite number")
     return float(got)
 
 
@@ -183,4 +181,4 @@ def _size(where: str, got: object) -> tuple[int, int]:
         and all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in got)
     ):
         return got[0], got[1]
-    raise FacialColorError(f"{DOCUMENT}: {where}: got {got!r}, expected two numbers of pixels")
+    raise FacialColorError(f"{RIG_DOCUMENT}: {where}: got {got!r}, expected two numbers of pixels")

@@ -23,13 +23,13 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.facial_color import basis, disc_statistics
-from model.facial_color.deviation_ratio import ROUNDING
+from model.facial_color.deviation_ratio import ROUNDING_ERROR
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, RigMaps
 from model.tissue_optics.layers import C_HD_MAX
 
 STORED_SIZE: Final = 256
 """Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
-LIMITS: Final = (0.0, C_HD_MAX)
+BLOOD_LIMITS: Final = (0.0, C_HD_MAX)
 """Volume fractions of blood that exist, Jimenez2010, Table 1."""
 GLOBAL_GAINS: Final[Mapping[str, float]] = MappingProxyType({"anger": 1.27, "fear": 0.81})
 """Factors of all blood at full emotion, beside the expression (Jimenez2010, section 7)."""
@@ -233,7 +233,7 @@ class HemoglobinRig(RigMaps):
         normalize: bool = False,
         gains: Mapping[str, float] | None = None,
         gain: float = 1.0,
-        limits: tuple[float, float] = LIMITS,
+        limits: tuple[float, float] = BLOOD_LIMITS,
     ) -> HemoglobinBlend:
         """Blend states, eq. (6).
 
@@ -291,7 +291,7 @@ class HemoglobinRig(RigMaps):
         blood = factor * (up[1] + base * up[0])  # eq. (6)
         # the misfit was seen with the noise of the maps in it
         pixel = np.maximum(up[5], (up[0] * self.neutral_stderr) ** 2)
-        pixel += (ROUNDING * self.neutral) ** 2
+        pixel += (ROUNDING_ERROR * self.neutral) ** 2
         error = factor * np.sqrt(pixel + up[4] + base * base * up[3])
         valid = self.valid & np.isfinite(blood)
         outside = valid & ((blood < limits[0]) | (blood > limits[1]))

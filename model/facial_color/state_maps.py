@@ -20,7 +20,7 @@ GLOBAL_STATES: Final = ("exercise", "alcohol")
 """States of the whole body: nothing of the face moves."""
 
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,57}")
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,57}")
 
 
 class FacialColorError(ValueError):
@@ -67,7 +67,7 @@ def check_name(name: str) -> None:
     """Refuse a state's name that can be no map's."""
     if name == NEUTRAL:
         raise FacialColorError(f"states: {NEUTRAL!r} is the neutral map's own name")
-    if not _NAME.fullmatch(name):
+    if not _NAME_PATTERN.fullmatch(name):
         raise FacialColorError(f"states: got name {name!r}, expected lower case, digits and _")
 
 

@@ -1,7 +1,7 @@
 """Dynamic microstructure: mesh strain, kernel table and convolution."""
 
 from model.microstructure.convolution import ConvolutionError, convolve, convolve_tiled
-from model.microstructure.convolution_kernels import TRUNCATE
+from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
 from model.microstructure.kernel_table import (
     ALPHA_LIMITS,
     FOREHEAD,
@@ -19,7 +19,7 @@ __all__ = [
     "ALPHA_LIMITS",
     "FOREHEAD",
     "TABLE_SCHEMA",
-    "TRUNCATE",
+    "TRUNCATE_SIGMAS",
     "ConvolutionError",
     "KernelPoints",
     "KernelTable",

@@ -56,9 +56,9 @@ Border = Literal["mirror", "open"]
 MAX_SIGMA_PX = 1000.0
 """A Gaussian wider than this is a mistake in units."""
 
-_REACH = {"linear": kernels.LINEAR, "cubic": kernels.CUBIC}
-_BORDER = {"mirror": kernels.MIRROR, "open": kernels.OPEN}
-_WRONG = {
+_INTERPOLATIONS = {"linear": kernels.LINEAR, "cubic": kernels.CUBIC}
+_BORDERS = {"mirror": kernels.MIRROR, "open": kernels.OPEN}
+_ERROR_TEXTS = {
     kernels.NOT_FINITE: "got NaN or infinity",
     kernels.ALPHA: "got a strength beyond [-2, 1]",
     kernels.SIGMA: f"got a standard deviation beyond 0...{MAX_SIGMA_PX:g} px",
@@ -137,15 +137,15 @@ def reach_of(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "c
     )
     if code.any():
         row = int(np.flatnonzero(code)[0])
-        raise ConvolutionError(f"alpha, sigma, axis: {_WRONG[int(code[row])]}, row {row}")
-    radius = int(kernels.TRUNCATE * float(largest.max(initial=0.0)) + 0.5)
-    return radius + _REACH[sampling] if radius else 0
+        raise ConvolutionError(f"alpha, sigma, axis: {_ERROR_TEXTS[int(code[row])]}, row {row}")
+    radius = int(kernels.TRUNCATE_SIGMAS * float(largest.max(initial=0.0)) + 0.5)
+    return radius + _INTERPOLATIONS[sampling] if radius else 0
 
 
 def _settings(sampling: str, border: str) -> None:
-    if sampling not in _REACH:
+    if sampling not in _INTERPOLATIONS:
         raise ConvolutionError(f'sampling: got {sampling!r}, expected "cubic" or "linear"')
-    if border not in _BORDER:
+    if border not in _BORDERS:
         raise ConvolutionError(f'border: got {border!r}, expected "mirror" or "open"')
 
 
@@ -188,8 +188,8 @@ def _pass(
         lines.alpha,
         lines.sigma_px,
         np.array([window.top, window.left]),
-        _REACH[sampling],
-        _BORDER[border],
+        _INTERPOLATIONS[sampling],
+        _BORDERS[border],
         out,
     )
     return out

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-TRUNCATE = 4.0
+TRUNCATE_SIGMAS = 4.0
 """The discrete Gaussian ends at the whole number of pixels next to so many sigmas."""
-LEAST_WEIGHT = 1e-8
+MIN_WEIGHT = 1e-8
 """Of a neighbouring pixel; below it the Gaussian is the delta in single precision."""
-FAR = 255
+MAX_DISTANCE_PX = 255
 """Distances to what is not valid are told up to so many pixels."""
 LINEAR, CUBIC = 1, 2
 """How many pixels to a side the sample between pixels takes from."""
@@ -37,13 +37,13 @@ def distance_to_invalid(valid: Any) -> Any:
     Returns
     -------
     (H, W) uint8
-        0 where not valid, at most `FAR`. The map's border counts for nothing.
+        0 where not valid, at most `MAX_DISTANCE_PX`. The map's border counts for nothing.
     """
     rows, columns = valid.shape
     out = np.empty((rows, columns), np.uint8)
     for y in range(rows):
         for x in range(columns):
-            d = FAR
+            d = MAX_DISTANCE_PX
             if not valid[y, x]:
                 d = 0
             else:
@@ -237,14 +237,14 @@ def along_lines(
             out[row, column] = own
             a = alpha[row * ah, column * aw]
             s = sigma[row * sh, column * sw]
-            radius = int(TRUNCATE * s + 0.5)
+            radius = int(TRUNCATE_SIGMAS * s + 0.5)
             if a == zero or radius == 0 or (masked and clear[y, x] == 0):
                 continue
             ax = axis[row * xh, column * xw, 0]
             ay = axis[row * xh, column * xw, 1]
             # w(i) = e^(i^2), by w(i + 1) = w(i) e^(2 i + 1)
             e = math.exp(-0.5 / (kind(s) * kind(s)))
-            if e < LEAST_WEIGHT:
+            if e < MIN_WEIGHT:
                 continue
             w, grow, grow_by = e, e * e * e, e * e
             norm = 1.0

@@ -28,14 +28,14 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
 from model.microstructure.convolution import ConvolutionError, convolve, convolve_tiled
-from model.microstructure.convolution_kernels import TRUNCATE
+from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
 from model.microstructure.mesh_strain import MeshStrain, StrainError, strain
 
 __all__ = [
     "ALPHA_LIMITS",
     "FOREHEAD",
     "TABLE_SCHEMA",
-    "TRUNCATE",
+    "TRUNCATE_SIGMAS",
     "ConvolutionError",
     "KernelPoints",
     "KernelTable",
@@ -58,7 +58,7 @@ ALPHA_LIMITS = (-2.0, 1.0)
 TABLE_SCHEMA = "skinrig.kernel-table/1"
 
 
-WIDEST_PX = 1e6
+MAX_WIDTH_PX = 1e6
 """Widest Gaussian, px: wider than any map, and its weights still fit into memory."""
 
 
@@ -69,13 +69,13 @@ class KernelTableError(ValueError):
 def gaussian_weights(sigma_px: float) -> Float64Array:
     """Return the right half of the normalised discrete Gaussian, its centre first.
 
-    The continuous Gaussian at whole pixels up to ``TRUNCATE`` sigmas, divided by its sum. Far
-    below one pixel it is the delta function to machine precision, and blurs nothing.
+    The continuous Gaussian at whole pixels up to ``TRUNCATE_SIGMAS`` sigmas, divided by its sum.
+    Far below one pixel it is the delta function to machine precision, and blurs nothing.
 
     Parameters
     ----------
     sigma_px : float
-        Standard deviation, px, above 0, up to `WIDEST_PX`.
+        Standard deviation, px, above 0, up to `MAX_WIDTH_PX`.
 
     Returns
     -------
@@ -89,9 +89,9 @@ def gaussian_weights(sigma_px: float) -> Float64Array:
     >>> gaussian_weights(0.1).tolist()
     [1.0]
     """
-    if not 0 < sigma_px <= WIDEST_PX:
-        raise ValueError(f"sigma_px: got {sigma_px}, expected above 0, up to {WIDEST_PX:g}")
-    k = np.arange(int(TRUNCATE * sigma_px + 0.5) + 1)
+    if not 0 < sigma_px <= MAX_WIDTH_PX:
+        raise ValueError(f"sigma_px: got {sigma_px}, expected above 0, up to {MAX_WIDTH_PX:g}")
+    k = np.arange(int(TRUNCATE_SIGMAS * sigma_px + 0.5) + 1)
     w = np.exp(-0.5 * (k / sigma_px) ** 2)
     return w / (w[0] + 2.0 * w[1:].sum())
 

@@ -29,7 +29,7 @@ from scipy.optimize import brentq
 from model.arrays import Float64Array
 from model.microstructure.kernel_table import ALPHA_LIMITS, gaussian_weights
 
-FARTHEST_ALPHA = 1e3
+MAX_ALPHA = 1e3
 """Strengths beyond this are not sought: the profile has nothing at sigma's scale to sharpen."""
 
 
@@ -262,9 +262,9 @@ def keep_length(
     alpha = 0.0
     if abs(excess(0.0)) > 1e-12 * neutral and slope(0.0) < 0:
         if excess(0.0) < 0:
-            alpha = -_crossing(lambda strength: excess(-strength), FARTHEST_ALPHA)
+            alpha = -_crossing(lambda strength: excess(-strength), MAX_ALPHA)
         else:
-            shortest = _crossing(slope, FARTHEST_ALPHA)
+            shortest = _crossing(slope, MAX_ALPHA)
             alpha = _crossing(excess, shortest)
     found = length_change(
         height, spacing_um=spacing_um, stretch=stretch, alpha=alpha, sigma_um=sigma_um

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float32Array, FloatArray
-from model.microstructure import strain_kernels as kernels
+from model.microstructure import texture_kernels
 from model.microstructure.convolution import LineKernels
 from model.microstructure.kernel_table import ALPHA_LIMITS, FOREHEAD, KernelTable
 from model.microstructure.map_windows import Window
@@ -92,7 +92,7 @@ def rasterize(
     stretch = np.ones((*shape, 2), np.float32)
     axes = np.zeros((*shape, 2, 2), np.float32)
     scale = np.zeros((*shape, 2), np.float32)
-    kernels.fill_texture(
+    texture_kernels.fill_texture(
         triangles,
         texture[:, 0] * width - 0.5,
         (1.0 - texture[:, 1]) * height - 0.5,
@@ -108,15 +108,15 @@ def rasterize(
         scale,
     )
     for _ in range(pad_px):
-        kernels.pad_once(state, state.copy(), stretch, axes, scale)
+        texture_kernels.pad_once(state, state.copy(), stretch, axes, scale)
     inner = asked.within(around)
     part = (inner.rows, inner.columns)
     return TextureStrain(
         stretch=np.ascontiguousarray(stretch[part]),
         axes=np.ascontiguousarray(axes[part]),
         px_per_mm=np.ascontiguousarray(scale[part]),
-        covered=state[part] == kernels.COVERED,
-        padded=state[part] == kernels.PADDED,
+        covered=state[part] == texture_kernels.COVERED,
+        padded=state[part] == texture_kernels.PADDED,
     )
 
 
@@ -238,7 +238,7 @@ def line_kernels(
     shape = strain.covered.shape
     alpha, sigma = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
     ends = table.stretch_range if extrapolate == "hold" else (0.0, math.inf)
-    kernels.look_up(
+    texture_kernels.look_up(
         strain.stretch,
         (strain.covered | strain.padded).astype(np.uint8),
         np.asarray(table.alpha_breaks, np.float64),

@@ -9,17 +9,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-SLIVER = 1e-6
+MIN_HEIGHT_RATIO = 1e-6
 """A triangle lower than this part of its longest edge is degenerate; so is one in the texture."""
-EVEN = 1e-6
+ISOTROPY_TOL = 1e-6
 """Relative difference of the two stretch ratios below which no axis is preferred."""
 FINE, DEGENERATE, NO_TEXTURE, TURNED = range(4)
 """What triangles are: usable, without area, without area in the texture, against their own."""
-BAND = 32
-"""Rows of the texture filled by one thread at a time."""
-EMPTY, COVERED, PADDED = range(3)
 
 
 @njit(inline="always")
@@ -91,7 +88,7 @@ def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
         longest = max(aa, max(bb, _dot(c, c)))
         n = _cross(a, b)
         twice = math.sqrt(_dot(n, n))
-        if not twice > SLIVER * longest:
+        if not twice > MIN_HEIGHT_RATIO * longest:
             kind[f] = DEGENERATE
             continue
         # on axes e1 = a / |a|, e2 = n x e1: a = (x, 0), b = (u, v)
@@ -132,7 +129,7 @@ def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
         ub, vb = uv[k, 0] - uv[i, 0], uv[k, 1] - uv[i, 1]
         cu, cv = ub - ua, vb - va
         longest = max(ua * ua + va * va, max(ub * ub + vb * vb, cu * cu + cv * cv))
-        if not abs(ua * vb - va * ub) > SLIVER * longest:
+        if not abs(ua * vb - va * ub) > MIN_HEIGHT_RATIO * longest:
             kind[f] = NO_TEXTURE
             continue
         to_uv[f, 0, 0], to_uv[f, 1, 0] = ua / x, va / x
@@ -284,7 +281,7 @@ def vertex_strain(
         mean, h, ax, ay = principal(t[0], t[1], t[2])
         stretch[vertex, 0] = max(1.0 + mean + h, 0.0)
         stretch[vertex, 1] = max(1.0 + mean - h, 0.0)
-        even[vertex] = 2.0 * h <= EVEN * stretch[vertex, 0]
+        even[vertex] = 2.0 * h <= ISOTROPY_TOL * stretch[vertex, 0]
         if even[vertex]:
             vx, vy = 1.0, 0.0
         else:
@@ -295,187 +292,3 @@ def vertex_strain(
         column_t[vertex, 1] = -metric[vertex, 1] * vy + metric[vertex, 2] * vx
         valid[vertex] = True
     return stretch, column_s, column_t, tensor, metric, even, valid
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def fill_texture(
-    faces: Any,
-    x: Any,
-    y: Any,
-    values: Any,
-    valid: Any,
-    top: Any,
-    left: Any,
-    width: Any,
-    height: Any,
-    state: Any,
-    stretch: Any,
-    axes: Any,
-    scale: Any,
-) -> None:
-    """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
-
-    The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
-    not depend on the window.
-
-    Parameters
-    ----------
-    faces : (F, 3) int64
-    x, y : (V,) float64
-        Vertices in pixels of the whole texture, y down.
-    values : (V, 6) float64
-        T - 1 and the metric, texture per length.
-    valid : (V,) bool
-    top, left : int
-        First row and column of the window.
-    width, height : float
-        Pixels per unit of the texture's u and v.
-    state : (m, n) uint8, of 0
-    stretch : (m, n, 2) float32
-        r_s, r_t.
-    axes : (m, n, 2, 2) float32
-        Unit vectors (right, down) of s and t.
-    scale : (m, n, 2) float32
-        Pixels per length along s and t.
-    """
-    rows, columns = state.shape
-    bands = (rows + BAND - 1) // BAND
-    for band in prange(bands):
-        first, last = top + band * BAND, top + min(rows, (band + 1) * BAND) - 1
-        for f in range(faces.shape[0]):
-            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-            low, high = min(y[i], min(y[j], y[k])), max(y[i], max(y[j], y[k]))
-            if high < first or low > last:
-                continue
-            if max(x[i], max(x[j], x[k])) < left or min(x[i], min(x[j], x[k])) > left + columns - 1:
-                continue
-            if not (valid[i] and valid[j] and valid[k]):
-                continue
-            det = (x[j] - x[i]) * (y[k] - y[i]) - (x[k] - x[i]) * (y[j] - y[i])
-            if det == 0.0:
-                continue
-            # weights of corners j and k, linear in x and y from corner i
-            jx, jy = (y[k] - y[i]) / det, -(x[k] - x[i]) / det
-            kx, ky = -(y[j] - y[i]) / det, (x[j] - x[i]) / det
-            for row in range(max(first, math.ceil(low)), min(last, math.floor(high)) + 1):
-                dy = row - y[i]
-                a, b = -np.inf, np.inf
-                for part in range(3):
-                    if part == 0:
-                        slope, at = jx, jy * dy
-                    elif part == 1:
-                        slope, at = kx, ky * dy
-                    else:
-                        slope, at = -jx - kx, 1.0 - (jy + ky) * dy
-                    if slope > 0.0:
-                        a = max(a, -at / slope)
-                    elif slope < 0.0:
-                        b = min(b, -at / slope)
-                    elif at < -1e-9:
-                        b = -np.inf
-                # pixels on an edge belong to both sides: the first triangle has them
-                begin = max(math.ceil(a + x[i] - 1e-6), left) if b >= a - 2e-6 else left
-                end = min(math.floor(b + x[i] + 1e-6), left + columns - 1) if b >= a - 2e-6 else -1
-                for column in range(begin, end + 1):
-                    r, c = row - top, column - left
-                    if state[r, c] != EMPTY:
-                        continue
-                    dx = column - x[i]
-                    wj, wk = jx * dx + jy * dy, kx * dx + ky * dy
-                    p = values[i, 0] + wj * (values[j, 0] - values[i, 0])
-                    p += wk * (values[k, 0] - values[i, 0])
-                    q = values[i, 1] + wj * (values[j, 1] - values[i, 1])
-                    q += wk * (values[k, 1] - values[i, 1])
-                    s = values[i, 2] + wj * (values[j, 2] - values[i, 2])
-                    s += wk * (values[k, 2] - values[i, 2])
-                    mean, h, vx, vy = principal(p, q, s)
-                    if 2.0 * h <= EVEN * (1.0 + mean + h):
-                        vx, vy = 1.0, 0.0
-                    p = values[i, 3] + wj * (values[j, 3] - values[i, 3])
-                    p += wk * (values[k, 3] - values[i, 3])
-                    q = values[i, 4] + wj * (values[j, 4] - values[i, 4])
-                    q += wk * (values[k, 4] - values[i, 4])
-                    s = values[i, 5] + wj * (values[j, 5] - values[i, 5])
-                    s += wk * (values[k, 5] - values[i, 5])
-                    sx, sy = width * (p * vx + q * vy), -height * (q * vx + s * vy)
-                    tx, ty = width * (q * vx - p * vy), -height * (s * vx - q * vy)
-                    ls, lt = math.sqrt(sx * sx + sy * sy), math.sqrt(tx * tx + ty * ty)
-                    if not (ls > 0.0 and lt > 0.0):
-                        continue
-                    state[r, c] = COVERED
-                    stretch[r, c, 0] = max(1.0 + mean + h, 0.0)
-                    stretch[r, c, 1] = max(1.0 + mean - h, 0.0)
-                    axes[r, c, 0, 0], axes[r, c, 0, 1] = sx / ls, sy / ls
-                    axes[r, c, 1, 0], axes[r, c, 1, 1] = tx / lt, ty / lt
-                    scale[r, c, 0], scale[r, c, 1] = ls, lt
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> None:
-    """Give empty pixels the values of a neighbour that had some; `before` is a copy of `state`."""
-    rows, columns = state.shape
-    for r in prange(rows):
-        for c in range(columns):
-            if before[r, c] != EMPTY:
-                continue
-            found = False
-            for straight in (True, False):  # sides before corners, then in order
-                for dr in range(-1, 2):
-                    for dc in range(-1, 2):
-                        y, x = r + dr, c + dc
-                        if found or (dr == 0 or dc == 0) != straight:
-                            continue
-                        if 0 <= y < rows and 0 <= x < columns and before[y, x] != EMPTY:
-                            found = True
-                            state[r, c] = PADDED
-                            stretch[r, c] = stretch[y, x]
-                            axes[r, c] = axes[y, x]
-                            scale[r, c] = scale[y, x]
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def look_up(
-    stretch: Any,
-    state: Any,
-    breaks: Any,
-    alpha_lines: Any,
-    sigma_lines: Any,
-    ends: Any,
-    limits: Any,
-    scale: Any,
-    alpha: Any,
-    sigma: Any,
-) -> None:
-    """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
-
-    Parameters
-    ----------
-    stretch, scale : (m, n, 2) float32
-        Ratios, and pixels per length.
-    state : (m, n) uint8
-        Nothing is convolved where `EMPTY`.
-    breaks, alpha_lines : (L - 1,), (L, 2) float64
-        Slope and intercept of alpha's lines.
-    sigma_lines : (2, 2) float64
-        Of sigma, in the length of `scale`, below and above a ratio of 1.
-    ends, limits : (2,) float64
-        Ratios are held within the first, alpha within the second.
-    alpha, sigma : (2, m, n) float32, written
-    """
-    for r in prange(state.shape[0]):
-        for c in range(state.shape[1]):
-            for axis in range(2):
-                alpha[axis, r, c] = 0.0
-                sigma[axis, r, c] = 0.0
-                if state[r, c] == EMPTY:
-                    continue
-                ratio = min(max(float(stretch[r, c, axis]), ends[0]), ends[1])
-                line = 0
-                while line < breaks.size and ratio > breaks[line]:
-                    line += 1
-                a = alpha_lines[line, 0] * ratio + alpha_lines[line, 1]
-                a = min(max(a, limits[0]), limits[1])
-                side = 0 if ratio < 1.0 else 1
-                s = sigma_lines[side, 0] * ratio + sigma_lines[side, 1]
-                alpha[axis, r, c] = 0.0 if ratio == 1.0 else a
-                sigma[axis, r, c] = max(s, 0.0) * scale[r, c, axis]

@@ -13,9 +13,12 @@ import numpy as np
 
 from model.arrays import Float64Array, Int64Array
 
-_POINT = 1e-6  # cores below this part of the largest length are points
-_NEAR, _FAR = 3.0, 10.0  # centre distances over the sum of core radii at which fewer nodes do
-_NODES = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
+_MIN_CORE_RATIO = 1e-6  # cores below this part of the largest length are points
+_NEAR_RATIO, _FAR_RATIO = (
+    3.0,
+    10.0,
+)  # centre distances over the sum of core radii at which fewer nodes do
+_NODE_COUNTS = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
 _RINGS, _ANGLES = 48, 96
 
 
@@ -61,12 +64,12 @@ def distance_rule(
     )
     a, b = 0.5 * core, 0.5 * source
     # its share of a squared distance, 1e-12, is lost in the recurrence of the Gauss rule
-    least = _POINT * max(radius, a, b)
+    least = _MIN_CORE_RATIO * max(radius, a, b)
     a, b = (0.0 if half < least else half for half in (a, b))
     reach = a + b
     if reach == 0.0:
         return np.array([radius_mm]), np.array([1.0])
-    count = _NODES[int(radius > _NEAR * reach) + int(radius > _FAR * reach)]
+    count = _NODE_COUNTS[int(radius > _NEAR_RATIO * reach) + int(radius > _FAR_RATIO * reach)]
     offset, offset_weight = _offsets(a, b)
     angle = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
     across = radius + offset[:, None] * np.cos(angle)

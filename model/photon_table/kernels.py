@@ -15,8 +15,8 @@ _READ_1, _READ_2 = (types.Array(types.float64, n, "C", readonly=True) for n in (
 _READ_INTEGERS_1, _READ_INTEGERS_2 = (
     types.Array(types.int64, n, "C", readonly=True) for n in (1, 2)
 )
-_WRITTEN = types.float64[:, ::1]
-_BLACK = 1e6  # exp(-u^2) is 0 long before, and u^4 still a number
+_ROWS_TYPE = types.float64[:, ::1]
+_MAX_ROOT = 1e6  # exp(-u^2) is 0 long before, and u^4 still a number
 _ROOT_FLOOR = 1e-6  # slopes by sigma_a at 0 are limits; here they are reached to 1e-12
 
 
@@ -47,9 +47,9 @@ def _basis(t):  # type: ignore[no-untyped-def]
         _READ_INTEGERS_1,
         _READ_1,
         _READ_1,
-        _WRITTEN,
-        _WRITTEN,
-        _WRITTEN,
+        _ROWS_TYPE,
+        _ROWS_TYPE,
+        _ROWS_TYPE,
     ),
     cache=True,
     nogil=True,
@@ -94,7 +94,7 @@ def evaluate(  # type: ignore[no-untyped-def]
     for n in range(n_rows):
         s = sigma_s_prime[n]
         u = max(sqrt(sigma_a[n] / s), _ROOT_FLOOR)
-        if u > _BLACK:
+        if u > _MAX_ROOT:
             for f in range(n_columns):
                 out[n, f] = out_by_a[n, f] = out_by_s[n, f] = 0.0
             continue

@@ -19,7 +19,7 @@ from model.photon_table import kernels
 
 Collection = Literal["all", "fibre"]
 
-_MOMENTS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
+_LEGENDRE_ORDERS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
 
 
 class TableDomainError(ValueError):
@@ -110,16 +110,16 @@ def asymptotic_decay(absorption_ratio: float, g: float) -> float:
         raise ValueError(f"absorption_ratio: got {absorption_ratio}, expected 1e-100 to 1e100")
     if not 0.0 <= g < 1.0:
         raise ValueError(f"g: got {g}, expected in [0, 1)")
-    order = np.arange(_MOMENTS)
+    order = np.arange(_LEGENDRE_ORDERS)
     removed = absorption_ratio + (1.0 - g**order) / (1.0 - g)
     ell = order[1:]
     off = ell / np.sqrt((2.0 * ell - 1.0) * (2.0 * ell + 1.0) * removed[:-1] * removed[1:])
     largest = eigh_tridiagonal(
-        np.zeros(_MOMENTS),
+        np.zeros(_LEGENDRE_ORDERS),
         off,
         eigvals_only=True,
         select="i",
-        select_range=(_MOMENTS - 1, _MOMENTS - 1),
+        select_range=(_LEGENDRE_ORDERS - 1, _LEGENDRE_ORDERS - 1),
     )
     return float(1.0 / largest[0])
 

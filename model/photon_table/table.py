@@ -37,7 +37,7 @@ __all__ = [
 
 NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""
-LARGEST = 1e50
+MAX_QUANTITY = 1e50
 """Largest length, mm, and coefficient, 1/mm: their squares and cubes are still finite numbers."""
 MAX_ABSORPTION_RATIO = 10.0
 """Largest sigma_a/sigma_s' in the domain."""
@@ -138,10 +138,10 @@ def derivatives(
     sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
     sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
     cores = (_not_negative("core_mm", core_mm), _not_negative("source_core_mm", source_core_mm))
-    if not any(cores) and np.any(radius < 1.0 / LARGEST):
+    if not any(cores) and np.any(radius < 1.0 / MAX_QUANTITY):
         raise ValueError(
             f"radius_mm: got {radius.min():g} between points, where R is infinite; "
-            f"expected {1.0 / LARGEST:g} and more"
+            f"expected {1.0 / MAX_QUANTITY:g} and more"
         )
     shape = np.broadcast_shapes(radius.shape, sigma_a.shape, sigma_s.shape)
     columns = shape[-1] if shape else 1
@@ -290,7 +290,7 @@ def domain(
 def _not_negative(name: str, value: ArrayLike) -> Float64Array:
     array = np.asarray(value, dtype=np.float64)
     # only the ratio of absorption to scattering counts, and what is black beyond its range is 0
-    most = np.finfo(np.float64).max if name == "sigma_a_per_mm" else LARGEST
+    most = np.finfo(np.float64).max if name == "sigma_a_per_mm" else MAX_QUANTITY
     outside = ~((array >= 0.0) & (array <= most))
     if np.any(outside):
         got = float(array[outside].flat[0])

@@ -24,7 +24,7 @@ from model.arrays import BoolArray, Float64Array
 
 Texturing = Literal["post", "pre", "both"]
 
-POWERS: Final[dict[Texturing, tuple[float, float]]] = {
+ALBEDO_POWERS: Final[dict[Texturing, tuple[float, float]]] = {
     "post": (0.0, 1.0),
     "pre": (1.0, 0.0),
     "both": (0.5, 0.5),

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
 
-SHOULDER: Final = 0.15
+SHOULDER_STRENGTH: Final = 0.15
 LINEAR_STRENGTH: Final = 0.50
 LINEAR_ANGLE: Final = 0.10
 TOE_STRENGTH: Final = 0.20
@@ -25,7 +25,7 @@ TOE_DENOMINATOR: Final = 0.30
 LINEAR_WHITE: Final = 11.2
 """Light, after the bias, that is shown as white."""
 EXPOSURE_BIAS: Final = 2.0
-MOST_LIGHT: Final = 1e20
+MAX_LIGHT: Final = 1e20
 """More is shown as this much: the curve is level there, and its squares overflow far beyond."""
 
 
@@ -59,11 +59,11 @@ def filmic(linear: ArrayLike) -> Float64Array:
     >>> filmic([0.0, 0.18, 5.6]).round(4).tolist()
     [0.0, 0.1283, 1.0]
     """
-    x = EXPOSURE_BIAS * np.clip(np.asarray(linear, np.float64), 0.0, MOST_LIGHT)
+    x = EXPOSURE_BIAS * np.clip(np.asarray(linear, np.float64), 0.0, MAX_LIGHT)
     return np.asarray(_curve(x) / _curve(np.float64(LINEAR_WHITE)))
 
 
 def _curve(x: Float64Array | np.float64) -> Float64Array:
-    A, B, C = SHOULDER, LINEAR_STRENGTH, LINEAR_ANGLE
+    A, B, C = SHOULDER_STRENGTH, LINEAR_STRENGTH, LINEAR_ANGLE
     D, E, F = TOE_STRENGTH, TOE_NUMERATOR, TOE_DENOMINATOR
     return np.asarray((x * (A * x + C * B) + D * E) / (x * (A * x + B) + D * F) - E / F)

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
-from model.texture_statistics.histograms import BINS
+from model.texture_statistics.histograms import HISTOGRAM_BINS
 
-OPPONENT = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
+OPPONENT_AXES = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
 """Brightness, red less green, yellow less blue: the axes where colors do not vary."""
-OPPONENT /= np.linalg.norm(OPPONENT, axis=1, keepdims=True)
-_MARGIN = 0.05
+OPPONENT_AXES /= np.linalg.norm(OPPONENT_AXES, axis=1, keepdims=True)
+_RANGE_MARGIN = 0.05
 
 
 def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
@@ -44,7 +44,7 @@ def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
             f"covariance: got shape {covariance.shape}, expected (C, C) of finite values, C at "
             "least 1"
         )
-    preferred = OPPONENT if C == 3 else np.eye(C)
+    preferred = OPPONENT_AXES if C == 3 else np.eye(C)
     # orders directions without variance; about that of the rounding of float32
     least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
     ordered = covariance + least * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
@@ -84,12 +84,12 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
     if not 0.0 < unit < np.inf:
         raise ValueError(f"unit: got {unit}, expected a finite value above 0")
     low, high = values[0], values[-1]
-    room = max(_MARGIN * (high - low), 0.5e-4 * unit)
+    room = max(_RANGE_MARGIN * (high - low), 0.5e-4 * unit)
     low, high = low - room, high + room
     at = np.concatenate([[low], values, [high]])
     occurrence = np.concatenate([[0.0], (np.arange(values.size) + 0.5) / values.size, [1.0]])
     share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
-    widths = np.diff(np.interp(np.linspace(0.0, 1.0, BINS + 1), share, at))
+    widths = np.diff(np.interp(np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1), share, at))
     # a value that occurs very often holds several edges: keep them apart
     least = max(1e-12 * (high - low), 4.0 * float(np.spacing(max(abs(low), abs(high)))))
     widths = np.maximum(widths, least)

@@ -30,7 +30,7 @@ from model.texture_statistics.steerable_pyramid import Responses, thread_count
 
 Weights = tuple[FloatArray, tuple[FloatArray, ...]] | None
 T = TypeVar("T")
-_SMALL = 128 * 128
+_MIN_PARALLEL_PIXELS = 128 * 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,7 +318,7 @@ def _count(
         counts = None if weights is None else weight_of(weights, r, space.orientations)
         return bins[r].count(responses[r], counts)
 
-    return _each(pool, one, range(len(bins)), large=responses[0].size > _SMALL)
+    return _each(pool, one, range(len(bins)), large=responses[0].size > _MIN_PARALLEL_PIXELS)
 
 
 def _move(
@@ -335,7 +335,7 @@ def _move(
         if far[r]:
             bins[r].match(response, counted[r], wanted[r], out=response)
 
-    _each(pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _SMALL)
+    _each(pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _MIN_PARALLEL_PIXELS)
 
 
 def _each(

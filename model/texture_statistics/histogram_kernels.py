@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-CELLS = 16384
+TABLE_CELLS = 16384
 """Even cells over the edges, in each of which a table bounds the bin."""
-EQUAL = 1e-12
+SHARE_TOL = 1e-12
 """Shares that differ by less are rounding: far below the share of one texel."""
 
 
@@ -23,12 +23,12 @@ def bound_bins(edges: Any, count: int, scale: float, least: Any, most: Any) -> N
         Not falling; the first ``count`` count.
     scale : float
         Cells per unit from the first edge on.
-    least, most : (CELLS,) int, written
+    least, most : (TABLE_CELLS,) int, written
         A value's cell and an edge's are found by the same arithmetic, which keeps their order:
         edges of cells before are certainly below the value, those of later ones above.
     """
     passed = 0
-    for cell in range(CELLS):
+    for cell in range(TABLE_CELLS):
         least[cell] = max(passed - 1, 0)
         while passed < count and (edges[passed] - edges[0]) * scale < cell + 1:
             passed += 1
@@ -41,7 +41,7 @@ def find(x: float, edges: Any, scale: float, least: Any, most: Any) -> int:
 
     Parameters as of `bound_bins`.
     """
-    cell = int(min(max((x - edges[0]) * scale, 0.0), CELLS - 1.0))
+    cell = int(min(max((x - edges[0]) * scale, 0.0), TABLE_CELLS - 1.0))
     low, high = int(least[cell]), int(most[cell])
     while high - low > 8:
         middle = (low + high + 1) // 2
@@ -130,12 +130,12 @@ def plan(source: Any, target: Any, edges: Any, begin: Any, end: Any, to: Any, sl
         if source[i + 1] <= rank:
             i += 1
             continue
-        if target[j + 1] <= rank + EQUAL:
+        if target[j + 1] <= rank + SHARE_TOL:
             j += 1
             continue
         # ends that differ by rounding are one: else bins left empty would be crossed
         until = source[i + 1]
-        if target[j + 1] < until - EQUAL:
+        if target[j + 1] < until - SHARE_TOL:
             until = target[j + 1]
         share, width = source[i + 1] - source[i], edges[i + 1] - edges[i]
         begin[pieces] = edges[i] + width * ((rank - source[i]) / share)
@@ -167,8 +167,8 @@ def move(values: Any, source: Any, target: Any, edges: Any, out: Any) -> None:
     begin, end, to, slope = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     pieces = plan(source, target, edges, begin, end, to, slope)
     reach = end[pieces - 1] - begin[0]
-    scale = CELLS / reach if reach > 0.0 else 0.0
-    least, most = np.empty(CELLS, np.int16), np.empty(CELLS, np.int16)
+    scale = TABLE_CELLS / reach if reach > 0.0 else 0.0
+    least, most = np.empty(TABLE_CELLS, np.int16), np.empty(TABLE_CELLS, np.int16)
     bound_bins(begin, pieces, scale, least, most)
     for k in range(values.size):
         x = float(values[k])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from model.texture_statistics import histogram_kernels
 
-BINS = 256
+HISTOGRAM_BINS = 256
 """Bins of every histogram (Weyrich et al. 2006, section 10.2)."""
 
 
@@ -51,12 +51,18 @@ class Bins:
     def over(cls, edges: ArrayLike) -> Bins:
         """Make the table of some edges."""
         e = np.ascontiguousarray(edges, np.float64)
-        if e.shape != (BINS + 1,) or not np.isfinite(e).all() or not (np.diff(e) > 0.0).all():
-            raise HistogramError(f"edges: got shape {e.shape}, expected {BINS + 1} rising numbers")
-        scale = histogram_kernels.CELLS / float(e[-1] - e[0])
-        least = np.empty(histogram_kernels.CELLS, np.int16)
+        if (
+            e.shape != (HISTOGRAM_BINS + 1,)
+            or not np.isfinite(e).all()
+            or not (np.diff(e) > 0.0).all()
+        ):
+            raise HistogramError(
+                f"edges: got shape {e.shape}, expected {HISTOGRAM_BINS + 1} rising numbers"
+            )
+        scale = histogram_kernels.TABLE_CELLS / float(e[-1] - e[0])
+        least = np.empty(histogram_kernels.TABLE_CELLS, np.int16)
         most = np.empty_like(least)
-        histogram_kernels.bound_bins(e, BINS, scale, least, most)
+        histogram_kernels.bound_bins(e, HISTOGRAM_BINS, scale, least, most)
         return cls(e, scale, least, most)
 
     def count(self, values: FloatArray, weights: FloatArray | None = None) -> Counted:
@@ -69,7 +75,7 @@ class Bins:
         ([0.5, 0.25, 0.25], 0.25)
         """
         flat = np.ascontiguousarray(values).reshape(-1)
-        sums = np.zeros(BINS)
+        sums = np.zeros(HISTOGRAM_BINS)
         table = (self.edges, self.scale, self.least, self.most, sums)
         if weights is None:
             below, above, least, most = histogram_kernels.count(flat, *table)
@@ -124,7 +130,7 @@ class Bins:
         widen the end bins of both histograms to where they reach.
         """
         flat = np.ascontiguousarray(values).reshape(-1)
-        _check_shares("target", target, BINS)
+        _check_shares("target", target, HISTOGRAM_BINS)
         wrong = flat.size - np.count_nonzero(np.isfinite(flat))
         if wrong:
             raise HistogramError(
@@ -142,7 +148,9 @@ class Bins:
 def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Float64Array:
     h = np.asarray(shares, np.float64)
     if h.ndim < 1 or not h.shape[-1] or (bins is not None and h.shape[-1] != bins):
-        raise HistogramError(f"{name}: got shape {h.shape}, expected (..., {bins or BINS})")
+        raise HistogramError(
+            f"{name}: got shape {h.shape}, expected (..., {bins or HISTOGRAM_BINS})"
+        )
     if not (np.isfinite(h).all() and (h >= 0.0).all() and (h.sum(axis=-1) > 0.0).all()):
         raise HistogramError(
             f"{name}: got NaN, infinite or negative shares, or none above 0, expected shares that "
@@ -191,14 +199,14 @@ def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
     1.0
     """
     e = np.asarray(edges, np.float64)
-    first, second = _check_shares("a", a, BINS), _check_shares("b", b, BINS)
-    if e.ndim < 1 or e.shape[-1] != BINS + 1:
-        raise HistogramError(f"edges: got shape {e.shape}, expected (..., {BINS + 1})")
+    first, second = _check_shares("a", a, HISTOGRAM_BINS), _check_shares("b", b, HISTOGRAM_BINS)
+    if e.ndim < 1 or e.shape[-1] != HISTOGRAM_BINS + 1:
+        raise HistogramError(f"edges: got shape {e.shape}, expected (..., {HISTOGRAM_BINS + 1})")
     if not (np.isfinite(e).all() and (np.diff(e, axis=-1) > 0.0).all()):
         raise HistogramError("edges: got some that do not rise, expected finite rising edges")
     apart = np.abs(cumulated(first) - cumulated(second))
     moved = np.sum(0.5 * (apart[..., 1:] + apart[..., :-1]) * np.diff(e, axis=-1), axis=-1)
-    quarter = BINS // 4
+    quarter = HISTOGRAM_BINS // 4
     return np.asarray(moved / (e[..., 3 * quarter] - e[..., quarter]))
 
 
@@ -228,13 +236,14 @@ def project_to_histograms(vectors: ArrayLike) -> Float64Array:
     [0.8, 0.2, 0.0]
     """
     v = np.asarray(vectors, np.float64)
-    if not v.ndim or v.shape[-1] % BINS or not v.size or not np.isfinite(v).all():
+    if not v.ndim or v.shape[-1] % HISTOGRAM_BINS or not v.size or not np.isfinite(v).all():
         raise HistogramError(
-            f"vectors: got shape {v.shape}, expected finite (..., n x {BINS}), n at least 1"
+            f"vectors: got shape {v.shape}, expected finite (..., n x {HISTOGRAM_BINS}), n "
+            "at least 1"
         )
-    h = v.reshape(-1, BINS)
+    h = v.reshape(-1, HISTOGRAM_BINS)
     falling = -np.sort(-h, axis=1)
-    excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, BINS + 1)
+    excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, HISTOGRAM_BINS + 1)
     kept = np.count_nonzero(falling > excess, axis=1)
     taken = excess[np.arange(len(h)), kept - 1]
     return np.maximum(h - taken[:, None], 0.0).reshape(v.shape)
@@ -264,7 +273,7 @@ def rgb_histograms(
     valid: Sequence[BoolArray | None] | None = None,
     *,
     reach: tuple[float, float] = (0.0, 1.0),
-    bins: int = BINS,
+    bins: int = HISTOGRAM_BINS,
 ) -> GroupHistograms:
     """Average the color histograms of images over groups (Weyrich et al. 2006, figure 16).
 

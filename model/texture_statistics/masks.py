@@ -9,7 +9,7 @@ from scipy.ndimage import convolve1d
 from model.arrays import BoolArray, FloatArray
 from model.texture_statistics.steerable_pyramid import level_sizes
 
-_BINOMIAL = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
+_BINOMIAL_FILTER = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 
 
 def fill_smoothly(image: FloatArray, valid: BoolArray) -> FloatArray:
@@ -100,7 +100,7 @@ def response_weights(
     for size in level_sizes((valid.shape[0], valid.shape[1]), levels):
         support = _cell_means(texels, size)
         for axis in (0, 1):
-            support = convolve1d(support, _BINOMIAL, axis=axis, mode="wrap")
+            support = convolve1d(support, _BINOMIAL_FILTER, axis=axis, mode="wrap")
         samples.append(_cell_means(inside, size) * support)
     return inside, tuple(samples)
 

@@ -27,12 +27,12 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.texture_statistics import steerable_pyramid
-from model.texture_statistics.bins import OPPONENT, principal_axes, uneven_edges
-from model.texture_statistics.histograms import BINS
+from model.texture_statistics.bins import OPPONENT_AXES, principal_axes, uneven_edges
+from model.texture_statistics.histograms import HISTOGRAM_BINS
 from model.texture_statistics.masks import fill_smoothly, response_weights
 from model.texture_statistics.steerable_pyramid import LEVELS, ORIENTATIONS
 
-_QUANTILES = 2049
+_N_QUANTILES = 2049
 
 
 class TextureError(ValueError):
@@ -63,9 +63,9 @@ class TextureSpace:
                 f"TextureSpace: got {self.levels} levels, {self.orientations} orientations, mean "
                 f"{self.mean.shape}, axes {self.axes.shape}, expected at least 1, (C,), (C, C)"
             )
-        if self.edges.shape != (C, R, BINS + 1):
+        if self.edges.shape != (C, R, HISTOGRAM_BINS + 1):
             raise TextureError(
-                f"TextureSpace.edges: got {self.edges.shape}, expected {(C, R, BINS + 1)}"
+                f"TextureSpace.edges: got {self.edges.shape}, expected {(C, R, HISTOGRAM_BINS + 1)}"
             )
         arrays = (self.mean, self.axes, self.edges)
         if any(a.dtype != np.float64 or not np.isfinite(a).all() for a in arrays):
@@ -93,7 +93,7 @@ class TextureSpace:
     @property
     def size(self) -> int:
         """Length of a vector."""
-        return self.channels * len(self.responses) * BINS
+        return self.channels * len(self.responses) * HISTOGRAM_BINS
 
     def part(self, channel: int, response: int | str) -> slice:
         """Return where one histogram lies in a vector.
@@ -119,15 +119,15 @@ class TextureSpace:
                 f"part: got channel {channel}, response {response!r}, expected 0 to "
                 f"{self.channels - 1} and 0 to {len(names) - 1} or one of {', '.join(names)}"
             )
-        begin = (channel * len(names) + number) * BINS
-        return slice(begin, begin + BINS)
+        begin = (channel * len(names) + number) * HISTOGRAM_BINS
+        return slice(begin, begin + HISTOGRAM_BINS)
 
     def histograms(self, vector: ArrayLike) -> Float64Array:
         """Return vectors (..., n) as histograms (..., C, responses, 256)."""
         v = np.asarray(vector, np.float64)
         if not v.ndim or v.shape[-1] != self.size:
             raise TextureError(f"vector: got shape {v.shape}, expected (..., {self.size})")
-        return v.reshape(*v.shape[:-1], self.channels, len(self.responses), BINS)
+        return v.reshape(*v.shape[:-1], self.channels, len(self.responses), HISTOGRAM_BINS)
 
     def check(self, vector: ArrayLike) -> Float64Array:
         """Return a vector as histograms (C, responses, 256) after checking that each is one.
@@ -179,15 +179,15 @@ class TextureSpace:
             raise TextureError(
                 f"channels: got {channels}; the standard space has 1 or 3: fit one to the images"
             )
-        even = np.linspace(0.0, 1.0, BINS + 1)
+        even = np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1)
         grown = np.sinh(8.0 * (2.0 * even - 1.0)) / np.sinh(8.0)
         count = LEVELS * ORIENTATIONS + 3
-        edges = np.empty((channels, count, BINS + 1))
+        edges = np.empty((channels, count, HISTOGRAM_BINS + 1))
         for c in range(channels):
             edges[c] = grown
             top = 1.25 * np.sqrt(channels)
             edges[c, [0, -1]] = top * even if c == 0 else 1.5 * grown
-        axes = OPPONENT if channels == 3 else np.eye(1)
+        axes = OPPONENT_AXES if channels == 3 else np.eye(1)
         return cls(np.zeros(channels), axes.copy(), edges, LEVELS, ORIENTATIONS, 0)
 
     @classmethod
@@ -256,7 +256,9 @@ class TextureSpace:
         plain = cls(
             mean,
             axes,
-            np.tile(np.linspace(0.0, 1.0, BINS + 1), (len(mean), levels * orientations + 3, 1)),
+            np.tile(
+                np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1), (len(mean), levels * orientations + 3, 1)
+            ),
             levels,
             orientations,
             count,
@@ -326,7 +328,7 @@ def _quantiles(
     """Return even quantiles of the valid samples of all responses, (C, R, quantiles) float32."""
     colors, mask = checked_image(image, valid)
     weights = None if mask.all() else response_weights(mask, None, space.levels)
-    out = np.empty((space.channels, len(space.responses), _QUANTILES), colors.dtype)
+    out = np.empty((space.channels, len(space.responses), _N_QUANTILES), colors.dtype)
     for c, channel in enumerate(space.to_channels(fill_smoothly(colors, mask))):
         pyramid = steerable_pyramid.analyze(
             channel, levels=space.levels, orientations=space.orientations, workers=workers
@@ -335,7 +337,7 @@ def _quantiles(
             if weights is not None:
                 values = values[weight_of(weights, r, space.orientations) > 0.0]
             ordered = np.sort(values, axis=None)
-            ranks = np.linspace(0.0, ordered.size - 1.0, _QUANTILES)
+            ranks = np.linspace(0.0, ordered.size - 1.0, _N_QUANTILES)
             out[c, r] = ordered[np.rint(ranks).astype(np.int64)]
     return out
 

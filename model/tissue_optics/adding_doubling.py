@@ -18,11 +18,11 @@ from model import fresnel
 from model.arrays import Float64Array
 
 _SERIES_TERMS = 9  # cosh(1) to 1e-16
-_CHUNK = 2048  # layers per batch: a few MB
+_CHUNK_LAYERS = 2048  # layers per batch: a few MB
 _MAX_DOUBLINGS = 60  # 1e18 starting layers: even without absorption nothing comes through
 _SERIES_END = 1e-12  # Legendre moment at which the phase function's series ends
-_TRAPPED = 1e-14  # share that total reflection loses, see quadrature
-_OPAQUE = 1e-13  # transmittance at which a layer counts as semi-infinite
+_TRAPPED_LOSS = 1e-14  # share that total reflection loses, see quadrature
+_MIN_TRANSMITTANCE = 1e-13  # transmittance at which a layer counts as semi-infinite
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +123,8 @@ def reflectance(
         index = _index_of(stack, layer, layers, owner)
         result = np.empty((rows.shape[0], rule.mu.size, rule.mu.size))
         phase = _phase_matrices(float(eta), int(directions), float(g[layer]))
-        for start in range(0, rows.shape[0], _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for start in range(0, rows.shape[0], _CHUNK_LAYERS):
+            part = slice(start, start + _CHUNK_LAYERS)
             r, t = _layer(rows[part, :3], rule, float(g[layer]), phase)
             lower = np.diag(rule.surface)[None] if below is None else below[index[part]]
             result[part] = _add(r, t, np.broadcast_to(lower, r.shape))
@@ -137,10 +137,10 @@ def quadrature(eta: float, directions: int) -> Quadrature:
     """Return the directions for an index of refraction: half of them beyond the critical angle."""
     if directions < 4 or directions % 2:
         raise ValueError(f"directions: expected an even number of at least 4, got {directions}")
-    if not 1.0 <= eta <= fresnel.LARGEST_INDEX:
+    if not 1.0 <= eta <= fresnel.MAX_INDEX:
         raise ValueError(
             f"eta: expected a relative refractive index of at least 1, up to "
-            f"{fresnel.LARGEST_INDEX:g}, got {eta}"
+            f"{fresnel.MAX_INDEX:g}, got {eta}"
         )
     mu_c = np.sqrt(1.0 - 1.0 / eta**2)
     if mu_c < 1e-3:  # matched: a single range
@@ -154,7 +154,7 @@ def quadrature(eta: float, directions: int) -> Quadrature:
         mu = np.concatenate([0.5 * mu_c * (node + 1.0), mu_c + (1.0 - mu_c) * s**2])
         weight = np.concatenate([0.5 * mu_c * node_weight, 2.0 * (1.0 - mu_c) * s * s_weight])
     # Total reflection loses 1e-14, else light trapped in a clear slab makes a singular matrix.
-    surface = np.minimum(fresnel.reflectance(mu, 1.0 / eta), 1.0 - _TRAPPED)
+    surface = np.minimum(fresnel.reflectance(mu, 1.0 / eta), 1.0 - _TRAPPED_LOSS)
     return Quadrature(mu, weight, surface)
 
 
@@ -208,7 +208,7 @@ def _layer(
     r, t = _thin_layer(albedo, first, rule, phase)
     identity = np.eye(rule.mu.size)
     for step in range(int(doublings.max(initial=0))):
-        active = np.flatnonzero((doublings > step) & (np.max(t, axis=(1, 2)) > _OPAQUE))
+        active = np.flatnonzero((doublings > step) & (np.max(t, axis=(1, 2)) > _MIN_TRANSMITTANCE))
         if active.size == 0:
             break
         r_a, t_a = r[active], t[active]

@@ -7,8 +7,8 @@ import numpy as np
 from model import fresnel
 from model.arrays import Float64Array
 
-_FAINT_PER_MM = 1e-9  # extinction below which a layer is empty for every purpose here
-_FLAT = 1e-4  # kappa d below which a term's limit for kappa = 0 is reached to 1e-9
+_MIN_EXTINCTION_PER_MM = 1e-9  # extinction below which a layer is empty for every purpose here
+_MIN_DECAY = 1e-4  # kappa d below which a term's limit for kappa = 0 is reached to 1e-9
 
 
 def reflectance(
@@ -71,7 +71,7 @@ def reflectance(
             raise ValueError(
                 f"{name}: got shape {np.shape(values)}, expected (..., layers), at least one layer"
             )
-    sigma_t = np.maximum(sigma_a_per_mm + sigma_s_prime_per_mm, _FAINT_PER_MM)
+    sigma_t = np.maximum(sigma_a_per_mm + sigma_s_prime_per_mm, _MIN_EXTINCTION_PER_MM)
     diffusion = 1.0 / (3.0 * sigma_t)
     kappa = np.sqrt(sigma_a_per_mm / diffusion)
     boundary = 2.0 * fresnel.boundary_factor(eta)
@@ -118,7 +118,9 @@ def _cover(
     # int exp(-sigma_t z) cosh and sinh(kappa (d - z))/kappa dz, times 2 f. The second is even in
     # kappa but for the factor f, so that a small kappa stands for an even smaller one.
     decaying, growing = _beam_integrals(kappa, sigma_t, d)
-    k = np.maximum(kappa, np.divide(_FLAT, d, out=np.full_like(d, _FLAT), where=d > _FLAT))
+    k = np.maximum(
+        kappa, np.divide(_MIN_DECAY, d, out=np.full_like(d, _MIN_DECAY), where=d > _MIN_DECAY)
+    )
     decaying_k, growing_k = _beam_integrals(k, sigma_t, d)
     slope = np.exp((k - kappa) * d) * (decaying_k - growing_k) / k
     source = sigma_s_prime * (decaying + growing + coupling * slope) / norm

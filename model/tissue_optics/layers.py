@@ -30,18 +30,20 @@ before it absorbs: with g = 0.8 and the same sigma_s' it returns less, half at C
 """
 
 # Donner et al. 2008, doi:10.1145/1409060.1409093.
-OXYGENATION = 0.75  # share of oxygenated hemoglobin
+OXYGEN_SATURATION = 0.75  # share of oxygenated hemoglobin
 EPIDERMIS_MM = 0.25  # thickness; the dermis below is semi-infinite
 DERMIS_SCATTERING = 0.5  # reduced scattering of the dermis relative to the epidermis
 
-TIERS: tuple[Tier, ...] = ("adding_doubling", "diffusion")
+TIER_NAMES: tuple[Tier, ...] = ("adding_doubling", "diffusion")
 
 
 class TissueError(ValueError):
     """A chromophore or an optical property lies outside what tissue can be."""
 
 
-def blood_absorption(wavelength_nm: ArrayLike, *, oxygenation: float = OXYGENATION) -> Float64Array:
+def blood_absorption(
+    wavelength_nm: ArrayLike, *, oxygenation: float = OXYGEN_SATURATION
+) -> Float64Array:
     """Return the absorption of whole blood with 150 g/l of hemoglobin.
 
     Parameters
@@ -75,7 +77,7 @@ def skin_layers(
     *,
     beta_m: float = BETA_M,
     c_he: ArrayLike | None = None,
-    oxygenation: float = OXYGENATION,
+    oxygenation: float = OXYGEN_SATURATION,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the optical properties of epidermis and dermis.
 
@@ -145,7 +147,7 @@ def two_layer_reflectance(
     *,
     beta_m: float = BETA_M,
     c_he: ArrayLike | None = None,
-    oxygenation: float = OXYGENATION,
+    oxygenation: float = OXYGEN_SATURATION,
     eta: float = ETA_SKIN,
     tier: Tier = "adding_doubling",
     anisotropy: float = 0.0,
@@ -256,8 +258,8 @@ def layer_stack_reflectance(
     >>> round(float(layer_stack_reflectance([0.17], [0.88], [np.inf], eta=1.3)), 3)
     0.21
     """
-    if tier not in TIERS:
-        raise TissueError(f"tier: got {tier!r}, expected one of {', '.join(TIERS)}")
+    if tier not in TIER_NAMES:
+        raise TissueError(f"tier: got {tier!r}, expected one of {', '.join(TIER_NAMES)}")
     given = (sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm)
     arrays = [np.asarray(x, dtype=np.float64) for x in given]
     try:

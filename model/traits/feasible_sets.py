@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float64Array
 from model.traits import nonnegative_kernels
 
-TOLERANCE = 1e-5
+FEASIBLE_TOL = 1e-5
 """What float32 leaves of a sum of one, and of a share of zero."""
-BINS = 256
+HISTOGRAM_BINS = 256
 
 
 class FeasibleError(ValueError):
@@ -54,7 +54,7 @@ class NonNegative:
         """Return whether each sample (..., d) lies in the set, (...)."""
         s = np.asarray(samples, np.float64)
         scale = np.abs(s).max(axis=-1, initial=0.0, keepdims=True)
-        return np.asarray((np.isfinite(s) & (s >= -TOLERANCE * scale)).all(axis=-1))
+        return np.asarray((np.isfinite(s) & (s >= -FEASIBLE_TOL * scale)).all(axis=-1))
 
     def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
         """Return the nearest samples of the set.
@@ -95,7 +95,7 @@ class NonNegative:
 class Histograms:
     """Samples made of histograms, one after another, each at least 0 and of sum one."""
 
-    block: int = BINS
+    block: int = HISTOGRAM_BINS
     """Bins of each histogram."""
 
     def __post_init__(self) -> None:
@@ -107,7 +107,9 @@ class Histograms:
         """Return whether each sample (..., d) lies in the set, (...)."""
         s = self._blocks(samples)
         with np.errstate(invalid="ignore"):
-            good = (s >= -TOLERANCE) & (np.abs(s.sum(axis=-1, keepdims=True) - 1.0) <= TOLERANCE)
+            good = (s >= -FEASIBLE_TOL) & (
+                np.abs(s.sum(axis=-1, keepdims=True) - 1.0) <= FEASIBLE_TOL
+            )
         return np.asarray(good.all(axis=(-1, -2)))
 
     def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
@@ -187,6 +189,6 @@ def smallest(samples: Float64Array) -> FeasibleSet:
     >>> smallest(np.array([[0.0, 2.0]])), smallest(np.array([[0.0, -2.0]]))
     (NonNegative(), Free())
     """
-    if samples.shape[-1] % BINS == 0 and Histograms().contains(samples).all():
+    if samples.shape[-1] % HISTOGRAM_BINS == 0 and Histograms().contains(samples).all():
         return Histograms()
     return NonNegative() if bool((samples >= 0.0).all()) else Free()

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
 
-LEVELS = 256
+N_QUANTILES = 256
 """Quantiles of a histogram, at even shares (k + 1/2) / 256."""
 
 
@@ -27,7 +27,7 @@ class TransportError(ValueError):
 
 def shares() -> Float64Array:
     """Return the shares at which quantiles are taken, (256,)."""
-    return (np.arange(LEVELS) + 0.5) / LEVELS
+    return (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
 
 
 def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
@@ -53,11 +53,11 @@ def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
     """
     h, e = _checked(histograms, edges)
     at = shares()
-    out = np.empty((len(h), LEVELS))
+    out = np.empty((len(h), N_QUANTILES))
     for k in range(len(h)):
         filled, place = _rising(np.concatenate([[0.0], np.cumsum(h[k])]), e[k])
         out[k] = np.interp(at, filled / filled[-1], place)
-    return out.reshape(*np.shape(histograms)[:-1], LEVELS)
+    return out.reshape(*np.shape(histograms)[:-1], N_QUANTILES)
 
 
 def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float64Array:
@@ -135,8 +135,8 @@ def moved(
 
 
 def _change(histograms: ArrayLike, change: ArrayLike) -> Float64Array:
-    shape = (*np.shape(histograms)[:-1], LEVELS)
-    by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, LEVELS)
+    shape = (*np.shape(histograms)[:-1], N_QUANTILES)
+    by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, N_QUANTILES)
     if not np.isfinite(by).all():
         raise TransportError("change: got values that are not finite")
     return by

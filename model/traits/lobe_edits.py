@@ -36,13 +36,13 @@ from model.traits import nonnegative_kernels, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import TraitError
 
-WORTH = 0.05
+MIN_ERROR_GAIN = 0.05
 """A trait brings a lobe when that lowers the error of its edit by more than this share of it."""
-GIVEN = (0.3, 1.0, 3.0)
+CANDIDATE_SHARES = (0.3, 1.0, 3.0)
 """Times the mean shares that a candidate assumes can be taken off."""
-TRIED = 1000
+TRIAL_TEXELS = 1000
 """Texels on which candidates are tried."""
-MOST_LOBES = 15
+MAX_LOBES = 15
 """More lobes than this, with those of traits, are refused."""
 
 
@@ -137,10 +137,10 @@ def edit_weights(
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
         for name, vector in vectors.items():
             some = np.flatnonzero(asked[name])
-            tried = some[:: -(-len(some) // TRIED)]
+            tried = some[:: -(-len(some) // TRIAL_TEXELS)]
             lobes = _with_lobe(t[tried], lobes, vector, asked[name][tried], space.metric)
-    if len(lobes) > max(MOST_LOBES, t.shape[1]):
-        raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MOST_LOBES}")
+    if len(lobes) > max(MAX_LOBES, t.shape[1]):
+        raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MAX_LOBES}")
     gram = reduced_spaces.times_metric(lobes, space.metric) @ lobes.T
     change = np.zeros((len(t), len(lobes)))
     misfit, unseen = {}, zero.copy()
@@ -221,13 +221,13 @@ def _with_lobe(
     frame = reduced_spaces.framed(np.eye(len(vector)), metric)
     columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
     usual = _padded(t, len(lobes)).mean(axis=0)
-    for given in GIVEN:
+    for given in CANDIDATE_SHARES:
         wanted = given * usual @ lobes + strength * way
         found.append(nnls(columns.T, wanted @ frame, maxiter=50 * len(columns))[0][len(lobes) :])
     sets = [lobes] + [np.vstack([lobes, one / one.sum()]) for one in found if one.sum() > 0.0]
     errors = [_error(t, s, vector, amount, metric) / size for s in sets]
     best = int(np.argmin(errors))
-    return sets[best] if errors[0] - errors[best] > WORTH else lobes
+    return sets[best] if errors[0] - errors[best] > MIN_ERROR_GAIN else lobes
 
 
 def _error(

@@ -13,11 +13,11 @@ from numba import njit, prange
 
 from model.arrays import Float64Array
 
-DEPENDENT = 1e-12
+INDEPENDENCE_TOL = 1e-12
 """A material whose part outside those in use is a smaller share of its square is not used."""
-STOP = 1e-10
+JOIN_TOL = 1e-10
 """A material joins while it would lower the misfit by more than this share of the mixture."""
-ROWS = 512  # rows that share their working memory
+BLOCK_ROWS = 512  # rows that share their working memory
 
 
 def nearest(gram: Float64Array, wanted: Float64Array) -> Float64Array:
@@ -57,7 +57,7 @@ def _factor(gram, active, used, low):  # type: ignore[no-untyped-def]
             for k in range(j):
                 s -= low[i, k] * low[j, k]
             if i == j:
-                if s <= DEPENDENT * gram[active[i], active[i]]:
+                if s <= INDEPENDENCE_TOL * gram[active[i], active[i]]:
                     return i
                 low[i, i] = math.sqrt(s)
             else:
@@ -124,7 +124,7 @@ def _one(gram, t, x, rhs, active, low, y, refused):  # type: ignore[no-untyped-d
             used -= 1
             for i in range(gone, used):
                 active[i] = active[i + 1]
-        best, entering = STOP * norm, -1
+        best, entering = JOIN_TOL * norm, -1
         for p in range(size):
             if x[p] == 0.0 and not refused[p]:
                 gain = rhs[p]
@@ -142,12 +142,12 @@ def _one(gram, t, x, rhs, active, low, y, refused):  # type: ignore[no-untyped-d
 @njit(parallel=True, cache=True)
 def _nearest(gram, rows):  # type: ignore[no-untyped-def]
     count, size = rows.shape
-    for block in prange((count + ROWS - 1) // ROWS):
+    for block in prange((count + BLOCK_ROWS - 1) // BLOCK_ROWS):
         x, rhs, y = np.empty(size), np.empty(size), np.empty(size)
         active = np.empty(size, np.int64)
         low = np.empty((size, size))
         refused = np.empty(size, np.bool_)
-        for row in range(block * ROWS, min((block + 1) * ROWS, count)):
+        for row in range(block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, count)):
             _one(gram, rows[row], x, rhs, active, low, y, refused)
             for p in range(size):
                 rows[row, p] = x[p]

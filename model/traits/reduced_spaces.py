@@ -21,11 +21,11 @@ from model.traits.vectors import Trait, TraitError, exponent_of
 
 SpaceKind = Literal["pca", "nmf"]
 
-HALVINGS = 20
+N_HALVINGS = 20
 """Random halvings of the people that choose the number of components."""
-GAIN = 1.05
+MIN_SCORE_RATIO = 1.05
 """Few components are taken when their score is more than this times that of all."""
-LEAST_SCORE = 0.5
+MIN_SCORE = 0.5
 """Scores below this tell too little to drop a component for."""
 
 
@@ -192,7 +192,7 @@ def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Gene
     products = scores @ scores.T
     for trait in used:
         groups = [np.flatnonzero(trait.values == side) for side in (1.0, 0.0)]
-        for _ in range(HALVINGS):
+        for _ in range(N_HALVINGS):
             contrast = np.zeros((2, n))  # of the two halves
             for group, sign in zip(groups, (1.0, -1.0), strict=True):
                 mixed = rng.permutation(group)
@@ -211,8 +211,8 @@ def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Gene
             score = np.cumsum(along * truth) / length / other
             total[: len(score)] += score
             total[len(score) :] += score[-1]
-    total /= len(used) * HALVINGS
-    better = total.max() > max(GAIN * total[-1], LEAST_SCORE)
+    total /= len(used) * N_HALVINGS
+    better = total.max() > max(MIN_SCORE_RATIO * total[-1], MIN_SCORE)
     return int(np.argmax(total)) + 1 if better else rank
 
 

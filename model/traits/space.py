@@ -31,7 +31,7 @@ from model.traits.vectors import Contrast, Trait, TraitError, TraitVector
 Mode = Literal["linear", "convex"]
 Source = Literal["simulated", "measured"]
 
-EMPTY: Mapping[str, ArrayLike] = MappingProxyType({})
+NO_TRAITS: Mapping[str, ArrayLike] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ class TraitSpace:
         labels: Mapping[str, ArrayLike],
         *,
         space: SpaceKind = "pca",
-        continuous: Mapping[str, ArrayLike] = EMPTY,
+        continuous: Mapping[str, ArrayLike] = NO_TRAITS,
         basis: ArrayLike | None = None,
         components: int | None = None,
         metric: ArrayLike | None = None,
@@ -382,7 +382,7 @@ def _vectors(
         others = [
             (t.name, float(r))
             for t, r in zip(traits, related[k], strict=True)
-            if t is not trait and abs(r) > trait_vectors.CONFOUNDED
+            if t is not trait and abs(r) > trait_vectors.MAX_CORRELATION
         ]
         confounded = tuple(sorted(others, key=lambda other: -abs(other[1])))
         along = trait.contrast @ reduced.coordinates

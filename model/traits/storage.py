@@ -28,10 +28,10 @@ Precision = Literal["float64", "float32", "float16", "int8"]
 Source = Literal["simulated", "measured"]
 
 SCHEMA = "skinrig.traits/1"
-PACKAGED = "trait_space.npz"
-BLOCK = 256
+PACKAGED_FILE = "trait_space.npz"
+SCALE_BLOCK = 256
 """Numbers that share one scale in 8 bits."""
-_LARGE = 1024  # samples at least so long are stored in fewer bits
+_MIN_REDUCED_LENGTH = 1024  # samples at least so long are stored in fewer bits
 
 
 class TraitFileError(ValueError):
@@ -101,7 +101,7 @@ class TraitLibrary:
             "spaces": {},
         }
         for name, space in self.spaces.items():
-            used: Precision = precision if len(space.center) >= _LARGE else "float64"
+            used: Precision = precision if len(space.center) >= _MIN_REDUCED_LENGTH else "float64"
             document["spaces"][name] = _packed(f"{name}/", space, used, arrays)
         for name, content in self.files.items():
             arrays[f"files/{name}"] = np.frombuffer(content, np.uint8)
@@ -126,7 +126,7 @@ def default() -> TraitLibrary:
     `tools/make_trait_space.py` makes them; `parameters` says of whom, and how near they come to
     what the simulator truly changed.
     """
-    return from_bytes(resources.files("model").joinpath("data", PACKAGED).read_bytes())
+    return from_bytes(resources.files("model").joinpath("data", PACKAGED_FILE).read_bytes())
 
 
 def load(path: str | Path) -> TraitLibrary:
@@ -291,9 +291,9 @@ def _encoded(key: str, values: Float64Array, precision: Precision) -> dict[str, 
     if precision != "int8":
         return {key: values.astype(precision)}
     width = values.shape[-1]
-    padded = np.zeros((*values.shape[:-1], -(-width // BLOCK) * BLOCK))
+    padded = np.zeros((*values.shape[:-1], -(-width // SCALE_BLOCK) * SCALE_BLOCK))
     padded[..., :width] = values
-    runs = padded.reshape(*values.shape[:-1], -1, BLOCK)
+    runs = padded.reshape(*values.shape[:-1], -1, SCALE_BLOCK)
     scale = (np.abs(runs).max(axis=-1, keepdims=True) / 127.0).astype(np.float32)
     steps = np.rint(runs / np.where(scale > 0.0, scale, 1.0)).astype(np.int8)
     return {key: steps.reshape(padded.shape)[..., :width], f"{key}/scale": scale[..., 0]}
@@ -304,4 +304,4 @@ def _decoded(key: str, arrays: Mapping[str, NDArray[Any]]) -> Float64Array:
     scale = arrays.get(f"{key}/scale")
     if scale is None:
         return values
-    return np.asarray(values * np.repeat(scale, BLOCK, axis=-1)[..., : values.shape[-1]])
+    return np.asarray(values * np.repeat(scale, SCALE_BLOCK, axis=-1)[..., : values.shape[-1]])

@@ -26,15 +26,15 @@ from model.arrays import Float64Array
 Kind = Literal["binary", "continuous"]
 Contrast = Literal["means", "regression"]
 
-FEW = 5
+MIN_GROUP_SIZE = 5
 """A group of fewer people gets a warning."""
-SAME = 1.0 - 1e-9
+IDENTITY_CORRELATION = 1.0 - 1e-9
 """Traits correlated by more than this are one and the same."""
-CONFOUNDED = 0.5
+MAX_CORRELATION = 0.5
 """Traits correlated by more than this get a warning."""
-DOUBTFUL_P = 0.05
-DOUBTFUL_COSINE = 0.95
-_CHUNK = 64
+MAX_P_VALUE = 0.05
+MIN_COSINE = 0.95
+_CHUNK_TRAITS = 64
 
 
 class TraitError(ValueError):
@@ -352,8 +352,8 @@ def confidence(
     base = whole if not beside else residuals(beside[0], whole, beside=beside[1:])[:, :-1]
     length, far = float(np.linalg.norm(vector)), float(np.linalg.norm(true))
     beyond = 0
-    for start in range(0, permutations, _CHUNK):
-        many = min(_CHUNK, permutations - start)
+    for start in range(0, permutations, _CHUNK_TRAITS):
+        many = min(_CHUNK_TRAITS, permutations - start)
         mixed = rng.permuted(np.broadcast_to(c, (many, n)), axis=1)
         beyond += int(np.count_nonzero(np.linalg.norm(mixed @ base, axis=1) >= far * (1.0 - 1e-12)))
     p = (1 + beyond) / (1 + permutations)
@@ -386,17 +386,22 @@ def doubts(
     if trait.kind == "binary":
         others = len(trait.values) - trait.members
         for count, which in ((trait.members, "with"), (others, "without")):
-            if count < FEW:
-                said.append(f"{trait.name}: only {count} faces {which} it, expected {FEW} or more")
-    elif len(trait.values) < FEW:
-        said.append(f"{trait.name}: only {len(trait.values)} faces, expected {FEW} or more")
+            if count < MIN_GROUP_SIZE:
+                said.append(
+                    f"{trait.name}: only {count} faces {which} it, expected "
+                    f"{MIN_GROUP_SIZE} or more"
+                )
+    elif len(trait.values) < MIN_GROUP_SIZE:
+        said.append(
+            f"{trait.name}: only {len(trait.values)} faces, expected {MIN_GROUP_SIZE} or more"
+        )
     if np.isinf(sure.relative_noise):
         said.append(f"{trait.name}: its error is not known, too few faces")
-    elif sure.p_value > DOUBTFUL_P:
+    elif sure.p_value > MAX_P_VALUE:
         said.append(
             f"{trait.name}: shuffled labels give as much (p = {sure.p_value:.2g}); it may be noise"
         )
-    elif sure.expected_cosine < DOUBTFUL_COSINE:
+    elif sure.expected_cosine < MIN_COSINE:
         said.append(
             f"{trait.name}: noisy, its cosine to the true direction is about "
             f"{sure.expected_cosine:.2f}"
@@ -404,7 +409,7 @@ def doubts(
     for other, r in confounded:
         said.append(
             f"{trait.name}: the same faces as {other}, cannot be told apart"
-            if abs(r) > SAME
+            if abs(r) > IDENTITY_CORRELATION
             else f"{trait.name}: goes along with {other} (correlation {r:+.2f})"
         )
     return tuple(said)

@@ -1,10 +1,10 @@
 """Wrinkles as signed blends of partial-derivative normal maps."""
 
-from model.wrinkles.expressions import CLAMPS, JIMENEZ2011, WrinkleError
+from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, WrinkleError
 from model.wrinkles.masks import Masks, mask_stack, mask_textures, zone_strength
 from model.wrinkles.partial_derivatives import (
-    LIMIT,
-    ZONES,
+    MAX_DERIVATIVE,
+    ZONE_NAMES,
     Encoding,
     Layer,
     combine,
@@ -18,10 +18,10 @@ from model.wrinkles.partial_derivatives import (
 )
 
 __all__ = [
-    "CLAMPS",
-    "JIMENEZ2011",
-    "LIMIT",
-    "ZONES",
+    "JIMENEZ2011_TABLE",
+    "MAX_DERIVATIVE",
+    "ZONE_NAMES",
+    "ZONE_SUM_LIMITS",
     "Encoding",
     "Layer",
     "Masks",

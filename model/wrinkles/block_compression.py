@@ -15,13 +15,13 @@ import numpy as np
 
 from model.arrays import Float64Array, FloatArray, Int64Array, UInt8Array
 
-SIDE = 4
+BLOCK_SIDE = 4
 """Texels a side of a block."""
-CHUNK = 32_768
+CHUNK_BLOCKS = 32_768
 """Blocks that are encoded at once."""
-INSETS = (0.0, 0.06, 0.12)
+RANGE_INSETS = (0.0, 0.06, 0.12)
 """Parts of a block's range by which its ends are drawn in at first."""
-FITS = 4
+FIT_ROUNDS = 4
 """Rounds of least squares on the ends of a block."""
 
 
@@ -31,7 +31,7 @@ class BlockError(ValueError):
 
 def blocks_of(shape: tuple[int, int]) -> tuple[int, int]:
     """Return rows and columns of blocks; the last ones may reach beyond the texture."""
-    return -(-shape[0] // SIDE), -(-shape[1] // SIDE)
+    return -(-shape[0] // BLOCK_SIDE), -(-shape[1] // BLOCK_SIDE)
 
 
 def encode_bc4(values: FloatArray) -> UInt8Array:
@@ -54,7 +54,7 @@ def encode_bc4(values: FloatArray) -> UInt8Array:
     texels = _cut(values[..., None])
     rows, columns = texels.shape[:2]
     flat = texels.reshape(-1, 16) * 255.0
-    out = [_bc4_chunk(flat[i : i + CHUNK]) for i in range(0, len(flat), CHUNK)]
+    out = [_bc4_chunk(flat[i : i + CHUNK_BLOCKS]) for i in range(0, len(flat), CHUNK_BLOCKS)]
     return np.concatenate(out).reshape(rows, columns, 8)
 
 
@@ -91,7 +91,7 @@ def encode_bc1(colors: FloatArray) -> UInt8Array:
     texels = _cut(colors)
     rows, columns = texels.shape[:2]
     flat = texels.reshape(-1, 16, 3)
-    out = [_bc1_chunk(flat[i : i + CHUNK]) for i in range(0, len(flat), CHUNK)]
+    out = [_bc1_chunk(flat[i : i + CHUNK_BLOCKS]) for i in range(0, len(flat), CHUNK_BLOCKS)]
     return np.concatenate(out).reshape(rows, columns, 8)
 
 
@@ -140,9 +140,11 @@ def _bc4_chunk(v: Float64Array) -> UInt8Array:
     high, low = np.ceil(most), np.floor(least)
     steps, error = _bc4_steps(v, high, low)
     tries = [
-        (most - a * (most - least), least + b * (most - least)) for a in INSETS for b in INSETS
+        (most - a * (most - least), least + b * (most - least))
+        for a in RANGE_INSETS
+        for b in RANGE_INSETS
     ]
-    for _ in range(FITS):
+    for _ in range(FIT_ROUNDS):
         tries.append(_least_squares_ends(v, steps / 7.0))
         for h, lo in tries:
             h, lo = np.clip(np.rint(h), 0, 255), np.clip(np.rint(lo), 0, 255)
@@ -212,7 +214,7 @@ def _bc1_chunk(v: Float64Array) -> UInt8Array:
     b = mean + along.min(axis=1)[:, None] * axis
     best: tuple[Int64Array, ...] | None = None
     error = np.full(len(v), np.inf)
-    for _ in range(FITS):
+    for _ in range(FIT_ROUNDS):
         ends = _to_565(a), _to_565(b)
         steps, missed = _bc1_steps(v, _from_565(ends[0]), _from_565(ends[1]))
         win = missed < error
@@ -273,15 +275,15 @@ def _cut(values: FloatArray) -> Float64Array:
         raise BlockError("texture: got values beyond [0, 1] or not finite")
     h, w, channels = v.shape
     rows, columns = blocks_of((h, w))
-    v = np.pad(v, ((0, rows * SIDE - h), (0, columns * SIDE - w), (0, 0)), mode="edge")
-    v = v.reshape(rows, SIDE, columns, SIDE, channels).swapaxes(1, 2)
+    v = np.pad(v, ((0, rows * BLOCK_SIDE - h), (0, columns * BLOCK_SIDE - w), (0, 0)), mode="edge")
+    v = v.reshape(rows, BLOCK_SIDE, columns, BLOCK_SIDE, channels).swapaxes(1, 2)
     return v.reshape(rows, columns, 16, channels)
 
 
 def _joined(texels: Float64Array, shape: tuple[int, int]) -> Float64Array:
     rows, columns, _, channels = texels.shape
-    v = texels.reshape(rows, columns, SIDE, SIDE, channels).swapaxes(1, 2)
-    return v.reshape(rows * SIDE, columns * SIDE, channels)[: shape[0], : shape[1]]
+    v = texels.reshape(rows, columns, BLOCK_SIDE, BLOCK_SIDE, channels).swapaxes(1, 2)
+    return v.reshape(rows * BLOCK_SIDE, columns * BLOCK_SIDE, channels)[: shape[0], : shape[1]]
 
 
 def _channels(values: FloatArray, wanted: int) -> None:

@@ -21,7 +21,7 @@ from model.arrays import BoolArray, FloatArray
 from model.wrinkles import kernels
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
-    JIMENEZ2011,
+    JIMENEZ2011_TABLE,
     Clamp,
     Table,
     Weights,
@@ -85,7 +85,7 @@ def combine(
     weights: Weights,
     *,
     clamp: Clamp = "unit",
-    table: Table = JIMENEZ2011,
+    table: Table = JIMENEZ2011_TABLE,
     renormalize: bool = True,
 ) -> FloatArray:
     """Return base normals plus the difference, times the strength of its zones.

@@ -20,7 +20,7 @@ from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.skin import SkinMap
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
-    CLAMPS,
+    ZONE_SUM_LIMITS,
     Clamp,
     ExpressionTable,
     Weights,
@@ -32,8 +32,8 @@ from model.wrinkles.expressions import (
 from model.wrinkles.partial_derivatives import Layer
 
 SCHEMA = "skinrig.wrinkles/1"
-FILE = "wrinkles.json"
-FRAME = "tangent space, +X right, +Y up; derivatives n_x/n_z, n_y/n_z"
+WRINKLE_FILE = "wrinkles.json"
+DERIVATIVE_FRAME = "tangent space, +X right, +Y up; derivatives n_x/n_z, n_y/n_z"
 NO_ERRORS: Mapping[str, tuple[float, ...]] = MappingProxyType({})
 
 
@@ -106,8 +106,10 @@ class WrinkleModel:
             raise WrinkleError(
                 f"base_stderr: got shape {np.shape(self.base_stderr)}, expected {base.shape}"
             )
-        if self.clamp not in CLAMPS:
-            raise WrinkleError(f"clamp: got {self.clamp!r}, expected one of {', '.join(CLAMPS)}")
+        if self.clamp not in ZONE_SUM_LIMITS:
+            raise WrinkleError(
+                f"clamp: got {self.clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}"
+            )
         object.__setattr__(self, "base", np.where(valid[..., None], base, base.dtype.type(0)))
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "layers", tuple(self.layers))
@@ -141,7 +143,7 @@ class WrinkleModel:
         return WrinkledNormals(normals, self.valid, sums, held, max(parts, default=0.0))
 
     def to_maps(self) -> tuple[dict[str, SkinMap], bytes]:
-        """Return the maps and the bytes of `FILE` that :meth:`from_maps` reads."""
+        """Return the maps and the bytes of `WRINKLE_FILE` that :meth:`from_maps` reads."""
         maps = {"wrinkle_base": _map(self.base, self.base_stderr, self.valid, "neutral")}
         layers: list[dict[str, Any]] = []
         for k, layer in enumerate(self.layers):
@@ -167,7 +169,7 @@ class WrinkleModel:
         }
         document = {
             "schema": SCHEMA,
-            "frame": FRAME,
+            "frame": DERIVATIVE_FRAME,
             "clamp": self.clamp,
             "layers": layers,
             "weight_stderr": errors,
@@ -186,10 +188,10 @@ class WrinkleModel:
         try:
             given: Any = json.loads(document)
         except ValueError as error:
-            raise WrinkleError(f"{FILE}: got text that is not JSON: {error}") from error
+            raise WrinkleError(f"{WRINKLE_FILE}: got text that is not JSON: {error}") from error
         schema = given.get("schema") if isinstance(given, dict) else type(given).__name__
         if schema != SCHEMA:
-            raise WrinkleError(f"{FILE}: schema: got {schema!r}, expected {SCHEMA!r}")
+            raise WrinkleError(f"{WRINKLE_FILE}: schema: got {schema!r}, expected {SCHEMA!r}")
         try:
             layers = tuple(_layer(entry, maps) for entry in given["layers"])
             errors = {
@@ -208,7 +210,9 @@ class WrinkleModel:
         except WrinkleError:
             raise
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-            raise WrinkleError(f"{FILE}: got keys or values of a wrong kind: {error!r}") from error
+            raise WrinkleError(
+                f"{WRINKLE_FILE}: got keys or values of a wrong kind: {error!r}"
+            ) from error
 
 
 def _map(
@@ -219,7 +223,7 @@ def _map(
         return np.pad(np.asarray(values, np.float32), padding)
 
     error = None if stderr is None else three(stderr)
-    return SkinMap(three(derivatives), "1", error, valid, f"{what}: {FRAME}")
+    return SkinMap(three(derivatives), "1", error, valid, f"{what}: {DERIVATIVE_FRAME}")
 
 
 def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> Layer:
@@ -232,5 +236,5 @@ def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> Layer:
 
 def _named(maps: Mapping[str, SkinMap], name: str) -> SkinMap:
     if name not in maps:
-        raise WrinkleError(f"{FILE}: names the map {name!r}, which is not there")
+        raise WrinkleError(f"{WRINKLE_FILE}: names the map {name!r}, which is not there")
     return maps[name]

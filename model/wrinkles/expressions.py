@@ -25,7 +25,7 @@ from model.arrays import Float64Array
 
 Clamp: TypeAlias = Literal["unit", "signed"]
 
-CLAMPS: Mapping[str, tuple[float, float]] = MappingProxyType(
+ZONE_SUM_LIMITS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 )
 """Range of a zone's sum over blend shapes: "unit" is the paper's [0, 1], in which an expression
@@ -68,7 +68,7 @@ class ExpressionTable:
 
     Examples
     --------
-    >>> JIMENEZ2011.rows["anger"][:4]
+    >>> JIMENEZ2011_TABLE.rows["anger"][:4]
     (-0.6, -0.6, -0.8, -0.8)
     """
 
@@ -148,7 +148,7 @@ def read_table(text: str) -> ExpressionTable:
     return ExpressionTable(tuple(cell.strip() for cell in rows[0][1:]), weights, source)
 
 
-JIMENEZ2011 = read_table(
+JIMENEZ2011_TABLE = read_table(
     resources.files("model").joinpath("data/jimenez2011_table1_1.csv").read_text("utf-8")
 )
 """Table 1.1: joy, surprise, fear, anger, disgust and sad over eight zones."""
@@ -161,10 +161,10 @@ def as_table(table: Table) -> ExpressionTable:
     """Return a table; a plain mapping of rows is one of the eight zones of the paper."""
     if isinstance(table, ExpressionTable):
         return table
-    return ExpressionTable(JIMENEZ2011.zones, {n: tuple(row) for n, row in table.items()})
+    return ExpressionTable(JIMENEZ2011_TABLE.zones, {n: tuple(row) for n, row in table.items()})
 
 
-def zone_sums(weights: Weights, table: Table = JIMENEZ2011) -> Float64Array:
+def zone_sums(weights: Weights, table: Table = JIMENEZ2011_TABLE) -> Float64Array:
     """Return each zone's sum over blend shapes, before any clamp.
 
     Parameters
@@ -199,13 +199,13 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011) -> Float64Array:
 
 
 def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
-    """Return sums held in the range of `CLAMPS`; where it changes them is for the caller to say.
+    """Return sums held in the range of `ZONE_SUM_LIMITS`; the caller reports where it changes them.
 
     Examples
     --------
     >>> clamped([-0.6, 0.2, 1.7]).tolist(), clamped([-0.6, 0.2, 1.7], "signed").tolist()
     ([0.0, 0.2, 1.0], [-0.6, 0.2, 1.0])
     """
-    if clamp not in CLAMPS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
-    return np.clip(np.asarray(sums, np.float64), *CLAMPS[clamp])
+    if clamp not in ZONE_SUM_LIMITS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
+    return np.clip(np.asarray(sums, np.float64), *ZONE_SUM_LIMITS[clamp])

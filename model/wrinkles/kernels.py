@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numba import njit, prange
 
-SMALL = 500_000
+MIN_PARALLEL_PIXELS = 500_000
 """Pixels below which one thread is sooner done than several are brought in."""
 
 
@@ -23,7 +23,7 @@ SMALL = 500_000
 def threads_for(pixels: int) -> Iterator[None]:
     """Keep to one thread while few pixels are computed."""
     before = numba.get_num_threads()
-    if pixels < SMALL:
+    if pixels < MIN_PARALLEL_PIXELS:
         numba.set_num_threads(1)
     try:
         yield

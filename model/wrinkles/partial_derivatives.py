@@ -29,10 +29,11 @@ from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.arrays import BoolArray, FloatArray
+from model.vectors import unit_vectors
 from model.wrinkles import kernels
 from model.wrinkles.expressions import (
-    CLAMPS,
-    JIMENEZ2011,
+    JIMENEZ2011_TABLE,
+    ZONE_SUM_LIMITS,
     Clamp,
     Table,
     Weights,
@@ -42,15 +43,15 @@ from model.wrinkles.expressions import (
 )
 from model.wrinkles.masks import Masks, mask_stack, mask_textures, real_array, zone_strength
 
-ZONES = JIMENEZ2011.zones
-LIMIT = 1.0
+ZONE_NAMES = JIMENEZ2011_TABLE.zones
+MAX_DERIVATIVE = 1.0
 """Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
 
 __all__ = [
-    "CLAMPS",
-    "JIMENEZ2011",
-    "LIMIT",
-    "ZONES",
+    "JIMENEZ2011_TABLE",
+    "MAX_DERIVATIVE",
+    "ZONE_NAMES",
+    "ZONE_SUM_LIMITS",
     "Encoding",
     "Layer",
     "Masks",
@@ -91,7 +92,7 @@ class Encoding:
     clamped_fraction: float
 
 
-def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> FloatArray:
+def encode(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> FloatArray:
     """Return partial derivatives of tangent-space normals.
 
     Parameters
@@ -119,7 +120,7 @@ def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> FloatArray:
     return report.derivatives
 
 
-def encoding_report(normals: ArrayLike, *, limit: float | None = LIMIT) -> Encoding:
+def encoding_report(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Encoding:
     """Encode as :func:`encode` does, and say which pixels were clamped or have no derivative.
 
     Examples
@@ -180,12 +181,11 @@ def _decoded_huge(d: FloatArray) -> FloatArray:
     good = np.asarray(np.isfinite(d).all(axis=-1))
     d = np.where(good[:, None], d, 0.0)
     scale = np.maximum(np.abs(d).max(axis=-1, keepdims=True), d.dtype.type(1.0))
-    n = np.concatenate([d / scale, 1.0 / scale], axis=-1)
-    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    n = unit_vectors(np.concatenate([d / scale, 1.0 / scale], axis=-1))
     return np.where(good[:, None], n, 0.0)
 
 
-def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> FloatArray:
+def to_unit(derivatives: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatArray:
     """Return derivatives in [-limit, limit] as texture values in [0, 1]; 0 becomes 0.5."""
     d = real_array(derivatives)
     if not np.isfinite(d).all() or (d.size and float(np.abs(d).max()) > limit):
@@ -196,7 +196,7 @@ def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> FloatArray:
     return d * d.dtype.type(0.5 / limit) + d.dtype.type(0.5)
 
 
-def from_unit(values: ArrayLike, *, limit: float = LIMIT) -> FloatArray:
+def from_unit(values: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatArray:
     """Return the derivatives that texture values in [0, 1] stand for (listing 1.1)."""
     t = real_array(values)
     return (t * t.dtype.type(2.0) - t.dtype.type(1.0)) * t.dtype.type(limit)
@@ -223,7 +223,7 @@ class Layer:
 
     wrinkle: FloatArray
     masks: FloatArray
-    table: Table = JIMENEZ2011
+    table: Table = JIMENEZ2011_TABLE
     stderr: FloatArray | None = None
     valid: BoolArray | None = None
 
@@ -245,7 +245,7 @@ def combine(
     weights: Weights,
     *,
     clamp: Clamp = "unit",
-    table: Table = JIMENEZ2011,
+    table: Table = JIMENEZ2011_TABLE,
 ) -> FloatArray:
     """Return the normals of a base map with wrinkles: listing 1.1.
 
@@ -258,7 +258,7 @@ def combine(
         read bilinearly, averaged first where finer than the base. Leading axes broadcast with
         those of the base.
     masks : array_like, shape (8, h, w), or two RGBA textures (h, w, 4)
-        In the order of `ZONES`, at any resolution; the same for all leading axes.
+        In the order of `ZONE_NAMES`, at any resolution; the same for all leading axes.
     weights : mapping of str to float, or array_like, shape (8,)
         Any number of blend shapes by name, or the zones' sums.
     clamp : {"unit", "signed"}

@@ -73,7 +73,7 @@ def texture_bytes(shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bo
     h, w = shape
     if in_blocks:
         rows, columns = blocks.blocks_of(shape)
-        h, w = rows * blocks.SIDE, columns * blocks.SIDE
+        h, w = rows * blocks.BLOCK_SIDE, columns * blocks.BLOCK_SIDE
     return h * w * bytes_per_texel
 
 

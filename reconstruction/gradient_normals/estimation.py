@@ -16,7 +16,6 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -24,23 +23,22 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from model.fresnel import ETA_SKIN
-from reconstruction.arrays import BoolArray, Float64Array, FloatArray
-from reconstruction.gradient_normals import kernels, lobe_response
+from reconstruction.arrays import FloatArray
+from reconstruction.gradient_normals import kernels, lobe_response, moment_kernels
 from reconstruction.gradient_normals.channels import channel_count, joined, sliced, summed
-from reconstruction.gradient_normals.lobe_response import (
-    Response,
-    SphereLights,
-    SphereLightsError,
-    frame_of,
+from reconstruction.gradient_normals.inversion import (
+    analyzer_of,
+    grid_of,
+    invert_moments,
+    places_of,
+    views_of,
 )
-from reconstruction.gradient_normals.moments import (
-    Reflection,
-    prepare,
-    with_filter,
-    with_shared_dark,
-)
+from reconstruction.gradient_normals.lobe_response import Response
+from reconstruction.gradient_normals.moments import Reflection, with_filter
 from reconstruction.gradient_normals.noise import SensorNoise
-from reconstruction.gradient_normals.patterns import GradientError, Key, MissingPatterns, collect
+from reconstruction.gradient_normals.patterns import GradientError, Key, MissingPatterns
+from reconstruction.gradient_normals.reflection import Valid, Variance, separate_reflection
+from reconstruction.gradient_normals.sphere_lights import SphereLights, SphereLightsError, frame_of
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tiles import map_tiles
 
@@ -57,16 +55,10 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
-Valid = BoolArray | Mapping[Key, BoolArray] | None
 
-NEEDED = 3.0
-"""Length of the moment vector over its standard error, below which a pixel has no normal."""
-LEAKY = 0.02
-"""Median leakage from which polarizers do not cross well: 8 degrees off."""
-CONTRADICTION = 3.0
+MAX_RESIDUAL_RATIO = 3.0
 """Mean square of residuals over their variance from which pictures are said not to fit together."""
-ALPHAS = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
+ROUGHNESS_LADDER = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
 """Ladder on which a roughness is searched."""
 
 
@@ -218,12 +210,12 @@ def from_patterns(
                 for k in range(channels)
             ]
         )
-    reflection = _reflection(
+    reflection = separate_reflection(
         patterns, component, variance, valid, saturation, lights, smooth_px, smooth_crossed_px
     )
     shape = reflection.shape
-    middle, each_view = _views(view, shape)
-    places = _places(points_mm, shape, middle, lights)
+    middle, each_view = views_of(view, shape)
+    places = places_of(points_mm, shape, middle, lights)
     if lights is None:
         if alpha is not None:
             raise GradientError("alpha: got it without lights, expected both or neither")
@@ -244,7 +236,7 @@ def from_patterns(
         )
     if wiener:
         reflection = with_filter(reflection)
-    return _maps(reflection, table, _analyser(lights, table), eta, each_view, places, executor)
+    return _maps(reflection, table, analyzer_of(lights, table), eta, each_view, places, executor)
 
 
 def estimate_roughness(
@@ -278,147 +270,13 @@ def estimate_roughness(
     if channel_count(patterns) is not None:
         patterns, variance = summed(patterns, variance=variance, valid=valid, saturation=saturation)
         valid = saturation = None
-    reflection = _reflection(
+    reflection = separate_reflection(
         patterns, "specular", variance, valid, saturation, lights, smooth_px, smooth_crossed_px
     )
-    found = _roughness(reflection, lights, _views(view, reflection.shape)[0], eta)
+    found = _roughness(reflection, lights, views_of(view, reflection.shape)[0], eta)
     if found.pixels == 0:
         raise GradientError("patterns: no pixel has a specular signal above its noise")
     return found
-
-
-def _reflection(
-    patterns: Mapping[Key, ArrayLike],
-    component: Literal["specular", "diffuse"],
-    variance: Variance,
-    valid: Valid,
-    saturation: float | None,
-    lights: SphereLights | None,
-    smooth_px: float,
-    smooth_crossed_px: float | None,
-) -> Reflection:
-    noise = variance if isinstance(variance, SensorNoise) else None
-    stacks = collect(
-        patterns,
-        variance=None if isinstance(variance, SensorNoise) else variance,
-        valid=valid,
-        saturation=saturation,
-    )
-    leakage = 0.0
-    if lights is not None:
-        # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
-        leakage = float(np.median(lights.leakage[lights.intensities > 0]))
-        if leakage > LEAKY:
-            _warn_of_leakage(round(leakage, 4))
-    return prepare(
-        with_shared_dark(stacks),
-        component,
-        noise=noise,
-        leakage=leakage,
-        smooth_px=smooth_px,
-        smooth_crossed_px=smooth_crossed_px,
-    )
-
-
-@lru_cache(maxsize=64)
-def _warn_of_leakage(leakage: float) -> None:
-    """Say once for all pictures of one sphere how much passes crossed polarizers."""
-    _log.warning(
-        "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if the"
-        " analyser were %.0f degrees off; corrected, at the price of signal",
-        100.0 * leakage,
-        np.degrees(np.arctan(np.sqrt(leakage))),
-    )
-
-
-def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
-    v = np.asarray(view, np.float64)
-    if v.shape not in ((3,), (*shape, 3)):
-        raise GradientError(f"view: got shape {v.shape}, expected (3,) or {(*shape, 3)}")
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    if not (np.abs(length - 1.0) < 0.01).all():
-        raise GradientError("view: expected unit vectors, got lengths other than 1")
-    v = v / length
-    if v.ndim == 1:
-        return v, np.zeros((0, 3))
-    middle = v.reshape(-1, 3).mean(axis=0)
-    return middle / np.linalg.norm(middle), v.reshape(-1, 3)
-
-
-def _places(
-    points_mm: ArrayLike | None,
-    shape: tuple[int, int],
-    middle: FloatArray,
-    lights: SphereLights | None,
-) -> FloatArray | None:
-    """Return the pixels' places (P, 2) along the frame's first two axes, mm."""
-    if points_mm is None:
-        return None
-    if lights is None or not np.isfinite(lights.distance_mm):
-        raise GradientError("points_mm: got them without lights of finite distance_mm")
-    points = np.asarray(points_mm, np.float64)
-    if points.shape not in ((*shape, 2), (*shape, 3)) or not np.isfinite(points).all():
-        raise GradientError(
-            f"points_mm: got shape {points.shape}, expected finite {(*shape, 2)} or {(*shape, 3)}"
-        )
-    flat = points.reshape(-1, points.shape[-1])
-    if points.shape[-1] == 2:
-        flat = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
-    if np.linalg.norm(flat, axis=1).max() > 0.2 * lights.distance_mm:
-        raise GradientError(
-            "points_mm: got points farther from the middle than a fifth of the lights' distance;"
-            " directions to the lights are followed to first order only"
-        )
-    return np.asarray(flat @ frame_of(middle)[:2].T)
-
-
-def _analyser(lights: SphereLights | None, table: Response) -> FloatArray:
-    """Return the analyser's axis in the frame of the view, (2,)."""
-    if lights is None:
-        return np.zeros(2)
-    return np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
-
-
-def _grid(table: Response) -> Float64Array:
-    """Return places for the search to begin at, see :func:`gradient_kernels.starts`."""
-    if table.coefficients.size == 0:
-        return np.zeros((2, 2, 2))
-    lines = int(np.clip(3.0 / table.step, 65, 257))
-    grid = np.empty((lines, lines, 2))
-    kernels.starts(table.coefficients, table.least, table.step, grid)
-    return grid
-
-
-def _inverted(
-    reflection: Reflection,
-    moments: tuple[FloatArray, FloatArray],
-    table: Response,
-    grid: FloatArray,
-    analyser: FloatArray,
-    eta: float,
-    view: FloatArray,
-    place: FloatArray,
-) -> Float64Array:
-    out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
-    kernels.invert(
-        *moments,
-        table.frame,
-        reflection.component == "specular",
-        table.coefficients,
-        table.least,
-        table.step,
-        grid,
-        analyser,
-        eta,
-        view,
-        place,
-        reflection.told > 0,
-        NEEDED,
-        1e-5 if reflection.kind == np.float32 else 1e-9,
-        out,
-    )
-    return out
 
 
 def _roughness(
@@ -443,12 +301,12 @@ def _roughness(
     def excess(log_alpha: float) -> tuple[float, FloatArray]:
         """Return how much longer the vectors are than this roughness makes them, each and all."""
         table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
-        found = _inverted(
+        found = invert_moments(
             reflection,
             moments,
             table,
-            _grid(table),
-            _analyser(lights, table),
+            grid_of(table),
+            analyzer_of(lights, table),
             eta,
             np.zeros((0, 3)),
             np.zeros((0, 2)),
@@ -464,11 +322,15 @@ def _roughness(
         )
         return float(each.sum() / max(light.sum(), 1e-300)), each / max(light.sum(), 1e-300)
 
-    ladder = np.log(ALPHAS)
+    ladder = np.log(ROUGHNESS_LADDER)
     steps = [excess(a) for a in ladder]
     pixels = max(len(each) for _, each in steps)
     if pixels == 0:
-        return Roughness(ALPHAS[len(ALPHAS) // 2], ALPHAS[len(ALPHAS) // 2], 0)
+        return Roughness(
+            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
+            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
+            0,
+        )
     values = np.array([value for value, _ in steps])
     change = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if change.size == 0:
@@ -476,11 +338,11 @@ def _roughness(
         _log.warning(
             "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
             "narrower" if values[best] > 0.0 else "wider",
-            ALPHAS[0],
-            ALPHAS[-1],
-            ALPHAS[best],
+            ROUGHNESS_LADDER[0],
+            ROUGHNESS_LADDER[-1],
+            ROUGHNESS_LADDER[best],
         )
-        return Roughness(ALPHAS[best], ALPHAS[best], pixels)
+        return Roughness(ROUGHNESS_LADDER[best], ROUGHNESS_LADDER[best], pixels)
     low, high = ladder[change[0]], ladder[change[0] + 1]
     root = float(brentq(lambda a: excess(a)[0], low, high, xtol=2e-3))
     value, each = excess(root)
@@ -505,12 +367,12 @@ def _maps(
     normals = np.zeros((height, width, 3), kind)
     flats = [np.zeros((height, width), kind) for _ in range(4)]
     valid, used = np.zeros((height, width), bool), np.zeros((height, width), np.int32)
-    grid = _grid(table)
+    grid = grid_of(table)
 
     def solve(rows: slice) -> tuple[float, float]:
         span = slice(rows.start * width, rows.stop * width)
         moments = reflection.moments(rows)
-        found = _inverted(
+        found = invert_moments(
             reflection,
             moments,
             table,
@@ -527,11 +389,11 @@ def _maps(
         chi = free = 0.0
         for one in moments:
             if one.shape[1]:
-                misfit += one[kernels.MISFIT]
-                count += one[kernels.USED]
-                told = np.isfinite(one[kernels.CHI])
-                chi += float(one[kernels.CHI][told].sum())
-                free += float(one[kernels.FREE][told].sum())
+                misfit += one[moment_kernels.MISFIT]
+                count += one[moment_kernels.USED]
+                told = np.isfinite(one[moment_kernels.CHI])
+                chi += float(one[moment_kernels.CHI][told].sum())
+                free += float(one[moment_kernels.FREE][told].sum())
         residual = np.sqrt(misfit / np.maximum(count, 1)).reshape(good.shape)
         for flat, values, none in (
             (flats[0], found[..., kernels.ALBEDO], 0.0),
@@ -550,7 +412,7 @@ def _maps(
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
             contradiction = list(map_tiles(solve, tiles, executor=pool))
     chi, free = (sum(part) for part in zip(*contradiction, strict=True))
-    if reflection.judged and free and chi > CONTRADICTION * free:
+    if reflection.judged and free and chi > MAX_RESIDUAL_RATIO * free:
         _log.warning(
             "patterns contradict each other: residuals of redundant pictures are %.1f times their"
             " noise; did subject or light change between them?",

@@ -10,14 +10,17 @@ import math
 import numpy as np
 from numba import njit
 
-# Rows of the samples, in the order of the patterns.
-FULL, DARK = 0, 7  # between them x, y, z, -x, -y, -z
-
-# Rows of the moments: values, (co)variances, squared residuals, their number, samples used.
-C_0, C_X, C_Y, C_Z = 0, 1, 2, 3
-V_0, V_XX, V_YY, V_ZZ, V_XY, V_XZ, V_YZ = 4, 5, 6, 7, 8, 9, 10
-CHI, FREE, USED, MISFIT = 11, 12, 13, 14
-MOMENT_ROWS = 15
+from reconstruction.gradient_normals.moment_kernels import (
+    C_0,
+    C_X,
+    V_0,
+    V_XX,
+    V_XY,
+    V_XZ,
+    V_YY,
+    V_YZ,
+    V_ZZ,
+)
 
 # Columns of the normals.
 N_X, N_Y, N_Z, ALBEDO, STDERR, STDERR_ALBEDO, CONCENTRATION, CONCENTRATION_SEEN, STATUS = range(9)
@@ -25,190 +28,16 @@ NORMAL_COLUMNS = 9
 GOOD, DIM, LOST, HORIZON = 0.0, 1.0, 2.0, 3.0
 """Status: a normal; no signal above its noise; too few samples; no normal leads to what is seen."""
 
-_PASSES = 24
+_MAX_PASSES = 24
 _STEPS_BACK = 8
-_TOLERATED = 2e-3  # distance between what is seen and what the place found shows
-_ROUGHLY = 2e-3
-_UNSETTLED = 1e-2  # relative changes of the moment vector by the polarization of diffuse light
+_MAX_POSITION_ERROR = 2e-3  # distance between what is seen and what the place found shows
+_COARSE_TOL = 2e-3
+_MAX_MOMENT_CHANGE = (
+    1e-2  # relative changes of the moment vector by the polarization of diffuse light
+)
 _EXACT_TURNS = 8
 _STEEP, _UNLIKE = 0.866, 0.03
-_LEAST_FACING = 0.1  # cosine to the view, which tables end at
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def moments(y, noise, gain, read, told, dark, out):  # type: ignore[no-untyped-def]
-    """Fit light, gradient and dark level to the patterns of one polarization, per pixel.
-
-    Parameters
-    ----------
-    y : ndarray, shape (8, P)
-        Samples; NaN where there is none.
-    noise : ndarray, shape (8, P)
-        Variances; read only where `told` is 1.
-    gain, read : float
-        Variance as ``read + gain * signal``; read only where `told` is 2. With `told` 0 all
-        samples count alike, and variances are for a variance of 1.
-    told : int
-    dark : bool
-        Whether the dark level is unknown; else it is 0.
-    out : ndarray, shape (MOMENT_ROWS, P)
-
-    Notes
-    -----
-    With a dark level ``b``, the full light gives ``b + c_0``, a pattern and its complement
-    ``b + (c_0 +- c_w) / 2``. Their sum says ``2 b + c_0`` and nothing of ``c_w``; so two unknowns
-    are fitted to at most five numbers, and each ``c_w`` then to at most two samples. Together this
-    is the generalised least squares of all samples in closed form.
-    """
-    nan = np.nan
-    v = np.empty(8)
-    for p in range(y.shape[1]):
-        for row in range(MOMENT_ROWS):
-            out[row, p] = nan
-        used = 0
-        top = 0.0
-        for k in range(8):
-            if y[k, p] == y[k, p]:
-                used += 1
-                top = max(top, float(y[k, p]))
-        out[USED, p] = used
-        if told == 1:
-            for k in range(8):
-                v[k] = noise[k, p]
-        else:
-            for k in range(8):
-                v[k] = 1.0
-        rounds = 2 if told == 2 else 1
-        for turn in range(rounds):
-            if told == 2:
-                # signals of the fit before, not the samples: these would weigh their own noise
-                base = max(out[C_0, p], 0.0) if turn else top
-                floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-12)
-                for k in range(8):
-                    signal = base
-                    if k == DARK:
-                        signal = 0.0
-                    elif k != FULL:
-                        signal = 0.5 * base
-                        if turn:
-                            along = out[1 + (k - 1) % 3, p]
-                            signal = 0.5 * (base + (along if k < 4 else -along))
-                    # no light and no read noise: still a variance
-                    v[k] = max(read + gain * signal, floor)
-            # normal equations of (c_0, b)
-            a00, a0b, abb, g0, gb = 0.0, 0.0, 0.0, 0.0, 0.0
-            level = 0
-            if y[FULL, p] == y[FULL, p]:
-                w = 1.0 / v[FULL]
-                a00 += w
-                a0b += w
-                abb += w
-                g0 += w * y[FULL, p]
-                gb += w * y[FULL, p]
-                level += 1
-            single = 0
-            for axis in range(3):
-                plus, minus = y[1 + axis, p], y[4 + axis, p]
-                if plus == plus and minus == minus:
-                    w = 1.0 / (v[1 + axis] + v[4 + axis])
-                    a00 += w
-                    a0b += 2.0 * w
-                    abb += 4.0 * w
-                    g0 += w * (plus + minus)
-                    gb += 2.0 * w * (plus + minus)
-                    level += 1
-                elif plus != plus and minus != minus:
-                    single = 9
-            if dark and y[DARK, p] == y[DARK, p]:
-                abb += 1.0 / v[DARK]
-                gb += y[DARK, p] / v[DARK]
-                level += 1
-            if single or level < (2 if dark else 1):
-                break
-            if dark:
-                det = a00 * abb - a0b * a0b
-                if not det > 1e-12 * a00 * abb:
-                    break
-                v00, v0b, vbb = abb / det, -a0b / det, a00 / det
-            else:
-                v00, v0b, vbb = 1.0 / a00, 0.0, 0.0
-            c0 = v00 * g0 + v0b * gb
-            b = v0b * g0 + vbb * gb
-            # the gradients, given the light: slope t by it, conditional variance s
-            misfit, chi = 0.0, 0.0
-            if y[FULL, p] == y[FULL, p]:
-                r = y[FULL, p] - b - c0
-                misfit += r * r
-                chi += r * r / v[FULL]
-            if dark and y[DARK, p] == y[DARK, p]:
-                r = y[DARK, p] - b
-                misfit += r * r
-                chi += r * r / v[DARK]
-            qq = v00 + 4.0 * v0b + 4.0 * vbb
-            t0, t1, t2 = 0.0, 0.0, 0.0
-            for axis in range(3):
-                plus, minus = y[1 + axis, p], y[4 + axis, p]
-                vp, vm = v[1 + axis], v[4 + axis]
-                if plus == plus and minus == minus:
-                    share = vm / (vp + vm)  # weight of the pattern, the rest its complement's
-                    t = 2.0 * share - 1.0
-                    s = 4.0 * vp * share
-                    c = share * (2.0 * (plus - b) - c0) + (1.0 - share) * (c0 - 2.0 * (minus - b))
-                    r = plus + minus - 2.0 * b - c0
-                    misfit += 0.5 * r * r
-                    chi += r * r / (vp + vm)
-                elif plus == plus:
-                    t, s, c = 1.0, 4.0 * vp, 2.0 * (plus - b) - c0
-                else:
-                    t, s, c = -1.0, 4.0 * vm, c0 - 2.0 * (minus - b)
-                out[C_X + axis, p] = c
-                out[V_XX + axis, p] = s + t * t * qq
-                if axis == 0:
-                    t0 = t
-                elif axis == 1:
-                    t1 = t
-                else:
-                    t2 = t
-            out[C_0, p] = c0
-            out[V_0, p] = v00
-            out[V_XY, p] = t0 * t1 * qq
-            out[V_XZ, p] = t0 * t2 * qq
-            out[V_YZ, p] = t1 * t2 * qq
-            out[CHI, p] = chi
-            out[MISFIT, p] = misfit
-            out[FREE, p] = level - (2 if dark else 1)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def smooth(image, taps, mask, out, line):  # type: ignore[no-untyped-def]
-    """Convolve rows and columns of ``image * mask`` (H, W) by symmetric taps; 0 outside.
-
-    `line` (H, W) is scratch; `taps` has the middle first.
-    """
-    height, width = image.shape
-    reach = taps.size - 1
-    for i in range(height):
-        for j in range(width):
-            line[i, j] = taps[0] * image[i, j] if mask[i, j] else image.dtype.type(0.0)
-        for k in range(1, reach + 1):
-            tap = taps[k]
-            if i >= k:
-                for j in range(width):
-                    if mask[i - k, j]:
-                        line[i, j] += tap * image[i - k, j]
-            if i + k < height:
-                for j in range(width):
-                    if mask[i + k, j]:
-                        line[i, j] += tap * image[i + k, j]
-    for i in range(height):
-        for j in range(width):
-            out[i, j] = taps[0] * line[i, j]
-        for k in range(1, reach + 1):
-            tap = taps[k]
-            for j in range(k, width):
-                out[i, j] += tap * line[i, j - k]
-            for j in range(width - k):
-                out[i, j] += tap * line[i, j + k]
+_MIN_FACING = 0.1  # cosine to the view, which tables end at
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -298,7 +127,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
     v0, v1, j00, j01, j10, j11 = lookup(table, least, step, u0, u1, x, y)
     e0, e1 = s0 - v0, s1 - v1
     off = math.sqrt(e0 * e0 + e1 * e1)
-    for _ in range(_PASSES):
+    for _ in range(_MAX_PASSES):
         if off < close:
             break
         det = j00 * j11 - j01 * j10
@@ -311,7 +140,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
         part, better = 1.0, False
         for _ in range(_STEPS_BACK):
             t0, t1 = u0 + part * d0, u1 + part * d1
-            if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _LEAST_FACING):
+            if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _MIN_FACING):
                 v0, v1, k00, k01, k10, k11 = lookup(table, least, step, t0, t1, x, y)
                 f0, f1 = s0 - v0, s1 - v1
                 now = math.sqrt(f0 * f0 + f1 * f1)
@@ -338,11 +167,11 @@ def starts(table, least, step, out):  # type: ignore[no-untyped-def]
         for j in range(size):
             s0 = reach * (2.0 * j / (size - 1) - 1.0)
             out[i, j, 0], out[i, j, 1] = s0, s1
-            if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _LEAST_FACING):
+            if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _MIN_FACING):
                 u0, u1, off, _, _, _, _ = _settle(
                     table, least, step, s0, s1, s0, s1, 0.0, 0.0, 1e-6
                 )
-                if off < _TOLERATED:
+                if off < _MAX_POSITION_ERROR:
                     out[i, j, 0], out[i, j, 1] = u0, u1
 
 
@@ -521,7 +350,7 @@ def invert(  # type: ignore[no-untyped-def]
                     turned[2, j] = (half[2, j] - n2 * s) / size
             else:
                 turned[:] = half
-            if n2 < _LEAST_FACING:
+            if n2 < _MIN_FACING:
                 status = HORIZON
                 break
             scale = math.sqrt(2.0 / (1.0 + n2))
@@ -539,7 +368,7 @@ def invert(  # type: ignore[no-untyped-def]
                 u0, u1, off, j00, j01, j10, j11 = _settle(
                     table, least, step, s0, s1, u0, u1, x, y, close
                 )
-                if off > _TOLERATED:
+                if off > _MAX_POSITION_ERROR:
                     status = HORIZON
                     break
             if not polarized:
@@ -551,10 +380,10 @@ def invert(  # type: ignore[no-untyped-def]
             change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
             ratio = fresh
             if rough:
-                rough = change > _ROUGHLY and turn < last - _EXACT_TURNS
+                rough = change > _COARSE_TOL and turn < last - _EXACT_TURNS
             elif change < max(10.0 * close, 1e-7):
                 break
-            elif turn == last and change > _UNSETTLED:
+            elif turn == last and change > _MAX_MOMENT_CHANGE:
                 status = HORIZON
         if status != GOOD:
             out[p, STATUS] = status

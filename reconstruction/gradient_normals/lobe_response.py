@@ -12,7 +12,7 @@ azimuthal): a place ``u`` is 2 sin(tilt / 2) long and points where the normal le
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -21,11 +21,21 @@ from scipy.ndimage import spline_filter
 
 from model import fresnel
 from model.brdf import microfacet
+from model.vectors import unit_vectors
 from reconstruction.arrays import Float64Array
+from reconstruction.gradient_normals.sphere_lights import (
+    SphereLights,
+    SphereLightsError,
+    frame_of,
+    normal_at,
+    place_of,
+    require_finite,
+    require_unit_vectors,
+)
 
-REACH = 1.3
+TABLE_REACH = 1.3
 """Length of the places that tables are made for: tilts up to 81 degrees."""
-MARGIN = 4
+MARGIN_LINES = 4
 """Grid lines around them."""
 FINEST, COARSEST = 0.0125, 0.04
 """Distance of grid lines; a lobe's roughness has four of them in between."""
@@ -35,129 +45,9 @@ FIELD_MM = 1.0
 F_X, F_Y, SCALE, CONCENTRATION, SYS_XX, SYS_XY, SYS_YY = range(7)
 """Layers of a table: place seen (2); full light over a white diffuser's; length of the mean vector
 to the lights; covariance of the place seen from what is not known about the lights (3)."""
-LAYERS = 7
+TABLE_LAYERS = 7
 FIELD_LAYERS = 4
 """Further layers where the field counts: change of the place seen with the point, 1/mm."""
-
-
-class SphereLightsError(ValueError):
-    """Lights that no gradient sphere has."""
-
-
-def _none() -> Float64Array:
-    return np.zeros(0)
-
-
-@dataclass(frozen=True, slots=True)
-class SphereLights:
-    """The lights of a gradient sphere and their films, as they were measured.
-
-    Attributes
-    ----------
-    directions : ndarray, shape (L, 3)
-        Unit vectors from the middle of the patch to the lights, rig frame, at least four.
-    intensities : ndarray, shape (L,)
-        What each light gives at the patch, relative, >= 0; any scale. Default: all 1.
-    leakage : ndarray, shape (L,)
-        Of the specular reflection into the camera what passes crossed, over what passes parallel,
-        >= 0; below 1 for most lights. Default: 0.
-    polarizers : ndarray, shape (L, 3)
-        Unit vectors of the electric field that each light sends to the patch. Default (0, 3): such
-        that what a facet reflects into the view is polarized along the analyser.
-    analyser : tuple of float
-        Passing axis of the analyser in its parallel state.
-    programmed : ndarray, shape (L, 3)
-        The vectors whose coordinates the patterns were made of; default: `directions`.
-    distance_mm : float
-        Of the lights from the middle of the patch; inf: a point's place does not count.
-    intensity_stderr : ndarray, shape (L,)
-        Standard error of `intensities`. Default: 0.
-    leakage_stderr : ndarray, shape (L,)
-        Standard error of `leakage`. Default: 0.
-
-    Examples
-    --------
-    >>> axes = np.concatenate([np.eye(3), -np.eye(3)])
-    >>> SphereLights(axes).intensities.tolist()
-    [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
-    """
-
-    directions: Float64Array
-    intensities: Float64Array = field(default_factory=_none)
-    leakage: Float64Array = field(default_factory=_none)
-    polarizers: Float64Array = field(default_factory=_none)
-    analyser: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    programmed: Float64Array = field(default_factory=_none)
-    distance_mm: float = np.inf
-    intensity_stderr: Float64Array = field(default_factory=_none)
-    leakage_stderr: Float64Array = field(default_factory=_none)
-
-    def __post_init__(self) -> None:
-        """Check shapes and ranges, and keep copies that cannot be written to."""
-        ways = _unit_vectors("directions", self.directions)
-        count = len(ways)
-        if count < 4:
-            raise SphereLightsError(f"directions: got {count} light(s), expected at least 4")
-        axis = _unit_vectors("analyser", np.asarray(self.analyser, np.float64)[None])[0]
-        # not given: stay empty, so that a later replace() of directions does not meet old ones
-        for name, default in (
-            ("intensities", 1.0),
-            ("leakage", 0.0),
-            ("intensity_stderr", 0.0),
-            ("leakage_stderr", 0.0),
-        ):
-            given = np.asarray(getattr(self, name), np.float64)
-            values = np.full(count, default) if given.size == 0 else given.copy()
-            if values.shape != (count,) or not np.isfinite(values).all() or (values < 0).any():
-                raise SphereLightsError(
-                    f"{name}: got shape {values.shape}, expected finite numbers >= 0, ({count},)"
-                )
-            _keep(self, name, values)
-        if not self.intensities.any():
-            raise SphereLightsError("intensities: got 0 for every light, expected some light")
-        # a few may exceed 1, by a film mounted across or where the surface hardly reflects the
-        # parallel state: what they give parallel less crossed is negative, and counts as such
-        middle = float(np.median(self.leakage[self.intensities > 0]))
-        if middle >= 1.0:
-            raise SphereLightsError(
-                f"leakage: got {middle:g} in the middle of the lights, expected crossed over"
-                " parallel below 1; are the two states exchanged?"
-            )
-        for name in ("polarizers", "programmed"):
-            given = np.asarray(getattr(self, name), np.float64)
-            vectors = np.zeros((0, 3)) if given.size == 0 else _unit_vectors(name, given)
-            if len(vectors) not in (0, count):
-                raise SphereLightsError(f"{name}: got {len(vectors)} vectors, expected {count}")
-            _keep(self, name, vectors)
-        if len(self.polarizers):
-            along = np.abs(np.sum(self.polarizers * ways, axis=1))
-            if along.max() > 0.05:
-                raise SphereLightsError(
-                    f"polarizers[{along.argmax()}]: got a field along its own ray, expected one"
-                    " across it"
-                )
-        if not self.distance_mm > 0:
-            raise SphereLightsError(f"distance_mm: got {self.distance_mm}, expected more than 0")
-        _keep(self, "directions", ways)
-        object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
-
-
-def _keep(lights: SphereLights, name: str, values: Float64Array) -> None:
-    values.flags.writeable = False
-    object.__setattr__(lights, name, values)
-
-
-def _unit_vectors(name: str, vectors: ArrayLike) -> Float64Array:
-    array = np.array(vectors, np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise SphereLightsError(f"{name}: got shape {array.shape}, expected (L, 3)")
-    length = np.linalg.norm(array, axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
-    if wrong.size:
-        raise SphereLightsError(
-            f"{name}[{wrong[0]}]: got {array[wrong[0]].tolist()}, expected a unit vector"
-        )
-    return np.asarray(array / length[:, None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,74 +73,6 @@ class Response:
         self.coefficients.flags.writeable = False  # of one kind: what reads them is compiled once
 
 
-def _require_finite(name: str, values: Float64Array) -> None:
-    wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
-    if wrong:
-        raise SphereLightsError(
-            f"{name}: got {wrong} of {np.size(values)} numbers that are NaN or infinite, expected "
-            "finite ones: leave out what is masked"
-        )
-
-
-def frame_of(view: ArrayLike) -> Float64Array:
-    """Return the orthonormal frame about a view, rows right, up, view; identity for +z.
-
-    Parameters
-    ----------
-    view : array_like, shape (3,)
-        Of any length above 0.
-
-    Raises
-    ------
-    SphereLightsError
-        For a view that points nowhere.
-    """
-    v = np.asarray(view, np.float64)
-    most = float(np.abs(v).max()) if v.shape == (3,) else np.nan
-    if not 0.0 < most < np.inf:
-        raise SphereLightsError(f"view: got {v.tolist()}, expected a finite vector of 3, not 0")
-    v = v / most
-    v /= np.linalg.norm(v)
-    up = np.array([0.0, 1.0, 0.0]) if abs(v[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
-    right = np.cross(up, v)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(v, right), v])
-
-
-def normal_at(place: Float64Array) -> Float64Array:
-    """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
-
-    The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
-
-    Raises
-    ------
-    SphereLightsError
-        For places that are not finite.
-
-    Examples
-    --------
-    >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
-    [0.866, 0.0, 0.5]
-    """
-    _require_finite("place", place)
-    length = np.hypot(place[..., :1], place[..., 1:])
-    seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
-    square = np.minimum(length, np.sqrt(2.0)) ** 2
-    return np.concatenate([seen * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
-
-
-def place_of(normal: Float64Array) -> Float64Array:
-    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
-
-    Raises
-    ------
-    SphereLightsError
-        For normals that are not finite.
-    """
-    _require_finite("normal", normal)
-    return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))
-
-
 def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> Float64Array:
     """Return what facets that mirror each light into the view send through the analyser, (L,).
 
@@ -262,7 +84,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
         For a view that is no unit vector or within 0.06 degrees of the analyser's axis, or a
         refractive index outside 1...4.
     """
-    view, eta = _unit_vectors("view", np.asarray(view, np.float64)[None])[0], _index(eta)
+    view, eta = require_unit_vectors("view", np.asarray(view, np.float64)[None])[0], _index(eta)
     if abs(float(view @ np.asarray(lights.analyser))) > 1.0 - 5e-7:
         raise SphereLightsError(
             f"view: got {view.tolist()}, the axis {list(lights.analyser)} of the analyser:"
@@ -336,7 +158,9 @@ def diffuse(lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = F
 
 
 def _direction(view: ArrayLike) -> tuple[float, ...]:
-    return tuple(float(x) for x in _unit_vectors("view", np.asarray(view, np.float64)[None])[0])
+    return tuple(
+        float(x) for x in require_unit_vectors("view", np.asarray(view, np.float64)[None])[0]
+    )
 
 
 def _index(eta: float) -> float:
@@ -385,7 +209,7 @@ def _cached(
     lights, frame = _lights(key), frame_of(view)
     matte = np.isnan(alpha)
     step = 0.05 if matte else float(np.clip(alpha / 4.0, FINEST, COARSEST))
-    lines = int(np.ceil(REACH / step)) + MARGIN
+    lines = int(np.ceil(TABLE_REACH / step)) + MARGIN_LINES
     axis = step * np.arange(-lines, lines + 1)
     places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     # beyond the horizon's side of the disc: as at its end, so that splines stay calm
@@ -393,17 +217,17 @@ def _cached(
     places = places * np.minimum(1.0, 1.38 / np.maximum(length, 1e-9))
     normals = normal_at(places) @ frame
     see = _matte_sums(lights, frame, eta) if matte else _glossy_sums(lights, frame, alpha, eta)
-    layers = np.empty((len(places), LAYERS + (FIELD_LAYERS if near else 0)))
+    layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
         shift = np.zeros(3)
-        layers[part, :LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
+        layers[part, :TABLE_LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
         for k in (0, 1) if near else ():
             ends = [
                 _layers(lights, frame, see(normals[part], sign * FIELD_MM * frame[k]), not matte)
                 for sign in (-1.0, 1.0)
             ]
-            layers[part, LAYERS + 2 * k : LAYERS + 2 * k + 2] = (
+            layers[part, TABLE_LAYERS + 2 * k : TABLE_LAYERS + 2 * k + 2] = (
                 ends[1][:, :2] - ends[0][:, :2]
             ) / (2.0 * FIELD_MM)
         if alpha_stderr > 0.0:
@@ -455,8 +279,7 @@ def _glossy_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: f
 
     def each(normals: Float64Array, point_mm: Float64Array) -> Float64Array:
         ways, strength = _local(lights, point_mm)
-        half = ways + view
-        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+        half = unit_vectors(ways + view, min_length=1e-9)
         mu_l, mu_v, mu_h = normals @ ways.T, normals @ view, normals @ half.T
         lobe = microfacet.facet_density(mu_h, alpha)
         lobe *= microfacet.visibility(mu_l, mu_v[:, None], alpha)
@@ -496,13 +319,13 @@ def _layers(
     axes = axes @ frame.T
     full = each.sum(axis=1)
     vector = each @ axes
-    place, slope = seen(vector, mirror)
+    place, slope = direction_from_moments(vector, mirror)
     some = np.maximum(lights.intensities, 1e-300)
     doubt = (lights.intensity_stderr / some) ** 2
     if mirror:
         passing = np.maximum(np.abs(1.0 - lights.leakage), 1e-9)
         doubt = doubt + (lights.leakage_stderr / passing) ** 2
-    out = np.zeros((len(each), LAYERS))
+    out = np.zeros((len(each), TABLE_LAYERS))
     out[:, [F_X, F_Y]] = place
     out[:, SCALE] = full
     out[:, CONCENTRATION] = np.linalg.norm(vector, axis=1) / np.maximum(full, 1e-300)
@@ -514,7 +337,7 @@ def _layers(
     return out
 
 
-def seen(vector: Float64Array, mirror: bool) -> tuple[Float64Array, Float64Array]:
+def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64Array, Float64Array]:
     """Return the place that a moment vector points at, and its derivative by the vector.
 
     Parameters
@@ -534,7 +357,7 @@ def seen(vector: Float64Array, mirror: bool) -> tuple[Float64Array, Float64Array
     SphereLightsError
         For vectors that are not finite.
     """
-    _require_finite("vector", vector)
+    require_finite("vector", vector)
     size = np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
     n = vector / size
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]

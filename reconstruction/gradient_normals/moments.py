@@ -9,22 +9,22 @@ from typing import Any, Literal
 import numpy as np
 
 from reconstruction.arrays import Float64Array, FloatArray
-from reconstruction.gradient_normals import kernels
+from reconstruction.gradient_normals import moment_kernels
 from reconstruction.gradient_normals.noise import SensorNoise, estimate_noise
 from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, Stack, require
 from reconstruction.gradient_normals.wiener import filtered
 
 TILE_PIXELS = 65_536
-_VALUES = slice(kernels.C_0, kernels.V_0)
-_SPREAD = slice(kernels.V_0, kernels.CHI)
-_VARIANCES = (
-    (kernels.V_0, 0, 0),
-    (kernels.V_XX, 1, 1),
-    (kernels.V_YY, 2, 2),
-    (kernels.V_ZZ, 3, 3),
-    (kernels.V_XY, 1, 2),
-    (kernels.V_XZ, 1, 3),
-    (kernels.V_YZ, 2, 3),
+_VALUE_ROWS = slice(moment_kernels.C_0, moment_kernels.V_0)
+_VARIANCE_ROWS = slice(moment_kernels.V_0, moment_kernels.CHI)
+_VARIANCE_PAIRS = (
+    (moment_kernels.V_0, 0, 0),
+    (moment_kernels.V_XX, 1, 1),
+    (moment_kernels.V_YY, 2, 2),
+    (moment_kernels.V_ZZ, 3, 3),
+    (moment_kernels.V_XY, 1, 2),
+    (moment_kernels.V_XZ, 1, 3),
+    (moment_kernels.V_YZ, 2, 3),
 )
 """Rows of variances, and which moments they are of."""
 REACH_SIGMA = 3.5
@@ -101,8 +101,10 @@ class Reflection:
             return parallel, crossed
         k = self.leakage / (1.0 - self.leakage)
         cleaned = crossed.copy()
-        cleaned[_VALUES] -= k * (parallel[_VALUES] - crossed[_VALUES])
-        cleaned[_SPREAD] = (1.0 + k) ** 2 * crossed[_SPREAD] + k**2 * parallel[_SPREAD]
+        cleaned[_VALUE_ROWS] -= k * (parallel[_VALUE_ROWS] - crossed[_VALUE_ROWS])
+        cleaned[_VARIANCE_ROWS] = (1.0 + k) ** 2 * crossed[_VARIANCE_ROWS] + k**2 * parallel[
+            _VARIANCE_ROWS
+        ]
         if self.clean is not None:
             self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
@@ -113,14 +115,14 @@ class Reflection:
             return
         lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
         a, b = (np.sqrt(share) for share in self.shares)
-        for row, i, j in _VARIANCES:
+        for row, i, j in _VARIANCE_PAIRS:
             first[row] *= a[i] * a[j]
             if second is not first:
                 first[row] += b[i] * b[j] * second[row]
                 second[row] = 0.0
         for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
-            moments[_VALUES] = clean[:, rows].reshape(4, -1)
-            moments[: kernels.CHI, lost] = np.nan
+            moments[_VALUE_ROWS] = clean[:, rows].reshape(4, -1)
+            moments[: moment_kernels.CHI, lost] = np.nan
 
     def _of(self, stack: Stack, rows: slice, sigma: float) -> FloatArray:
         taps = _taps(sigma).astype(self.kind)
@@ -129,7 +131,7 @@ class Reflection:
         y = stack.samples(slice(start, stop), self.kind)
         noise = stack.variances(slice(start, stop), self.kind)
         height, width = y.shape[1:]
-        out = np.empty((kernels.MOMENT_ROWS, height * width), self.kind)
+        out = np.empty((moment_kernels.MOMENT_ROWS, height * width), self.kind)
         # a view that repeats itself keeps doing so
         flat = (
             np.broadcast_to(noise[:, :1, 0], (len(y), height * width))
@@ -137,11 +139,11 @@ class Reflection:
             else noise.reshape(len(y), -1)
         )
         gain, read = (self.noise.gain, self.noise.read_variance) if self.noise else (0.0, 1.0)
-        kernels.moments(y.reshape(len(y), -1), flat, gain, read, self.told, stack.dark, out)
+        moment_kernels.moments(y.reshape(len(y), -1), flat, gain, read, self.told, stack.dark, out)
         if reach:
             _smooth(out.reshape(-1, height, width), taps)
         inner = out.reshape(-1, height, width)[:, rows.start - start : rows.stop - start]
-        return np.ascontiguousarray(inner).reshape(kernels.MOMENT_ROWS, -1)
+        return np.ascontiguousarray(inner).reshape(moment_kernels.MOMENT_ROWS, -1)
 
 
 def _taps(sigma: float) -> Float64Array:
@@ -155,17 +157,17 @@ def _taps(sigma: float) -> Float64Array:
 
 def _smooth(moments: FloatArray, taps: FloatArray) -> None:
     """Smooth moments (MOMENT_ROWS, H, W) in place over their valid pixels; variances follow."""
-    mask = np.isfinite(moments[kernels.C_0])
+    mask = np.isfinite(moments[moment_kernels.C_0])
     if not mask.any():
         return
     line, found = np.empty_like(moments[0]), np.empty_like(moments[0])
     share = np.empty_like(moments[0])
-    kernels.smooth(np.ones_like(share), taps, mask, share, line)
+    moment_kernels.smooth(np.ones_like(share), taps, mask, share, line)
     share[~mask] = 1.0
     squared = taps * taps
-    for row in range(kernels.CHI):
-        mean = row < kernels.V_0
-        kernels.smooth(moments[row], taps if mean else squared, mask, found, line)
+    for row in range(moment_kernels.CHI):
+        mean = row < moment_kernels.V_0
+        moment_kernels.smooth(moments[row], taps if mean else squared, mask, found, line)
         moments[row] = found / share if mean else found / share**2
         moments[row][~mask] = np.nan
 
@@ -258,9 +260,11 @@ def with_filter(reflection: Reflection) -> Reflection:
     count = 0
     for rows in reflection.tiles():
         for number, moments in enumerate(reflection.moments(rows)[: len(raw)]):
-            raw[number][:, rows] = moments[_VALUES].reshape(4, -1, width)
+            raw[number][:, rows] = moments[_VALUE_ROWS].reshape(4, -1, width)
             good = np.isfinite(moments[0])
-            noise[number] += moments[kernels.V_0 : kernels.V_ZZ + 1][:, good].sum(axis=1)
+            noise[number] += moments[moment_kernels.V_0 : moment_kernels.V_ZZ + 1][:, good].sum(
+                axis=1
+            )
             count += int(good.sum()) if number == 0 else 0
     noise /= max(count, 1)
     valid = np.isfinite(raw[0][0]) & np.isfinite(raw[-1][0])

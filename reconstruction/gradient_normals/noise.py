@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.arrays import Float64Array, FloatArray
-from reconstruction.gradient_normals.patterns import PATTERNS, GradientError, Stack, design
+from reconstruction.gradient_normals.patterns import PATTERN_NAMES, GradientError, Stack, design
 
 _CHI_MEDIAN = 0.4549364  # of the square of a standard normal variable
 
@@ -61,9 +61,9 @@ def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
     for stack in stacks.values():
         step = max(1, int(np.prod(stack.shape)) // 100_000)
         rows = slice(0, None, max(1, min(step, stack.shape[0] // 16)))
-        y = stack.samples(rows, np.float64).reshape(len(PATTERNS), -1)
+        y = stack.samples(rows, np.float64).reshape(len(PATTERN_NAMES), -1)
         for weights in _contrasts(stack):
-            used = [k for k in range(len(PATTERNS)) if weights[k]]
+            used = [k for k in range(len(PATTERN_NAMES)) if weights[k]]
             good = np.isfinite(y[used]).all(axis=0)
             if good.sum() < 16:
                 continue
@@ -81,15 +81,15 @@ def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
 
 def _contrasts(stack: Stack) -> list[Float64Array]:
     """Return weights (8,) of orthogonal sums of the pictures that hold nothing but noise."""
-    names: list[str] = [name for name in PATTERNS if name in stack.pictures]
+    names: list[str] = [name for name in PATTERN_NAMES if name in stack.pictures]
     if stack.redundant < 1:
         return []
     A = design(names, dark=stack.dark)
     left = np.linalg.svd(A)[0][:, A.shape[1] :]
     out = []
     for column in left.T:
-        weights = np.zeros(len(PATTERNS))
-        weights[[PATTERNS.index(name) for name in names]] = np.where(
+        weights = np.zeros(len(PATTERN_NAMES))
+        weights[[PATTERN_NAMES.index(name) for name in names]] = np.where(
             np.abs(column) > 1e-9, column, 0.0
         )
         out.append(weights)

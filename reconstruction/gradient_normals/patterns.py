@@ -18,8 +18,8 @@ from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 Key = tuple[str, str]
 
-PATTERNS: Final = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
-POLARIZERS: Final = ("parallel", "crossed")
+PATTERN_NAMES: Final = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
+POLARIZER_NAMES: Final = ("parallel", "crossed")
 
 
 class GradientError(ValueError):
@@ -63,11 +63,11 @@ class Stack:
         return redundancy(self.pictures)
 
     def samples(self, rows: slice, kind: Any) -> FloatArray:
-        """Return samples (8, h, W) in the order of :data:`PATTERNS`; NaN where there is none."""
+        """Return samples (8, h, W) in the order of :data:`PATTERN_NAMES`, NaN where missing."""
         _, width = self.shape
         height = len(range(*rows.indices(self.shape[0])))
-        out = np.full((len(PATTERNS), height, width), np.nan, kind)
-        for k, name in enumerate(PATTERNS):
+        out = np.full((len(PATTERN_NAMES), height, width), np.nan, kind)
+        for k, name in enumerate(PATTERN_NAMES):
             if name in self.pictures:
                 out[k] = self.pictures[name][rows]
                 if name in self.valid:
@@ -80,9 +80,9 @@ class Stack:
         """Return variances (8, h, W); 1 where no picture is, and a view where it can be."""
         height, width = len(range(*rows.indices(self.shape[0]))), self.shape[1]
         if self.variance is None:
-            return np.broadcast_to(np.ones(1, kind), (len(PATTERNS), height, width))
-        out = np.ones((len(PATTERNS), height, width), kind)
-        for k, name in enumerate(PATTERNS):
+            return np.broadcast_to(np.ones(1, kind), (len(PATTERN_NAMES), height, width))
+        out = np.ones((len(PATTERN_NAMES), height, width), kind)
+        for k, name in enumerate(PATTERN_NAMES):
             if name in self.pictures:
                 given = self.variance[name]
                 out[k] = given[rows] if given.ndim else given
@@ -110,7 +110,7 @@ def redundancy(names: Mapping[str, Any]) -> int:
     >>> redundancy(dict.fromkeys(["full", "x", "y", "z"])), redundancy(dict.fromkeys("xyz"))
     (0, -1)
     """
-    chosen = [name for name in PATTERNS if name in names]
+    chosen = [name for name in PATTERN_NAMES if name in names]
     dark = "dark" in chosen
     A = design(chosen, dark=dark)
     rank = int(np.linalg.matrix_rank(A)) if chosen else 0
@@ -128,12 +128,12 @@ def require(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
     """
     if redundancy(names) >= 0:
         return
-    lit = [name for name in PATTERNS if name in names and name != "dark"]
+    lit = [name for name in PATTERN_NAMES if name in names and name != "dark"]
     axes = [a for a in "xyz" if a not in lit and f"-{a}" not in lit]
     needs = [f"{a} or -{a}" for a in axes]
     if "full" not in lit and not any(a in lit and f"-{a}" in lit for a in "xyz"):
         needs.append("full, or a complement of one more pattern")
-    missing = [name for name in PATTERNS if name not in names]
+    missing = [name for name in PATTERN_NAMES if name not in names]
     raise MissingPatterns(
         f"patterns: {purpose} needs the {polarizer} pictures to tell full light and three"
         f" gradients; got {', '.join(lit) or 'none'}; missing {', '.join(missing)};"
@@ -193,7 +193,10 @@ def collect(
 def _known_key(key: Any) -> Key:
     if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(k, str) for k in key)):
         raise GradientError(f"patterns: got key {key!r}, expected (pattern, polarizer)")
-    for word, known, kind in ((key[0], PATTERNS, "pattern"), (key[1], POLARIZERS, "polarizer")):
+    for word, known, kind in (
+        (key[0], PATTERN_NAMES, "pattern"),
+        (key[1], POLARIZER_NAMES, "polarizer"),
+    ):
         if word not in known:
             near = difflib.get_close_matches(word, known, 1)
             hint = f"; did you mean {near[0]}?" if near else ""

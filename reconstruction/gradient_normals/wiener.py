@@ -15,7 +15,7 @@ from reconstruction.arrays import BoolArray, FloatArray
 
 PAD_PX = 24
 """Mirrored border, so that the ends of a picture do not meet."""
-BAND = 64
+SPECTRUM_BANDS = 64
 """A spectrum is averaged over about this part of its width, which it must be smooth over."""
 
 
@@ -76,7 +76,7 @@ def _pads(side: int) -> tuple[int, int]:
 
 def _averaged(power: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Average the half spectrum of a real picture over bands of frequencies, periodically."""
-    rows, columns = (max(3, side // BAND) | 1 for side in shape)
+    rows, columns = (max(3, side // SPECTRUM_BANDS) | 1 for side in shape)
     half = columns
     # the missing half is the other one's mirror image, rows turned too
     turned = np.roll(power[::-1], 1, axis=0)

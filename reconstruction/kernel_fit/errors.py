@@ -23,22 +23,22 @@ from reconstruction.kernel_fit.neutral_relief import Relief
 from reconstruction.kernel_fit.search import Buckets, Found
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.block_errors import LEAST_BLOCKS
+from reconstruction.normal_histogram.block_errors import MIN_BLOCKS
 
-DRAWS = 200
+N_DRAWS = 200
 """Histograms drawn for the standard errors."""
-MOST_DRAWN = 64
+MAX_DRAWN = 64
 """Nearly-as-good kernels among which each draw finds its best."""
-DRAWN_WITHIN = 3.0
+DRAWN_SIGMAS = 3.0
 """They are taken from within so many standard errors of the distance."""
-MOST_PAIRED = 140
+MAX_PAIRED = 140
 """The same of histograms of one piece of skin."""
 PAIRED_PX = 1_000_000
-"""Of maps with more normals the valley is shorter, and fewer are taken, down to `MOST_DRAWN`: on
+"""Of maps with more normals the valley is shorter, and fewer are taken, down to `MAX_DRAWN`: on
 1000 x 1000 pixels each takes 0.02 s."""
-PAIRED_WITHIN = 4.0
+PAIRED_SIGMAS = 4.0
 """The same of histograms of one piece of skin, whose valley is wider than their scatter."""
-WITHIN = 0.6827, 0.95
+INTERVAL_COVERAGES = 0.6827, 0.95
 """Shares of draws within the half widths of intervals that are told."""
 GAUSSIAN_95 = 1.959964
 """Half width of a Gaussian's interval of the second share over that of the first."""
@@ -111,7 +111,7 @@ def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -
         The kernel; sigma in um.
     """
     shape = (relief.code.shape[0], relief.code.shape[1])
-    blocks = normal_blocks.BLOCKS
+    blocks = normal_blocks.BLOCKS_PER_SIDE
     group, groups = normal_blocks.block_of(relief.places, shape, blocks)
     da, db = relief.change(sigma_um)
     a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
@@ -187,13 +187,13 @@ def widths_of_best(
     rng
         Draws the histograms.
     """
-    near = nearly_as_good(found, alphas, sigmas_um, DRAWN_WITHIN * noise)
-    some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
+    near = nearly_as_good(found, alphas, sigmas_um, DRAWN_SIGMAS * noise)
+    some = near[np.unique(np.linspace(0, len(near) - 1, MAX_DRAWN).round().astype(int))]
     gap = found.shares(relief, buckets, sigmas_um, alphas, some) - buckets.target
     used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
     gap, scatter = gap[:, used], scatter[:, used]
-    best = np.empty(DRAWS, int)
-    for draw in range(DRAWS):
+    best = np.empty(N_DRAWS, int)
+    for draw in range(N_DRAWS):
         moved = rng.standard_normal(len(scatter)) @ scatter
         best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
     return _widths(alphas, sigmas_um, some, best)
@@ -229,21 +229,21 @@ def widths_of_pair(
         None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
     """
     shape = (relief.code.shape[0], relief.code.shape[1])
-    group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS)
+    group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS_PER_SIDE)
     ours = np.bincount(group, minlength=groups)
     both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
-    if len(both) < LEAST_BLOCKS:
+    if len(both) < MIN_BLOCKS:
         return None
     theirs = normal_blocks.residuals_of(target_blocks[both])
-    factors = rng.standard_normal((DRAWS, len(both)))
+    factors = rng.standard_normal((N_DRAWS, len(both)))
     factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
     factors = factors.astype(np.float32)
-    near = nearly_as_good(found, alphas, sigmas_um, PAIRED_WITHIN * noise)
+    near = nearly_as_good(found, alphas, sigmas_um, PAIRED_SIGMAS * noise)
     # dense about the best, sparse where hardly a draw comes
-    most = max(MOST_DRAWN, min(MOST_PAIRED, MOST_PAIRED * PAIRED_PX // relief.places.size))
+    most = max(MAX_DRAWN, min(MAX_PAIRED, MAX_PAIRED * PAIRED_PX // relief.places.size))
     steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
     some = near[np.unique(steps.round().astype(int))]
-    distance = np.empty((DRAWS, len(some)), np.float32)
+    distance = np.empty((N_DRAWS, len(some)), np.float32)
     for i in np.unique(some[:, 0]).tolist():
         da, db = relief.change(float(sigmas_um[i]))
         for column in np.flatnonzero(some[:, 0] == i).tolist():
@@ -283,7 +283,7 @@ def _widths(
     """Return quantiles of how far draws' best kernels are from the best, which is the first."""
     i, j = some[best].T
     ways = np.abs([alphas[j] - alphas[some[0, 1]], sigmas_um[i] - sigmas_um[some[0, 0]]])
-    (alpha, sigma), (alpha_95, sigma_95) = np.quantile(ways, WITHIN, axis=1).tolist()
+    (alpha, sigma), (alpha_95, sigma_95) = np.quantile(ways, INTERVAL_COVERAGES, axis=1).tolist()
     return HalfWidths(
         (alpha, max(alpha_95, GAUSSIAN_95 * alpha)), (sigma, max(sigma_95, GAUSSIAN_95 * sigma))
     )

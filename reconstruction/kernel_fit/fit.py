@@ -29,7 +29,7 @@ from reconstruction.kernel_fit.search import Buckets
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
 
-ALPHAS = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
+ALPHA_GRID = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
 """The paper's grid of strengths, by 0.01."""
 SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
@@ -157,7 +157,7 @@ def fit_kernel(
     return fit_relief(
         relief,
         Buckets(target, bins, float(limit)),
-        ALPHAS if alphas is None else alphas,
+        ALPHA_GRID if alphas is None else alphas,
         SIGMAS_UM if sigmas_um is None else sigmas_um,
         search=search,
         target_samples=target_samples,
@@ -199,7 +199,7 @@ def fit_relief(
             relief, buckets, strengths, widths, first_sample=first_sample, rng=rng
         )
     with kernels.threads_for(500 * relief.places.size):
-        return kernel_outcome.described(
+        return kernel_outcome.summarize_search(
             relief,
             buckets,
             strengths,
@@ -240,7 +240,7 @@ def _blocks(
         return None
     parts = np.asarray(counts, np.float64)
     shape = (relief.code.shape[0], relief.code.shape[1])
-    expected = (*normal_blocks.grid_of(shape, normal_blocks.BLOCKS), bins, bins)
+    expected = (*normal_blocks.grid_of(shape, normal_blocks.BLOCKS_PER_SIDE), bins, bins)
     if transposed and parts.ndim == 4:
         parts = parts.transpose(1, 0, 3, 2)
     if parts.shape != expected:

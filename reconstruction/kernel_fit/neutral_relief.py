@@ -76,7 +76,7 @@ class Relief:
         """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
         a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
         right, down = np.float32(self.right_um), np.float32(self.down_um)
-        kernels.leans(height, self.code, self.starts, right, down, a, b)
+        kernels.negative_slopes(height, self.code, self.starts, right, down, a, b)
         return a, b
 
     def weights(self, sigma_um: float) -> Float32Array:

@@ -102,7 +102,7 @@ class KernelFit:
     reason: str = ""
 
 
-def described(
+def summarize_search(
     relief: Relief,
     buckets: Buckets,
     alphas: Float64Array,
@@ -201,7 +201,7 @@ def described(
         samples=samples,
         effective_samples=effective,
         search=search,
-        miss_probability=0.0 if found.exact.all() else kernel_search.MISS,
+        miss_probability=0.0 if found.exact.all() else kernel_search.MAX_MISS_PROBABILITY,
         passes=found.passes,
         reason=reason,
     )
@@ -223,7 +223,7 @@ def _refined(
         change = relief.change(float(sigma))
         found = buckets.distances((relief.along, relief.across), change, fine_alpha)
         k = int(np.argmin(found))
-        if found[k] < result[2] - kernel_search.TIE:
+        if found[k] < result[2] - kernel_search.TIE_TOL:
             result = (float(fine_alpha[k]), float(sigma), float(found[k]))
     return result
 

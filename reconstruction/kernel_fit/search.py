@@ -11,7 +11,7 @@ With s chosen before they are drawn, a mean over m pixels drawn without replacem
 above the mean of all by more than ``sqrt(2 ln(1/p) (1 - (m - 1) / M) / m)`` with a chance of at
 most p (Serfling 1974). s is the sign of H - h, of the kernel itself on the pixels drawn before, or
 of a nearby kernel on all pixels. p is so small that over all tests of a search the chance of
-dropping the best kernel is at most `MISS`.
+dropping the best kernel is at most `MAX_MISS_PROBABILITY`.
 
 References
 ----------
@@ -31,21 +31,21 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int32Ar
 from reconstruction.kernel_fit.neutral_relief import Relief
 from reconstruction.normal_histogram import kernels
 
-MISS = 1e-6
+MAX_MISS_PROBABILITY = 1e-6
 """Chance at most that a hierarchical search drops the exhaustive search's result."""
-ROUNDING = 2e-4
+DISTANCE_ROUNDING = 2e-4
 """Distance granted to rounding: on samples, sums of single precision are taken in another order."""
-TIE = 1e-12
+TIE_TOL = 1e-12
 """Distances that differ by less are tied."""
 FIRST_SAMPLE = 16_384
-GROWTH = 5.6
+SAMPLE_GROWTH = 5.6
 """From one sample to the next. On 2000 x 2000 pixels these took the fewest evaluations of what was
 tried, with samples whose neighbourhoods stay below `WINDOW_BYTES`."""
-LARGEST_SAMPLE = 0.35
+MAX_SAMPLE_FRACTION = 0.35
 """Share of all pixels from which all are taken."""
 WINDOW_BYTES = 300_000_000
 """Most memory for the neighbourhoods of sampled pixels; beyond, whole maps are convolved."""
-ANCHORS = 6
+N_ANCHORS = 6
 """Kernels evaluated on all pixels between two samples."""
 KEPT_BYTES = 100_000_000
 """Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
@@ -166,7 +166,7 @@ def gentlest(
             f"distance: got shape {distance.shape} for {sigmas_um.size} sigmas and {alphas.size} "
             "alphas, expected one distance a kernel, of one kernel at least"
         )
-    i, j = np.nonzero(distance <= distance.min() + TIE)
+    i, j = np.nonzero(distance <= distance.min() + TIE_TOL)
     order = np.lexsort((-alphas[j], sigmas_um[i], np.abs(alphas[j])))
     return int(i[order[0]]), int(j[order[0]])
 
@@ -193,7 +193,7 @@ def hierarchical(
     first_sample: int = FIRST_SAMPLE,
     rng: np.random.Generator,
 ) -> Found:
-    """Find what :func:`exhaustive` does, but for a chance of `MISS`; see the module's text.
+    """Find what :func:`exhaustive` does, but for a chance of `MAX_MISS_PROBABILITY`.
 
     Parameters
     ----------
@@ -202,16 +202,18 @@ def hierarchical(
     alphas, sigmas_um : ndarray, shapes (A,), (S,)
         The grid.
     first_sample : int
-        Pixels that all kernels are evaluated on; grows by `GROWTH` from one round to the next.
+        Pixels that all kernels are evaluated on; grows by `SAMPLE_GROWTH` from one round to the
+        next.
     rng
-        Draws the pixels. The result does not depend on it, but for the chance `MISS`.
+        Draws the pixels. The result does not depend on it, but for the chance
+        `MAX_MISS_PROBABILITY`.
     """
     pixels = relief.places.size
-    if first_sample >= LARGEST_SAMPLE * pixels:
+    if first_sample >= MAX_SAMPLE_FRACTION * pixels:
         return exhaustive(relief, buckets, alphas, sigmas_um)
     sizes = [first_sample]
-    while sizes[-1] * GROWTH < LARGEST_SAMPLE * pixels:
-        sizes.append(int(sizes[-1] * GROWTH))
+    while sizes[-1] * SAMPLE_GROWTH < MAX_SAMPLE_FRACTION * pixels:
+        sizes.append(int(sizes[-1] * SAMPLE_GROWTH))
     with kernels.threads_for(first_sample * alphas.size * sigmas_um.size):
         return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
 
@@ -238,8 +240,8 @@ class _Race:
     def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
         pixels = self.relief.places.size
         order = rng.permutation(pixels)[: sizes[-1]]
-        tests = self.low.size * len(sizes) * (1 + ANCHORS)
-        log = math.log(tests / MISS)
+        tests = self.low.size * len(sizes) * (1 + N_ANCHORS)
+        log = math.log(tests / MAX_MISS_PROBABILITY)
         before = sizes[0] // 2
         for number, size in enumerate(sizes):
             if not self._open.any():
@@ -256,7 +258,7 @@ class _Race:
             if both.any():
                 excess[number] = np.median((self.guess - self.distance)[both])
             elif number:
-                excess[number] = excess[number - 1] / math.sqrt(GROWTH)
+                excess[number] = excess[number - 1] / math.sqrt(SAMPLE_GROWTH)
         distance = np.where(self.exact, self.distance, self.guess - excess[self.level])
         distance[~self.exact] = np.maximum(distance[~self.exact], self.distance[best])
         return Found(distance, self.exact, best, self.passes, self.counts)
@@ -271,7 +273,10 @@ class _Race:
         pixels, m = relief.places.size, chosen.size
         rest, fresh = pixels - before, m - before
         # Serfling's bound, of the mean over what was not drawn before
-        slack = math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels + ROUNDING
+        slack = (
+            math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels
+            + DISTANCE_ROUNDING
+        )
         signs = np.array(self.signs).reshape(-1, target.size)
         start = relief.along[chosen], relief.across[chosen]
         old = start[0][:before], start[1][:before]
@@ -297,7 +302,7 @@ class _Race:
         rows = np.flatnonzero(self._open.any(axis=1))
         if rows.size == 0:
             return
-        spread = np.linspace(0, rows.size - 1, ANCHORS - 1).round().astype(int)
+        spread = np.linspace(0, rows.size - 1, N_ANCHORS - 1).round().astype(int)
         for i in np.unique(rows[spread]).tolist():
             if self._open[i].any():
                 j = int(np.argmin(np.where(self._open[i], self.guess[i], np.inf)))

@@ -27,13 +27,13 @@ from scipy.special import fdtrc
 from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
 from reconstruction.arrays import BoolArray, Float64Array
 
-LEAST_POINTS = 2
+MIN_POINTS = 2
 """Points that inform a line of alpha, at least; its ends and the neutral kernel count."""
 BREAK_GRID = 24
 """Places tried for a break, beside the points', before it is moved in finer steps."""
-NEUTRAL = 1e-6
+NEUTRAL_STRETCH_TOL = 1e-6
 """Stretch ratios nearer to 1 are neutral: they tell nothing of either branch."""
-LEAST_SIGMA_UM = 1.0
+MIN_SIGMA_UM = 1.0
 """The smallest sigma that Nagano2015 searches, section 5."""
 
 
@@ -91,7 +91,7 @@ def fit_table(
     *,
     weights: ArrayLike | None = None,
     max_segments: int = 2,
-    least_points: int = LEAST_POINTS,
+    least_points: int = MIN_POINTS,
     source: str = "fitted",
 ) -> TableFit:
     """Fit a table of kernels to kernels fitted at single stretch ratios.
@@ -139,7 +139,7 @@ def fit_table(
             f"point {int(np.argmin(good))}: got NaN, or a value beyond r > 0, "
             f"{ALPHA_LIMITS[0]} <= alpha <= {ALPHA_LIMITS[1]}, sigma > 0"
         )
-    told = (np.abs(r - 1.0) > NEUTRAL) & (w > 0).all(axis=1)
+    told = (np.abs(r - 1.0) > NEUTRAL_STRETCH_TOL) & (w > 0).all(axis=1)
     r, a, s, w = r[told], a[told], s[told], w[told]
     low, high = r < 1.0, r > 1.0
     for name, side in (("compression", low), ("stretching", high)):
@@ -326,7 +326,7 @@ def _fit_sigma(
 ) -> tuple[tuple[float, float] | None, tuple[float, float], float, float]:
     """Return line, standard errors, covariance and weighted RMS residual of one branch, um.
 
-    The line is not below `LEAST_SIGMA_UM` between r = 1 and the outermost point. Where that binds,
+    The line is not below `MIN_SIGMA_UM` between r = 1 and the outermost point. Where that binds,
     the standard errors are those of the line without the bound.
     """
     if r.size == 0:
@@ -337,9 +337,9 @@ def _fit_sigma(
     line = C @ (X.T @ (w * s))
     far = float(r[np.argmax(np.abs(r - 1.0))])
     ends = np.array([[1.0, 1.0], [far, 1.0]])
-    if (ends @ line < LEAST_SIGMA_UM).any():
+    if (ends @ line < MIN_SIGMA_UM).any():
         root, to_line = np.sqrt(w), np.linalg.inv(ends)
-        held = lsq_linear(root[:, None] * X @ to_line, root * s, (LEAST_SIGMA_UM, np.inf))
+        held = lsq_linear(root[:, None] * X @ to_line, root * s, (MIN_SIGMA_UM, np.inf))
         line = to_line @ held.x
     rss = float(np.sum(w * (X @ line - s) ** 2))
     rms = math.sqrt(rss / w.sum())

@@ -21,7 +21,7 @@ from reconstruction.kernel_fit.fit import fit_kernel
 from reconstruction.kernel_fit.neutral_relief import Axis, KernelFitError, convolved
 from reconstruction.kernel_fit.outcome import KernelFit
 
-STARTS = ((0.0, 1.0), (0.6, 15.0), (-0.6, 15.0), (1.0, 30.0), (-1.5, 8.0))
+START_KERNELS = ((0.0, 1.0), (0.6, 15.0), (-0.6, 15.0), (1.0, 30.0), (-1.5, 8.0))
 """alpha and sigma_um across the jaws that fits begin with."""
 
 
@@ -60,7 +60,7 @@ def fit_two_axes(
     pixel_um: float | tuple[float, float],
     valid: ArrayLike | None = None,
     most_rounds: int = 6,
-    starts: Sequence[tuple[float, float]] = STARTS,
+    starts: Sequence[tuple[float, float]] = START_KERNELS,
     **settings: Any,
 ) -> TwoAxisFit:
     """Fit (alpha, sigma) along the jaws and across them, in turn until neither changes.

@@ -16,12 +16,12 @@ from scipy.linalg import solve_triangular
 
 from reconstruction.arrays import Float64Array
 
-REACHES = (0.5, 1.0, 1.5, 2.0)
+CORRELATION_LENGTHS = (0.5, 1.0, 1.5, 2.0)
 """Lengths over which blocks are alike, in sides of a block; of eight blocks across a map. Fields
 longer than a quarter of the map are little scatter in it: their share cannot be told from it."""
-SHARES = (0.0, 0.3, 0.6, 0.8, 0.95)
+CORRELATED_FRACTIONS = (0.0, 0.3, 0.6, 0.8, 0.95)
 """Of the blocks' variance, what neighbors have in common."""
-LEAST_BLOCKS = 5
+MIN_BLOCKS = 5
 """Fewer tell neither how they scatter nor how they are alike."""
 
 
@@ -42,10 +42,10 @@ def stderr_of_mean(
     Returns
     -------
     stderr : float
-        In the values' unit; infinite below `LEAST_BLOCKS`.
+        In the values' unit; infinite below `MIN_BLOCKS`.
     growth : float
         Variance over that of blocks that have nothing in common, at least 1; 1 below
-        `LEAST_BLOCKS`.
+        `MIN_BLOCKS`.
 
     Examples
     --------
@@ -56,7 +56,7 @@ def stderr_of_mean(
     (True, True)
     """
     count = len(values)
-    if count < LEAST_BLOCKS:
+    if count < MIN_BLOCKS:
         return math.inf, 1.0
     if np.ptp(values) == 0.0:
         return 0.0, 1.0
@@ -64,10 +64,10 @@ def stderr_of_mean(
     own = np.diag(sizes.mean() / sizes)
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     logs, variances = [], []
-    for reach in REACHES:
+    for reach in CORRELATION_LENGTHS:
         alike = np.exp(-((apart / reach) ** 2))
-        for share in SHARES:
-            if share == 0.0 and reach != REACHES[0]:
+        for share in CORRELATED_FRACTIONS:
+            if share == 0.0 and reach != CORRELATION_LENGTHS[0]:
                 continue  # without a field its reach does not matter
             correlation = share * alike + (1.0 - share) * own
             lower = np.linalg.cholesky(correlation + 1e-9 * np.eye(count))
@@ -77,7 +77,7 @@ def stderr_of_mean(
             rest = seen - one * (one @ seen) / information
             scatter = float(rest @ rest)
             # the case without a field stands for all reaches
-            log = np.log(len(REACHES)) if share == 0.0 else 0.0
+            log = np.log(len(CORRELATION_LENGTHS)) if share == 0.0 else 0.0
             log -= float(np.log(np.diag(lower)).sum()) + 0.5 * np.log(information)
             logs.append(log - 0.5 * (count - 1) * np.log(scatter))
             variances.append(scatter / (count - 3) * float(weights @ correlation @ weights))

@@ -11,7 +11,7 @@ from reconstruction.normal_histogram.block_errors import stderr_of_mean
 from reconstruction.normal_histogram.counting import HistogramError, check_buckets
 from reconstruction.normal_histogram.relief_slopes import slopes, turned
 
-BLOCKS = 8
+BLOCKS_PER_SIDE = 8
 """A map is cut into so many blocks a side."""
 
 

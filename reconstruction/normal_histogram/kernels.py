@@ -15,28 +15,28 @@ import numba
 import numpy as np
 from numba import njit, prange
 
-BLOCK = 4096
+BLOCK_SAMPLES = 4096
 """Samples whose slopes stay in the cache while all alphas pass over them."""
-LANES = 64
+SUM_LANES = 64
 """Buckets whose sums are taken side by side."""
-MOST_THREADS = 8
+MAX_THREADS = 8
 """Each thread holds a histogram of every alpha (5 MB at 301 and 64 x 64)."""
 
 
-SMALL = 100_000_000
+MIN_PARALLEL_NORMALS = 100_000_000
 """Normals computed in all, below which one thread is sooner done than several are brought in."""
 
 
 def threads() -> int:
     """Return into how many parts the samples are cut."""
-    return min(int(numba.get_num_threads()), MOST_THREADS)
+    return min(int(numba.get_num_threads()), MAX_THREADS)
 
 
 @contextmanager
 def threads_for(work: int) -> Iterator[None]:
     """Keep to one thread while ``work`` normals are computed, if they are few."""
     before = numba.get_num_threads()
-    if work < SMALL:
+    if work < MIN_PARALLEL_NORMALS:
         numba.set_num_threads(1)
     try:
         yield
@@ -104,7 +104,9 @@ def count_in_groups(p: Any, q: Any, group: Any, groups: Any, bins: Any, limit: A
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def leans(height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b: Any) -> None:
+def negative_slopes(
+    height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b: Any
+) -> None:
     """Write minus the slopes of the samples, row by row, into `a` and `b`.
 
     Parameters
@@ -168,7 +170,7 @@ def windows(
     Parameters
     ----------
     height, code, right, down
-        As of `leans`.
+        As of `negative_slopes`.
     places : (m,) int64
         Pixels, y * W + x.
     along, across : (blocks, R, B) float32, written
@@ -206,7 +208,7 @@ def windows(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def weighed(along: Any, across: Any, weights: Any, da: Any, db: Any) -> None:
-    """Write the sums of windows over k, weighed: what `leans` of G * h - h are at the samples."""
+    """Write the weighted sums of windows over k: `negative_slopes` of G * h - h at the samples."""
     blocks, _, size = along.shape
     for block in prange(blocks):
         count = min(size, da.size - block * size)
@@ -246,10 +248,10 @@ def count_kernels(
     most, scale = np.float32(limit), np.float32(bins / (2.0 * limit))
     counts = np.zeros((parts, alphas.size, bins * bins + 1), np.int32)
     for part in prange(parts):
-        bucket = np.empty(BLOCK, np.int32)
+        bucket = np.empty(BLOCK_SAMPLES, np.int32)
         end = (part + 1) * n // parts
-        for start in range(part * n // parts, end, BLOCK):
-            size = min(BLOCK, end - start)
+        for start in range(part * n // parts, end, BLOCK_SAMPLES):
+            size = min(BLOCK_SAMPLES, end - start)
             A, B = a0[start : start + size], b0[start : start + size]
             dA, dB = da[start : start + size], db[start : start + size]
             for j in range(alphas.size):
@@ -321,11 +323,11 @@ def bounds(
     grown = (pixels - before) / fresh
     for j in prange(kinds):
         # sums of every LANES-th bucket, so that neighbours are added at once; then the sums' sums
-        total, own = np.zeros(LANES), np.zeros(LANES)
-        lows = np.zeros((signs.shape[0], LANES))
-        x, y, gap = np.empty(LANES), np.empty(LANES), np.empty(LANES)
-        for begin in range(0, cells, LANES):
-            size = min(LANES, cells - begin)
+        total, own = np.zeros(SUM_LANES), np.zeros(SUM_LANES)
+        lows = np.zeros((signs.shape[0], SUM_LANES))
+        x, y, gap = np.empty(SUM_LANES), np.empty(SUM_LANES), np.empty(SUM_LANES)
+        for begin in range(0, cells, SUM_LANES):
+            size = min(SUM_LANES, cells - begin)
             x[:] = 0.0
             y[:] = 0.0
             for part in range(parts):

@@ -14,7 +14,12 @@ from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.blocks import BLOCKS, block_error, block_of, effective_number
+from reconstruction.normal_histogram.blocks import (
+    BLOCKS_PER_SIDE,
+    block_error,
+    block_of,
+    effective_number,
+)
 from reconstruction.normal_histogram.counting import check_buckets, shares_of
 from reconstruction.normal_histogram.relief_slopes import (
     SlopeError,
@@ -77,7 +82,7 @@ def measure(
     y_up: bool = True,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
-    blocks: int = BLOCKS,
+    blocks: int = BLOCKS_PER_SIDE,
 ) -> NormalStatistics:
     """Return the histogram of a relief's normals, its noise and the normals' variances.
 
@@ -118,7 +123,7 @@ def measure_normals(
     limit: float = 1.0,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
-    blocks: int = BLOCKS,
+    blocks: int = BLOCKS_PER_SIDE,
 ) -> NormalStatistics:
     """Return what :func:`measure` does, of a map of normals.
 

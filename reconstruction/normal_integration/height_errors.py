@@ -18,8 +18,8 @@ from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
 from reconstruction.normal_maps import NormalMaps
 
-_STEP = 1e-3  # of the difference quotient, in standard errors
-_TOLERANCE = 1e-3
+_DIFFERENCE_STEP = 1e-3  # of the difference quotient, in standard errors
+_SOLVER_TOL = 1e-3
 
 
 def sampled_stderr(
@@ -82,7 +82,11 @@ def sampled_stderr(
         n, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
     )
     length = np.linalg.norm(np.where(base.valid[..., None], n, 0.0), axis=-1)
-    spread = _STEP / np.sqrt(2.0) * np.broadcast_to(np.asarray(stderr_rad, float), length.shape)
+    spread = (
+        _DIFFERENCE_STEP
+        / np.sqrt(2.0)
+        * np.broadcast_to(np.asarray(stderr_rad, float), length.shape)
+    )
     spread = np.where(base.valid, spread, 0.0) * length
     ax, ay, dx, dy = slope_fields.edges(base)
     hierarchy = Hierarchy(ax, ay)
@@ -96,7 +100,13 @@ def sampled_stderr(
         )
         _, _, ex, ey = slope_fields.edges(moved)
         x = np.zeros(ex.shape)
-        solve(hierarchy, (ex - dx) / _STEP, (ey - dy) / _STEP, x, tolerance=_TOLERANCE)
+        solve(
+            hierarchy,
+            (ex - dx) / _DIFFERENCE_STEP,
+            (ey - dy) / _DIFFERENCE_STEP,
+            x,
+            tolerance=_SOLVER_TOL,
+        )
         error: FloatArray = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera) - flat
         if cutoff is not None:
             error = high_pass(error, pixel=pixel, cutoff=cutoff, valid=base.valid)

@@ -14,7 +14,7 @@ from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
 SIGMA_OF_CUTOFF = float(np.sqrt(np.log(2.0) / 2.0) / np.pi)
 """Standard deviation of the Gaussian over the wavelength it halves (ISO 16610-21: 0.18739)."""
-_REACH = 4.0  # standard deviations at which the Gaussian ends
+_TRUNCATE_SIGMAS = 4.0  # standard deviations at which the Gaussian ends
 
 
 def high_pass(
@@ -82,7 +82,7 @@ def high_pass(
 
 
 def _without_planes(values: FloatArray, inside: BoolArray, sigma: float) -> FloatArray:
-    reach = max(1, int(np.ceil(_REACH * sigma)))
+    reach = max(1, int(np.ceil(_TRUNCATE_SIGMAS * sigma)))
     shape = values.shape
     kind = values.dtype
     size = [fft.next_fast_len(n + min(reach, n), real=True) for n in shape]

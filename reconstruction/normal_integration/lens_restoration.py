@@ -14,16 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
-MOST_GAIN = 4.0
+MAX_GAIN = 4.0
 """Waves are raised by this factor at most: what the lens weakens more is as good as lost."""
 SMOOTH_BINS = 2.0
 """Standard deviation by which the spectrum is smoothed, in bins of its own grid."""
 PAD_PX = 32
-LEAST_COSINE = 0.1
+MIN_COSINE = 0.1
 """Normals farther from the view than this are no measurement of a slope."""
-BEYOND = 1.03
+NOISE_CUTOFF_RATIO = 1.03
 """Of the cutoff: frequencies from here on hold noise alone."""
 
 
@@ -150,7 +151,7 @@ def restore(
     RestorationError
         Where no normal is valid, or pixels are so large that no frequency is beyond the lens.
     """
-    known = valid & (normals[..., 2] > LEAST_COSINE) & np.isfinite(normals).all(axis=-1)
+    known = valid & (normals[..., 2] > MIN_COSINE) & np.isfinite(normals).all(axis=-1)
     if not known.any():
         raise RestorationError("valid: got no pixel with a normal towards the view")
     z = np.where(known, normals[..., 2], 1.0)
@@ -166,7 +167,7 @@ def restore(
         -2.0 * (np.pi * smooth_px * lens.pixel_um) ** 2 * (per_um_x**2 + per_um_y**2)
     )
     power = sum(np.abs(s) ** 2 for s in spectra) / 2.0
-    beyond = np.hypot(per_um_x, per_um_y) * lens.cutoff_um > BEYOND
+    beyond = np.hypot(per_um_x, per_um_y) * lens.cutoff_um > NOISE_CUTOFF_RATIO
     if np.count_nonzero(beyond) < 16:
         raise RestorationError(
             f"pixel_um: got {lens.pixel_um:g}, expected below half of the lens's cutoff period "
@@ -180,13 +181,12 @@ def restore(
     signal = np.maximum(even - noise_power * smoothing**2, 0.0)
     share = np.where(even > 0, signal / np.where(even > 0, even, 1.0), 0.0)
     blur = through * smoothing
-    gain = np.minimum(1.0 / np.maximum(blur, 1e-6), MOST_GAIN)
+    gain = np.minimum(1.0 / np.maximum(blur, 1e-6), MAX_GAIN)
     wiener = np.where(beyond, 0.0, share * gain)
     restored = [
         np.where(known, filtered(s, wiener) + m, 0.0) for s, m in zip(slopes, means, strict=True)
     ]
-    found = np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1)
-    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    found = unit_vectors(np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1))
     found[~known] = (0.0, 0.0, 1.0)
     noise = math.sqrt(noise_power / power.size)
     applied = wiener * smoothing

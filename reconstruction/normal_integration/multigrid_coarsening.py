@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_FAST_MATH = {"reassoc", "contract", "nsz", "arcp"}
 EAST, SOUTH, SOUTHEAST, SOUTHWEST, INVERSE = range(5)
 """Planes of a coarse level: couplings to four of the eight neighbours, one over the diagonal."""
 RIGHT_0, RIGHT_1, BELOW_0, BELOW_1, MID_00, MID_01, MID_10, MID_11 = range(8)
 """Planes of interpolation by coarse node: to the fine node right of it, below it, and between."""
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def invert_diagonal(ax, ay, inverse):  # type: ignore[no-untyped-def]
     """Write one over the sum of each node's edges, 0 for nodes without any."""
     rows, columns = ax.shape
@@ -38,7 +38,7 @@ def _share(a, b):  # type: ignore[no-untyped-def]
     return max(a, np.float32(0.0)) / total, max(b, np.float32(0.0)) / total
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def interpolate_edges(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-untyped-def]
     """Write the interpolation weights of fine nodes between two coarse ones.
 
@@ -79,7 +79,7 @@ def interpolate_edges(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-u
                 P[BELOW_0, row, column], P[BELOW_1, row, column] = first, second
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-untyped-def]
     """Write the weights of fine nodes between four coarse ones, through their neighbours'."""
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -135,7 +135,7 @@ def _column(P, inverse, row, column, p):  # type: ignore[no-untyped-def]
     p[0, 0] = P[MID_11, row - 1, column - 1]
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def coarsen(e, s, se, sw, inverse, diagonals, P, coarse):  # type: ignore[no-untyped-def]
     """Write the coarse couplings P^T A P: its planes `EAST` ... `INVERSE`."""
     rows, columns = P.shape[1:]

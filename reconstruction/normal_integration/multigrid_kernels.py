@@ -31,10 +31,10 @@ from reconstruction.normal_integration.multigrid_coarsening import (
     SOUTHWEST,
 )
 
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_FAST_MATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def smooth_from_zero(ax, ay, inverse, b, x):  # type: ignore[no-untyped-def]
     """Write one sweep from x = 0 on the finest level: even nodes (i + j even), then odd ones."""
     rows, columns = b.shape
@@ -64,7 +64,7 @@ def _even_residual(ax, ay, inverse, b, x, i, r):  # type: ignore[no-untyped-def]
         )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def restrict_even(ax, ay, inverse, b, x, P, out):  # type: ignore[no-untyped-def]
     """Write P^T (b - A x) of the finest level, whose odd nodes have no residual."""
     rows, columns = out.shape
@@ -89,7 +89,7 @@ def restrict_even(ax, ay, inverse, b, x, P, out):  # type: ignore[no-untyped-def
             )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def prolong_even(P, coarse, inverse, x):  # type: ignore[no-untyped-def]
     """Add the coarse correction to the even nodes of the finest level."""
     rows, columns = coarse.shape
@@ -109,7 +109,7 @@ def prolong_even(P, coarse, inverse, x):  # type: ignore[no-untyped-def]
                     )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def smooth(ax, ay, inverse, b, x, odd):  # type: ignore[no-untyped-def]
     """Solve each node of one colour of the finest level for itself: odd 1 or 0."""
     rows, columns = b.shape
@@ -124,7 +124,7 @@ def smooth(ax, ay, inverse, b, x, odd):  # type: ignore[no-untyped-def]
             )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def smooth_coarse(A, b, x, first_row, first_column):  # type: ignore[no-untyped-def]
     """Solve two colours of a coarse level for themselves: every second row, both its colours.
 
@@ -170,7 +170,7 @@ def _coarse_residual(A, b, x, i, r):  # type: ignore[no-untyped-def]
         ) * (one if inverse > zero else zero)
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def restrict(A, b, x, P, out):  # type: ignore[no-untyped-def]
     """Write P^T (b - A x) of a coarse level, whose middle nodes have no residual."""
     rows, columns = out.shape
@@ -195,7 +195,7 @@ def restrict(A, b, x, P, out):  # type: ignore[no-untyped-def]
             )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def prolong(P, coarse, A, x):  # type: ignore[no-untyped-def]
     """Add the correction to a level's coarse nodes and to those between two of them."""
     rows, columns = coarse.shape
@@ -217,7 +217,7 @@ def prolong(P, coarse, A, x):  # type: ignore[no-untyped-def]
                 )
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def direction(z, p, beta, ax, ay, out, sums):  # type: ignore[no-untyped-def]
     """Write out = z + beta p and, by rows, out . A out; return nothing."""
     rows, columns = z.shape
@@ -232,7 +232,7 @@ def direction(z, p, beta, ax, ay, out, sums):  # type: ignore[no-untyped-def]
         sums[i] = total
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def advance(p, alpha, ax, ay, x, r, sums):  # type: ignore[no-untyped-def]
     """Add alpha p to x (float64), take alpha A p from r; write r . r by rows."""
     rows, columns = p.shape
@@ -253,7 +253,7 @@ def advance(p, alpha, ax, ay, x, r, sums):  # type: ignore[no-untyped-def]
         sums[i] = total
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def inner(a, b, sums):  # type: ignore[no-untyped-def]
     """Write a . b by rows."""
     rows, columns = a.shape
@@ -264,7 +264,7 @@ def inner(a, b, sums):  # type: ignore[no-untyped-def]
         sums[i] = total
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def residual(ax, ay, dx, dy, x, r, sums):  # type: ignore[no-untyped-def]
     """Write r = D^T a (d - D x) in float64 arithmetic; sums: its squares, and those of D^T a d."""
     rows, columns = x.shape

@@ -15,9 +15,9 @@ import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
-HEIGHT: Final = 0.07
+RELATIVE_HEIGHT_ERROR: Final = 0.07
 """Error of a height over the standard deviation of the relief."""
-SLOPE: Final = 0.055
+RELATIVE_SLOPE_ERROR: Final = 0.055
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
 
 
@@ -47,7 +47,7 @@ def of_height(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Flo
     """
     if not valid.any():
         return stderr
-    model = HEIGHT * float(np.std(height[valid], dtype=np.float64))
+    model = RELATIVE_HEIGHT_ERROR * float(np.std(height[valid], dtype=np.float64))
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
 
 
@@ -71,5 +71,5 @@ def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> F
     if not valid.any():
         return stderr
     across = np.var(normals[valid][:, :2], axis=0, dtype=np.float64)
-    model = SLOPE * float(np.sqrt(across.mean()))
+    model = RELATIVE_SLOPE_ERROR * float(np.sqrt(across.mean()))
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)

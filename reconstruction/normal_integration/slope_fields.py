@@ -18,11 +18,11 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatAr
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
-GRAZING = 0.02
+MIN_RAY_COSINE = 0.02
 """Least cosine between normal and ray of a pixel that is used: 88.9 degrees."""
-SPAN = 1e3
+MAX_STDERR_RATIO = 1e3
 """Standard errors count as at most so many times, and at least one over that of, their median."""
-_APART = 10.0
+_MAX_VARIANCE_RATIO = 10.0
 """Variance over that of an edge's own pixels from which pixels beyond them are not asked."""
 
 
@@ -99,7 +99,7 @@ def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid): 
             m = z + x * wx + y * wy
             w2 = 1.0 + wx * wx + wy * wy
             good = good and length2 > 0.0 and length2 < np.inf
-            good = good and m > 0.0 and m * m > GRAZING * GRAZING * length2 * w2
+            good = good and m > 0.0 and m * m > MIN_RAY_COSINE * MIN_RAY_COSINE * length2 * w2
             valid[i, j] = good
             if not good:
                 gx[i, j], gy[i, j], facing[i, j] = 0.0, 0.0, 0.0
@@ -197,7 +197,7 @@ def _relative_variance(
     if sigma.ndim == 0:
         return np.ones((1, 1), np.float32), middle**2
     with np.errstate(invalid="ignore"):
-        within = np.clip(sigma / middle, 1.0 / SPAN, SPAN)
+        within = np.clip(sigma / middle, 1.0 / MAX_STDERR_RATIO, MAX_STDERR_RATIO)
     return (within * within).astype(np.float32), middle**2
 
 
@@ -227,8 +227,8 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
                 before = smooth and j > 0 and valid[i, j - 1]
                 after = smooth and j + 2 < columns and valid[i, j + 2]
                 if weighted:
-                    before = before and vx[i, j - 1] < _APART * v
-                    after = after and vx[i, j + 2] < _APART * v
+                    before = before and vx[i, j - 1] < _MAX_VARIANCE_RATIO * v
+                    after = after and vx[i, j + 2] < _MAX_VARIANCE_RATIO * v
                 ax[i + 1, j + 1] = np.float32(2.0) / v
                 dx[i + 1, j + 1] = _difference(
                     gx[i, j - 1] if before else 0.0,
@@ -243,8 +243,8 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
                 before = smooth and i > 0 and valid[i - 1, j]
                 after = smooth and i + 2 < rows and valid[i + 2, j]
                 if weighted:
-                    before = before and vy[i - 1, j] < _APART * v
-                    after = after and vy[i + 2, j] < _APART * v
+                    before = before and vy[i - 1, j] < _MAX_VARIANCE_RATIO * v
+                    after = after and vy[i + 2, j] < _MAX_VARIANCE_RATIO * v
                 ay[i + 1, j + 1] = np.float32(2.0) / v
                 dy[i + 1, j + 1] = _difference(
                     gy[i - 1, j] if before else 0.0,

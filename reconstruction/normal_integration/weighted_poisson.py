@@ -16,12 +16,12 @@ from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.normal_integration import multigrid_coarsening as coarsening
 from reconstruction.normal_integration import multigrid_kernels as kernels
 
-COARSEST = 6
+COARSEST_SIDE = 6
 """Nodes a side at which a grid is not made coarser any more."""
 _COARSEST_SWEEPS = 12
-_SMALL = 1 << 16
+_MIN_PARALLEL_NODES = 1 << 16
 """Nodes of a level below which one thread does it."""
-_REDUCTION = 1e-4
+_RESIDUAL_REDUCTION = 1e-4
 """Of the residual by float32 steps, before it is computed anew."""
 
 
@@ -68,7 +68,7 @@ class Hierarchy:
         none = np.zeros((1, 1), np.float32)
         e, s, se, sw, inv, diagonals = ax, ay, none, none, inverse, False
         rows, columns = ax.shape[0] - 2, ax.shape[1] - 2
-        while max(rows, columns) > COARSEST:
+        while max(rows, columns) > COARSEST_SIDE:
             rows, columns = (rows + 1) // 2, (columns + 1) // 2
             shape = (rows + 2, columns + 2)
             P = np.zeros((8, *shape), np.float32)
@@ -104,7 +104,7 @@ class Hierarchy:
     def _coarse_cycle(self, depth: int) -> None:
         level = self.levels[depth]
         threads = get_num_threads()
-        if threads > 1 and level.b.size < _SMALL:
+        if threads > 1 and level.b.size < _MIN_PARALLEL_NODES:
             set_num_threads(1)  # waiting for one another would take longer than the work
             try:
                 self._coarse_cycle(depth)
@@ -167,14 +167,16 @@ def solve(
         if found <= tolerance or done >= iterations or not found < 0.5 * before:
             return Convergence(done, found, found <= tolerance)
         # r is rounded: what it gains in constants must stay small beside it
-        goal = max(0.9 * tolerance * given, _REDUCTION * norm)
+        goal = max(0.9 * tolerance * given, _RESIDUAL_REDUCTION * norm)
         left, rz = norm, 0.0
         while done < iterations:
             hierarchy.cycle(r, z)
             kernels.inner(r, z, sums)
             old, rz = rz, float(sums.sum())
             energy = energy or rz
-            enough = rz <= max(tolerance**2 * energy, (_REDUCTION * norm / given) ** 2 * energy)
+            enough = rz <= max(
+                tolerance**2 * energy, (_RESIDUAL_REDUCTION * norm / given) ** 2 * energy
+            )
             if not rz > 0.0 or (left <= goal and enough):
                 break
             kernels.direction(z, p, np.float32(rz / old if old > 0.0 else 0.0), ax, ay, q, sums)

@@ -21,6 +21,7 @@ from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
 from reconstruction.photometric_stereo.refinement import refine
+from reconstruction.photometric_stereo.solver_kernels import Settings
 from reconstruction.tiles import map_tiles
 
 __all__ = [
@@ -34,16 +35,16 @@ __all__ = [
 
 
 TILE_POINTS = 8192
-LEAST_SHARE = 0.5
+MIN_AGREEING_FRACTION = 0.5
 """Of the samples that are not dark, how many must agree with a robust fit."""
-TIGHT = 0.02
+TIGHT_RESIDUAL = 0.02
 """Standard deviation of a robust fit's residuals, over a bright sample, up to which it stands as
 it is: real matte surfaces depart from Lambert's law by more."""
-CLEAR = 0.2
+CLEAR_OUTLIER_RESIDUAL = 0.2
 """Residual over a bright sample from which a sample is a clear outlier."""
-LOOSE = 0.15
-"""Standard deviation as of `TIGHT` that asks for one more clear outlier as evidence."""
-FLATTEST = 3e-3
+LOOSE_RESIDUAL = 0.15
+"""Standard deviation as of `TIGHT_RESIDUAL` that asks for one more clear outlier as evidence."""
+MIN_SINGULAR_RATIO = 3e-3
 """Least over largest singular value of the light directions, below which they lie in a plane."""
 
 
@@ -91,6 +92,27 @@ class Robustness:
                 raise PhotometricStereoError(
                     f"Robustness.{name}: got {getattr(self, name)}, expected {expected}"
                 )
+
+    def settings(self, kind: Any) -> Settings:
+        """Return the limits of a fit in the data's type."""
+        limits = Settings(
+            shadow=self.shadow,
+            grazing=self.grazing,
+            tuning=self.tuning,
+            tolerance=1e-3,
+            floor=1e-6 if kind is np.float32 else 1e-13,
+            l1_soft=0.01,
+            min_spread=1e-5,
+            bright_part=1 / 8,
+            dark_sigmas=3.0,
+            dark_fit=1.5,
+            min_agreeing=MIN_AGREEING_FRACTION,
+            few=self.few,
+            tight=TIGHT_RESIDUAL,
+            clear=CLEAR_OUTLIER_RESIDUAL,
+            loose=LOOSE_RESIDUAL,
+        )
+        return Settings(*(kind(limit) for limit in limits))
 
 
 def estimate_normals(
@@ -192,29 +214,10 @@ def estimate_normals(
     way, geometry = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
     strength = _strength(light_intensity, geometry if way == kernels.NEAR else None, lights, shape)
     chosen = robustness or Robustness()
-    settings = np.array(
-        [
-            chosen.shadow,
-            chosen.grazing,
-            chosen.tuning,
-            1e-3,
-            1e-6 if kind is np.float32 else 1e-13,
-            0.01,
-            1e-5,
-            1 / 8,
-            3.0,
-            1.5,
-            LEAST_SHARE,
-            chosen.few,
-            TIGHT,
-            CLEAR,
-            LOOSE,
-        ],
-        kind,
-    )
+    settings = chosen.settings(kind)
     count = int(np.prod(shape))
     flat = samples.reshape(lights, count)
-    out = np.empty((count, kernels.ROWS), kind)
+    out = np.empty((count, kernels.RESULT_ROWS), kind)
     good = np.empty(count, bool)
     noise = _per_sample("variance", variance, lights, shape)
     mask = _usable(valid, lights, shape)
@@ -247,7 +250,7 @@ def estimate_normals(
     out[~good] = 0.0
     out[~good, kernels.STDERR] = np.pi
     out[~good, kernels.STDERR_ALBEDO] = np.inf
-    maps = out.reshape(*shape, kernels.ROWS)
+    maps = out.reshape(*shape, kernels.RESULT_ROWS)
     return NormalMaps(
         normals=np.ascontiguousarray(maps[..., :3]),
         albedo=maps[..., kernels.ALBEDO].copy(),
@@ -329,7 +332,7 @@ def require_spread(directions: FloatArray) -> None:
         Where no normal follows from lights in these directions.
     """
     *_, singular, axes = np.linalg.svd(np.asarray(directions, np.float64), full_matrices=True)
-    least = FLATTEST * singular[0]
+    least = MIN_SINGULAR_RATIO * singular[0]
     if len(singular) < 3 or singular[2] < least:
         unseen = axes[np.count_nonzero(singular >= least) :]
         ways = " and ".join(str(tuple(round(float(v), 2) + 0.0 for v in axis)) for axis in unseen)

@@ -19,10 +19,10 @@ from reconstruction.arrays import BoolArray, FloatArray, Int32Array
 from reconstruction.tiles import map_tiles
 
 TILE_POINTS = 2048
-BRIGHTEST = 4
+N_BRIGHTEST = 4
 """Samples of one view whose directions are interpolated; the paper's number."""
 OUTLIER_SIGMAS = 3.0
-LEAST_SPREAD_RAD = math.radians(1.0)
+MIN_SPREAD_RAD = math.radians(1.0)
 """Views closer than this to the others' middle are no outliers, however well those agree."""
 
 
@@ -160,7 +160,7 @@ def _half_vectors(values, light_dir, view_dir, view, valid, best, which, half): 
         if not (valid[k] and value > 0.0 and value < math.inf):
             continue
         row = view[k]
-        place = BRIGHTEST - 1
+        place = N_BRIGHTEST - 1
         if value <= best[row, place]:
             continue
         while place > 0 and best[row, place - 1] < value:
@@ -171,10 +171,10 @@ def _half_vectors(values, light_dir, view_dir, view, valid, best, which, half): 
         which[row, place] = k
     found = 0
     for row in range(best.shape[0]):
-        if which[row, BRIGHTEST - 1] < 0:
+        if which[row, N_BRIGHTEST - 1] < 0:
             continue
         x = y = z = 0.0
-        for place in range(BRIGHTEST):
+        for place in range(N_BRIGHTEST):
             k = which[row, place]
             x += best[row, place] * light_dir[k, 0]
             y += best[row, place] * light_dir[k, 1]
@@ -199,8 +199,8 @@ def _angle(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _estimate(values, light_dir, view_dir, view, valid, views, normals, stderr, used):  # type: ignore[no-untyped-def]
-    best = np.empty((views, BRIGHTEST), np.float64)
-    which = np.empty((views, BRIGHTEST), np.int64)
+    best = np.empty((views, N_BRIGHTEST), np.float64)
+    which = np.empty((views, N_BRIGHTEST), np.int64)
     half = np.empty((views, 3), np.float64)
     angles = np.empty(views, np.float64)
     for p in range(values.shape[0]):
@@ -220,7 +220,7 @@ def _estimate(values, light_dir, view_dir, view, valid, views, normals, stderr, 
             angles[i] = _angle(half[i], half[middle])
         # the median of the others' distances; 1.18 makes it a standard deviation in two dimensions
         ordered = np.sort(angles[:found])
-        spread = max(ordered[(found + 1) // 2] / 1.1774, LEAST_SPREAD_RAD)
+        spread = max(ordered[(found + 1) // 2] / 1.1774, MIN_SPREAD_RAD)
         x = y = z = 0.0
         kept = 0
         for i in range(found):

@@ -13,172 +13,35 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, types, void
 
-BLOCK = 32
+from reconstruction.photometric_stereo.solver_kernels import (
+    FAST_MATH,
+    Settings,
+    kth_largest,
+    noise_of,
+    plain_fit,
+    residuals_of,
+    step_biweight,
+    step_l1,
+    step_squares,
+)
+
+BLOCK_POINTS = 32
 """Points gathered at once: rows of a stack are read in whole cache lines."""
-LANES = 32
+LIGHT_LANES = 32
 """Lights are filled up to a multiple with samples of no strength: vector loops have no rest."""
 SHARED, PER_POINT, NEAR = 0, 1, 2
 """How light vectors are given: one a light, one a light and point, or positions."""
 
-# Row of the table of settings, which carries them in the type of the data.
-SHADOW, GRAZING, TUKEY, TOLERANCE, FLOOR, L1_SOFT = 0, 1, 2, 3, 4, 5
-MIN_SPREAD, BRIGHT_PART, DARK_SIGMAS, DARK_FIT, LEAST_SHARE = 6, 7, 8, 9, 10
-FEW, TIGHT, CLEAR, LOOSE = 11, 12, 13, 14
 # Rows of the table of results.
 NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
-ROWS = 9
+RESULT_ROWS = 9
 
-# Reordered sums, but NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
-_FASTER = _FAST | {"nnan", "ninf"}  # where nothing but finite numbers can come
 TUKEY_EFFICIENCY = 0.95  # of the biweight with c = 4.685 at the normal distribution
-VAGUE_RAD = 0.5
+MAX_STDERR_RAD = 0.5
 """Standard error from which a signal drowns in its noise."""
-_MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
-_BISECTIONS = 10
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
-def _solve(a, g):  # type: ignore[no-untyped-def]
-    """Solve the symmetric system a = (xx, xy, xz, yy, yz, zz), g, in float64; singular gives 0."""
-    xx, xy, xz, yy, yz, zz = a
-    cxx = yy * zz - yz * yz
-    cxy = xz * yz - xy * zz
-    cxz = xy * yz - xz * yy
-    det = xx * cxx + xy * cxy + xz * cxz
-    trace = xx + yy + zz
-    if not det > 1e-18 * trace * trace * trace:
-        return 0.0, 0.0, 0.0
-    cyy = xx * zz - xz * xz
-    cyz = xy * xz - xx * yz
-    czz = xx * yy - xy * xy
-    one = 1.0 / det
-    return (
-        one * (cxx * g[0] + cxy * g[1] + cxz * g[2]),
-        one * (cxy * g[0] + cyy * g[1] + cyz * g[2]),
-        one * (cxz * g[0] + cyz * g[1] + czz * g[2]),
-    )
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
-    """Return the Newton step of sum m |r| with |r| rounded off below ``soft``."""
-    zero = x.dtype.type(0.0)
-    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for k in range(x.size):
-        xk, yk, zk = x[k], y[k], z[k]
-        r = v[k] - (xk * b0 + yk * b1 + zk * b2)
-        w = m[k] / max(abs(r), soft)
-        wx, wy, wz = w * xk, w * yk, w * zk
-        xx += wx * xk
-        xy += wx * yk
-        xz += wx * zk
-        yy += wy * yk
-        yz += wy * zk
-        zz += wz * zk
-        gx += wx * r
-        gy += wy * r
-        gz += wz * r
-    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
-    return _solve(a, (float(gx), float(gy), float(gz)))
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
-    """Return the step to the least squares of the samples chosen by m."""
-    zero = x.dtype.type(0.0)
-    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for k in range(x.size):
-        xk, yk, zk = x[k], y[k], z[k]
-        r = v[k] - (xk * b0 + yk * b1 + zk * b2)
-        wx, wy, wz = m[k] * xk, m[k] * yk, m[k] * zk
-        xx += wx * xk
-        xy += wx * yk
-        xz += wx * zk
-        yy += wy * yk
-        yz += wy * zk
-        zz += wz * zk
-        gx += wx * r
-        gy += wy * r
-        gz += wz * r
-    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
-    return _solve(a, (float(gx), float(gy), float(gz)))
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignore[no-untyped-def]
-    """Return the step of Tukey's biweight over the samples that the fit itself sees lit."""
-    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
-    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for k in range(x.size):
-        xk, yk, zk = x[k], y[k], z[k]
-        fit = xk * b0 + yk * b1 + zk * b2
-        r = v[k] - fit
-        t = max(one - r * r * per_reach2, zero)
-        w = t * t if fit > least * s[k] else zero
-        wx, wy, wz = w * xk, w * yk, w * zk
-        xx += wx * xk
-        xy += wx * yk
-        xz += wx * zk
-        yy += wy * yk
-        yz += wy * zk
-        zz += wz * zk
-        gx += wx * r
-        gy += wy * r
-        gz += wz * r
-    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
-    return _solve(a, (float(gx), float(gy), float(gz)))
-
-
-@njit(cache=True, nogil=True, fastmath=_FASTER, error_model="numpy")
-def _kth_largest(q, rank):  # type: ignore[no-untyped-def]
-    """Return about the rank-th largest of the values above 0, from above."""
-    zero, one = q.dtype.type(0.0), q.dtype.type(1.0)
-    top = total = zero
-    for k in range(q.size):
-        top = max(top, q[k])
-        total += max(q[k], zero)
-    low, high = zero, min(top, total / q.dtype.type(rank))
-    half = q.dtype.type(0.5)
-    for _ in range(_BISECTIONS):
-        middle = half * (low + high)
-        count = zero
-        for k in range(q.size):
-            count += one if q[k] > middle else zero
-        if count >= rank:
-            low = middle
-        else:
-            high = middle
-    return high
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _residuals(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-untyped-def]
-    """Put |r| of the samples that are not dark into q, -1 for others; return their number.
-
-    Nor those that the fit does not see lit.
-    """
-    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
-    count = zero
-    for k in range(x.size):
-        fit = x[k] * b0 + y[k] * b1 + z[k] * b2
-        lit = (fit > least * s[k]) & (m[k] > zero)
-        q[k] = abs(v[k] - fit) if lit else -one
-        count += one if lit else zero
-    return int(count)
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _noise(q, count):  # type: ignore[no-untyped-def]
-    """Return the scale of residuals: their median without the three that any fit makes 0."""
-    if count < 4:
-        return q.dtype.type(0.0)
-    rank = count - (3 + (count - 3 + 1) // 2) + 1  # from the largest
-    # few residuals: Rousseeuw and Leroy (1987), chapter 5, eq. (1.3)
-    return _kth_largest(q, rank) / q.dtype.type(_MAD) * q.dtype.type(1.0 + 5.0 / (count - 3))
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
 def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
     """Sum what the standard errors need over the samples with weight; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
@@ -244,11 +107,11 @@ def _finish(  # type: ignore[no-untyped-def]
     length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
     if not (length > 0.0 and length < math.inf):
         return False
-    least = max(settings[GRAZING] * kind(length), above) if robust else -kind(math.inf)
-    reach = settings[TUKEY] * scale
+    least = max(settings.grazing * kind(length), above) if robust else -kind(math.inf)
+    reach = settings.tuning * scale
     per_reach2 = kind(1.0) / (reach * reach) if robust and reach > kind(0.0) else kind(0.0)
     used = _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums)
-    if used < 3 or (robust and sums[24] < float(settings[LEAST_SHARE]) * sums[23]):
+    if used < 3 or (robust and sums[24] < float(settings.min_agreeing) * sums[23]):
         return False
     xx, xy, xz, yy, yz, zz = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     dxx, dxy, dxz, dyy, dyz, dzz = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
@@ -261,7 +124,7 @@ def _finish(  # type: ignore[no-untyped-def]
         - dxy * (dxy * dzz - dyz * dxz)
         + dxz * (dxy * dyz - dyy * dxz)
     )
-    if not det > float(settings[MIN_SPREAD]) * minors * used:
+    if not det > float(settings.min_spread) * minors * used:
         return False
     nx, ny, nz = b0 / length, b1 / length, b2 / length
     free = used - 3
@@ -315,7 +178,7 @@ def _finish(  # type: ignore[no-untyped-def]
     if variance < math.inf:
         angle = math.sqrt(variance * across) / length
         error = math.sqrt(variance * max(along, 0.0))
-        if angle > VAGUE_RAD:
+        if angle > MAX_STDERR_RAD:
             return False
     elif free > 0:
         return False
@@ -327,27 +190,6 @@ def _finish(  # type: ignore[no-untyped-def]
     out[USED] = used
     out[SCALE] = scale
     return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _plain(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
-    """Return least squares with each sample weighed by the square of its intensity.
-
-    Leaves the weights' roots in e, intensities in q and the weights in m.
-    """
-    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
-    top = zero
-    for k in range(x.size):
-        q[k] = v[k] / s[k] if s[k] > zero else zero
-        top = max(top, q[k])
-    for k in range(x.size):
-        e[k] = min(max(q[k], zero) / top, one)
-        m[k] = e[k] * e[k]
-    b0, b1, b2 = zero, zero, zero
-    for _ in range(2):  # the second step refines the digits of the first
-        d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
-        b0, b1, b2 = x.dtype.type(b0 + d0), x.dtype.type(b1 + d1), x.dtype.type(b2 + d2)
-    return b0, b1, b2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -386,8 +228,8 @@ def _fit_point(  # type: ignore[no-untyped-def]
     for k in range(x.size):
         q[k] = v[k] / s[k] if m[k] > zero else -one
         e[k] = one
-    rank = min(n, max(4, int(n * settings[BRIGHT_PART]))) if robust else 1
-    bright = _kth_largest(q, rank)
+    rank = min(n, max(4, int(n * settings.bright_part))) if robust else 1
+    bright = kth_largest(q, rank)
     if not bright > zero:
         return False
     if not known and not robust:
@@ -398,12 +240,12 @@ def _fit_point(  # type: ignore[no-untyped-def]
             v[k], s[k] = v[k] * e[k], s[k] * e[k]
     if not robust:
         for _ in range(2):  # the second step refines the digits of the first
-            d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+            d0, d1, d2 = step_squares(x, y, z, v, m, b0, b1, b2)
             b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         return _finish(
             x, y, z, v, s, e, m, b0, b1, b2, one, zero, known, False, settings, sums, out
         )
-    dark = settings[SHADOW] * bright
+    dark = settings.shadow * bright
     # samples below zero are noise around a shadow, and as much of it lies above
     below, negative = 0, zero
     for k in range(x.size):
@@ -411,7 +253,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
             below += 1
             negative += q[k] * q[k]
     if below > 0:
-        dark = max(dark, settings[DARK_SIGMAS] * kind(math.sqrt(negative / kind(below))))
+        dark = max(dark, settings.dark_sigmas * kind(math.sqrt(negative / kind(below))))
     lit = 0
     for k in range(x.size):
         m[k] = one if q[k] > dark else zero
@@ -419,45 +261,45 @@ def _fit_point(  # type: ignore[no-untyped-def]
         lit += 1 if q[k] > dark else 0
     if lit < 3:
         return False
-    soft = settings[L1_SOFT] * bright * total / kind(lit)
+    soft = settings.l1_soft * bright * total / kind(lit)
     if known:
         soft = max(soft, one)
-    d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+    d0, d1, d2 = step_squares(x, y, z, v, m, b0, b1, b2)
     b0, b1, b2 = kind(d0), kind(d1), kind(d2)
-    near = settings[TOLERANCE] * settings[TOLERANCE]
+    near = settings.tolerance * settings.tolerance
     for _ in range(l1_steps):
-        d0, d1, d2 = _step_l1(x, y, z, v, m, b0, b1, b2, soft)
+        d0, d1, d2 = step_l1(x, y, z, v, m, b0, b1, b2, soft)
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         if d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
             break
-    floor = settings[FLOOR] * bright * total / kind(lit)
+    floor = settings.floor * bright * total / kind(lit)
     if known:
         floor = max(floor, one)
     # what the fit itself sees near the dark may be a shadow as well
-    above = settings[DARK_FIT] * dark
+    above = settings.dark_fit * dark
     scale = one
     for step in range(steps):
         length = kind(math.sqrt(b0 * b0 + b1 * b1 + b2 * b2))
-        least = max(settings[GRAZING] * length, above)
+        least = max(settings.grazing * length, above)
         if step % 2 == 0 and step < 4:
-            count = _residuals(x, y, z, v, s, m, b0, b1, b2, least, q)
-            scale = max(_noise(q, count), floor)
-        per_reach = one / (settings[TUKEY] * scale)
-        d0, d1, d2 = _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach * per_reach, least)
+            count = residuals_of(x, y, z, v, s, m, b0, b1, b2, least, q)
+            scale = max(noise_of(q, count), floor)
+        per_reach = one / (settings.tuning * scale)
+        d0, d1, d2 = step_biweight(x, y, z, v, s, b0, b1, b2, per_reach * per_reach, least)
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         if step > 2 and d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
             break
     done = _finish(x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, True, settings, sums, out)
     loose = scale * kind(lit) / (bright * total)
-    if known or not done or n >= settings[FEW] or loose <= settings[TIGHT]:
+    if known or not done or n >= settings.few or loose <= settings.tight:
         return done
     # few samples, and the robust fit is not much better than real surfaces are Lambertian: what
     # looks like an outlier may be chance, unless it is a clear one; more so the looser the fit
-    p0, p1, p2 = _plain(x, y, z, v, s, e, q, m)
-    clear = settings[CLEAR]
+    p0, p1, p2 = plain_fit(x, y, z, v, s, e, q, m)
+    clear = settings.clear
     gained = _clearly_off(x, y, z, s, q, p0, p1, p2, bright, clear)
     gained -= _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear)
-    if gained > one + loose / settings[LOOSE]:
+    if gained > one + loose / settings.loose:
         return done
     for k in range(x.size):
         m[k] = one if s[k] > zero else zero
@@ -497,21 +339,21 @@ def _fit_points(  # type: ignore[no-untyped-def]
     positions, points
         (N, 3) and (P, 3) mm; read when ``way`` is `NEAR`, where strength falls as 1 / d^2.
     settings
-        By row, see the names above, in the data's type.
+        Numbers in the data's type.
     out, valid
-        (P, ROWS) and (P,), written.
+        (P, RESULT_ROWS) and (P,), written.
     """
     kind = out.dtype.type
     lights, count = intensity.shape
     zero, one = kind(0.0), kind(1.0)
-    lanes = (lights + LANES - 1) // LANES * LANES
-    v = np.zeros((BLOCK, lanes), out.dtype)
-    s = np.zeros((BLOCK, lanes), out.dtype)
+    lanes = (lights + LIGHT_LANES - 1) // LIGHT_LANES * LIGHT_LANES
+    v = np.zeros((BLOCK_POINTS, lanes), out.dtype)
+    s = np.zeros((BLOCK_POINTS, lanes), out.dtype)
     x, y, z = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
     q, m, e = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
     sums = np.empty(25, np.float64)
-    for start in range(0, count, BLOCK):
-        size = min(BLOCK, count - start)
+    for start in range(0, count, BLOCK_POINTS):
+        size = min(BLOCK_POINTS, count - start)
         for k in range(lights):
             for p in range(size):
                 value = kind(intensity[k, start + p])
@@ -556,7 +398,7 @@ def _fit_points(  # type: ignore[no-untyped-def]
                         x[k], y[k], z[k] = dx * scale, dy * scale, dz * scale
                     else:
                         x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
-            for row in range(ROWS):
+            for row in range(RESULT_ROWS):
                 out[place, row] = zero
             valid[place] = _fit_point(
                 x,
@@ -599,7 +441,7 @@ def fit_points(kind: type[np.floating]) -> Any:
         boolean,
         int64,
         int64,
-        real[::1],
+        types.NamedUniTuple(real, len(Settings._fields), Settings),
         real[:, ::1],
         boolean[::1],
     )

@@ -13,16 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo.estimation import estimate_normals
 
 SAMPLE_POINTS = 1500
-DEAD = 0.05
+MIN_LIGHT_STRENGTH = 0.05
 """Strength, relative to the median light, below which a light gave none."""
-CLEARLY = 0.7
+ORDER_MISFIT_RATIO = 0.7
 """A different order is named when it leaves less than this part of the listed order's misfit."""
-FITS = 0.15
+MAX_SHADING_MISFIT = 0.15
 """Misfit over mean brightness up to which shading counts as explained."""
 
 
@@ -102,7 +103,7 @@ def check(
             for row, ok in zip(samples, usable, strict=True)
         ]
     )
-    dead = ~(top > DEAD * float(np.median(top)))
+    dead = ~(top > MIN_LIGHT_STRENGTH * float(np.median(top)))
     if np.count_nonzero(~dead) < 4:
         raise PhotometricStereoError(
             f"intensity: got light from {np.count_nonzero(~dead)} of {lights} lights, expected at"
@@ -114,10 +115,10 @@ def check(
         misfit[name] = _misfit(samples, directions[permutation], usable, dead)
     best = min(misfit, key=lambda name: misfit[name])
     listed = misfit["as listed"]
-    order = best if misfit[best] < CLEARLY * listed else "as listed"
+    order = best if misfit[best] < ORDER_MISFIT_RATIO * listed else "as listed"
     permutation = orders[order]
     strength = _strength(samples, directions[permutation], usable, dead)
-    if misfit[order] > FITS:
+    if misfit[order] > MAX_SHADING_MISFIT:
         order = "unknown"
     return LightCheck(order, permutation, misfit, strength, dead, samples.shape[1])
 
@@ -193,8 +194,9 @@ def _fit(
     """Return the shading fitted under living lights (N, P), and the points that have it."""
     alive = ~dead
     found = estimate_normals(samples[alive], directions[alive], valid=usable[alive], robust=True)
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.maximum(unit @ (found.normals * found.albedo[:, None]).T, 0.0), found.valid
+    return np.maximum(
+        unit_vectors(directions) @ (found.normals * found.albedo[:, None]).T, 0.0
+    ), found.valid
 
 
 def _misfit(

@@ -22,11 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array
 
-UNKNOWN_RAD = np.radians(10.0)
+UNKNOWN_ERROR_RAD = np.radians(10.0)
 """Error that a point without an estimate counts as: about what a scan's normals are off."""
-_VAGUE = 1e-6
+_PRIOR_INFORMATION = 1e-6
 """Information held before the first light: tilts and log albedo known to a thousand."""
 
 
@@ -163,8 +164,7 @@ def information(
     n = np.asarray(normals, np.float64)
     way = np.broadcast_to(np.asarray(to_light, np.float64), (len(n), *np.shape(to_light)[-2:]))
     helper = np.where(np.abs(n[:, [0]]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(n, helper)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    first = unit_vectors(np.cross(n, helper))
     second = np.cross(n, first)
     cosine = np.einsum("plk,pk->pl", way, n)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -278,13 +278,14 @@ def _start(found: Information, chosen: NDArray[np.intp]) -> Float64Array:
     """Return the information of these lights, (P, 3, 3)."""
     weight = found.weight[:, chosen]
     g = np.concatenate([found.tilt[:, chosen], np.ones((*weight.shape, 1))], axis=-1)
-    return np.asarray(np.einsum("pl,pli,plj->pij", weight, g, g) + _VAGUE * np.eye(3))
+    return np.asarray(np.einsum("pl,pli,plj->pij", weight, g, g) + _PRIOR_INFORMATION * np.eye(3))
 
 
 def _gains(found: Information, chosen: list[int], least: int) -> Float64Array:
     """Return by how much each light would lower the mean squared error of the points, (L,).
 
-    Points that too few lights reach count `UNKNOWN_RAD` and more, the more the fewer reach them, so
+    Points that too few lights reach count `UNKNOWN_ERROR_RAD` and more, the more the fewer reach
+    them, so
     that a light towards them is worth something before the last one comes.
     """
     at = np.asarray(chosen, np.intp)
@@ -296,7 +297,7 @@ def _gains(found: Information, chosen: list[int], least: int) -> Float64Array:
     drop = found.weight * np.sum(moved[..., :2] ** 2, -1) / (1.0 + found.weight * bend)
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]
     floor = np.square(found.systematic_rad)
-    unknown = UNKNOWN_RAD**2
+    unknown = UNKNOWN_ERROR_RAD**2
     now = _loss(0.5 * trace + floor, reached, least, unknown)
     then = _loss(
         0.5 * (trace[:, None] - drop) + floor[:, None],

@@ -9,6 +9,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.tiles import map_tiles
@@ -17,9 +18,9 @@ Predict = Callable[[Float64Array, Float64Array, Float64Array, NDArray[np.intp]],
 """(normals (P, 3), light_dir (P, M, 3), view_dir (P, M, 3), points (P,)) -> f_r (P, M), 1/sr."""
 
 TILE_SAMPLES = 500_000
-TUKEY = 4.685
-EFFICIENCY = 0.95  # of the biweight with that constant
-_MAD = 0.6744897501960817
+TUKEY_CONSTANT = 4.685
+TUKEY_EFFICIENCY = 0.95  # of the biweight with that constant
+_NORMAL_MAD = 0.6744897501960817
 _STEP_RAD = 1e-4  # of the one-sided difference quotients
 
 
@@ -143,8 +144,7 @@ def _dots(directions: Float64Array, normals: Float64Array) -> Float64Array:
 def _turned(
     normals: Float64Array, s: Float64Array, t: Float64Array, a: Float64Array, b: Float64Array
 ) -> Float64Array:
-    moved = normals + a[:, None] * s + b[:, None] * t
-    return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
+    return unit_vectors(normals + a[:, None] * s + b[:, None] * t)
 
 
 def _tangents(normals: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -180,8 +180,7 @@ def _refine_tile(
     samples = np.where(good, samples, 0.0)
     length = np.linalg.norm(start, axis=-1)
     begun = np.isfinite(length) & (length > 0)
-    n = np.where(begun[:, None], start, [0.0, 0.0, 1.0])
-    n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+    n = unit_vectors(np.where(begun[:, None], start, [0.0, 0.0, 1.0]))
     first, factor = n, np.ones(len(n))
     unknowns = 3 if free_scale else 2
     known = noise is not None
@@ -194,7 +193,7 @@ def _refine_tile(
             factor = _ratio(samples, model, weight * seen)
         r = np.where(seen, (samples - factor[:, None] * model) * weight, 0.0)
         scale = _scale(r, seen, unknowns, 1.0 if known else 0.0)
-        u2 = np.square(r / (TUKEY * scale[:, None]))
+        u2 = np.square(r / (TUKEY_CONSTANT * scale[:, None]))
         w = np.where(seen & (u2 < 1), (1 - u2) ** 2, 0.0)
         s, t = _tangents(n)
         zero, h = np.zeros(len(n)), np.full(len(n), _STEP_RAD)
@@ -240,7 +239,7 @@ def _scale(r: Float64Array, seen: BoolArray, unknowns: int, least: float) -> Flo
     few = 1.0 + 5.0 / np.maximum(
         count - unknowns, 1
     )  # Rousseeuw and Leroy (1987), ch. 5, eq. (1.3)
-    scale = np.where(np.isfinite(middle), middle / _MAD * few, 1.0)
+    scale = np.where(np.isfinite(middle), middle / _NORMAL_MAD * few, 1.0)
     size = np.max(np.abs(r), axis=-1, initial=0.0)
     return np.maximum(np.maximum(scale, least), 1e-12 * size + 1e-300)
 
@@ -274,8 +273,8 @@ def _judged(
     slope = np.maximum(slope, 0.1)
     sigma2 = np.sum(psi**2, axis=-1) / free / slope**2  # Huber (1981), section 7.6
     if known:
-        beyond = (1.0 + 3.0 * np.sqrt(2.0 / free)) / EFFICIENCY
-        sigma2 = np.where(sigma2 > beyond, sigma2, 1.0 / EFFICIENCY)
+        beyond = (1.0 + 3.0 * np.sqrt(2.0 / free)) / TUKEY_EFFICIENCY
+        sigma2 = np.where(sigma2 > beyond, sigma2, 1.0 / TUKEY_EFFICIENCY)
     B = np.einsum("pm,pmi,pmj->pij", used.astype(np.float64), J, J)
     size = np.sqrt(np.maximum(np.einsum("pii->pi", B), 1e-300))
     correlation = B / (size[:, :, None] * size[:, None, :])

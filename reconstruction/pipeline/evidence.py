@@ -14,9 +14,9 @@ from typing import Any
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
-from reconstruction.pipeline.hold_out import NOTHING, HoldOut
+from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 
-TELL_S = 5.0
+PROGRESS_INTERVAL_S = 5.0
 """Seconds between two lines about the same stage."""
 
 
@@ -68,7 +68,7 @@ class Evidence:
     basis: Path | None = None
     landmarks: Path | None = None
     repeat: int | None = None
-    hold_out: HoldOut = NOTHING
+    hold_out: HoldOut = NO_HOLD_OUT
     rank: int | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
@@ -79,7 +79,7 @@ class Evidence:
     def tell(self, stage: str, done: float) -> None:
         """Say how far a stage is, 0 to 1, every few seconds at most."""
         now = time.monotonic()
-        if self.progress is not None and now - self._told_at >= TELL_S:
+        if self.progress is not None and now - self._told_at >= PROGRESS_INTERVAL_S:
             self._told_at = now
             self.progress(f"{stage}: {100 * done:.0f} %")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-FIELDS = ("lights", "views")
+FIELD_NAMES = ("lights", "views")
 
 
 class HoldOutError(ValueError):
@@ -45,7 +45,7 @@ class HoldOut:
             name, equals, first = word.partition("=")
             if equals:
                 field, word = name.strip(), first
-                if field not in FIELDS or field in lists:
+                if field not in FIELD_NAMES or field in lists:
                     raise HoldOutError(
                         f"hold-out: got {name.strip()!r} in {text!r}, expected "
                         "lights=NAMES,views=NAMES, each at most once"
@@ -87,7 +87,7 @@ class HoldOut:
         return {"lights": list(self.lights), "views": list(self.views)}
 
 
-NOTHING = HoldOut()
+NO_HOLD_OUT = HoldOut()
 """Every frame may be fitted to."""
 
 

@@ -13,22 +13,23 @@ import numpy as np
 from capture import raw
 from capture.session import Session
 from capture.session.frames import FrameRecord
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
 
-REVISION = 2
+STAGE_REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-MAPS = ("normals", "albedo", "residual")
+MAP_NAMES = ("normals", "albedo", "residual")
 """Maps that can be made of pictures with a light list."""
 
 MEMORY_BYTES = 2**30
 """Size of a stack from which on it lies in a file and not in memory."""
-UNEVEN = 0.2
+MAX_STRENGTH_DEVIATION = 0.2
 """Relative strength that a light may be off before it is named."""
 OUTLIER_SIGMAS = 4.0
 
@@ -63,7 +64,7 @@ class Lights:
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a session with a light list can go through; see `stages.run`."""
-    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     return [
         stages.Stage("stack", (), ("stack",), lambda: {"stack": _stack(evidence.session)}, base),
         stages.Stage(
@@ -158,7 +159,7 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )
-    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = unit_vectors(vectors)
     near = bool(listed.get("near", False))
     scale = float(listed.get("mm_per_px") or 1.0)
     alive = np.ones(len(vectors), bool)
@@ -185,11 +186,12 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
     alive = ~found.dead
     for number in np.flatnonzero(found.dead):
         evidence.assumed.append(f"light {number + 1} of the list gave no light and is left out")
-    off = np.flatnonzero(alive & (np.abs(found.strength - 1) > UNEVEN))
+    off = np.flatnonzero(alive & (np.abs(found.strength - 1) > MAX_STRENGTH_DEVIATION))
     if off.size and found.order != "unknown":
         worst = off[np.argmax(np.abs(found.strength[off] - 1))]
         evidence.assumed.append(
-            f"lights are of one strength, though {off.size} differ by more than {UNEVEN:.0%}, most"
+            f"lights are of one strength, though {off.size} differ by more than "
+            f"{MAX_STRENGTH_DEVIATION:.0%}, most"
             f" light {worst + 1} with {found.strength[worst]:.2f} of the middle one"
         )
     evidence.noted["light_check"] = {
@@ -254,13 +256,13 @@ def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, A
     return {
         "normals": SkinMap(
             n,
-            UNITS["normals"],
+            MAP_UNITS["normals"],
             np.where(valid[..., None], each, 0.0),
             valid,
             "picture frame: x right, y up, z towards the camera",
         ),
         "residual": SkinMap(
-            relative, UNITS["residual"], None, valid, "root mean square misfit over albedo"
+            relative, MAP_UNITS["residual"], None, valid, "root mean square misfit over albedo"
         ),
         "gray_albedo": best,
     }

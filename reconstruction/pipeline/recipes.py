@@ -41,44 +41,44 @@ class Recipe:
 
 
 def _flash() -> Recipe:
-    from reconstruction.pipeline.flash import sequence as stages_of
+    from reconstruction.pipeline.flash import sequence
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(
+        sequence.MAP_NAMES, sequence.graph, sequence.FILE_NAMES, products=sequence.products
+    )
 
 
 def _dome() -> Recipe:
-    from reconstruction.pipeline.dome import stages as stages_of
+    from reconstruction.pipeline.dome import stages as dome
 
     return Recipe(
-        stages_of.MAPS,
-        stages_of.graph,
-        stages_of.FILES,
-        ("position",),
-        maps_of_rank=stages_of.maps_of,
+        dome.MAP_NAMES, dome.graph, dome.FILE_NAMES, ("position",), maps_of_rank=dome.maps_of
     )
 
 
 def _gradient() -> Recipe:
-    from reconstruction.pipeline.gradient import stages as stages_of
+    from reconstruction.pipeline.gradient import stages as gradient
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(
+        gradient.MAP_NAMES, gradient.graph, gradient.FILE_NAMES, products=gradient.products
+    )
 
 
 def _probe() -> Recipe:
-    from reconstruction.pipeline.probe import stages as stages_of
+    from reconstruction.pipeline.probe import stages as probe
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+    return Recipe(probe.MAP_NAMES, probe.graph, probe.FILE_NAMES, products=probe.products)
 
 
 def light_list() -> Recipe:
-    """Return the recipe of pictures under listed lights, imported without a rig."""
-    from reconstruction.pipeline import light_stack as stages_of
+    """Return the recipe of images under listed lights, imported without a rig."""
+    from reconstruction.pipeline import light_stack
 
-    return Recipe(stages_of.MAPS, stages_of.graph)
+    return Recipe(light_stack.MAP_NAMES, light_stack.graph)
 
 
 # kernels are compiled when a module is first imported: each rig imports its own only
-RECIPES: Mapping[str, Callable[[], Recipe]] = {
+RECIPE_OF_STEP: Mapping[str, Callable[[], Recipe]] = {
     "subject": _flash,
     "olat": _dome,
     "gradient": _gradient,
@@ -98,12 +98,12 @@ def recipe_of(session: Session) -> Recipe:
     if "light_list" in session.manifest.extra:
         return light_list()
     kinds = {step.kind for step in session.plan.steps}
-    for kind, recipe in RECIPES.items():
+    for kind, recipe in RECIPE_OF_STEP.items():
         if kind in kinds:
             return recipe()
     raise EvidenceError(
         f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
-        f"{' or '.join(RECIPES)}; `skinrig calibrate` takes sessions of targets"
+        f"{' or '.join(RECIPE_OF_STEP)}; `skinrig calibrate` takes sessions of targets"
     )
 
 
@@ -130,7 +130,7 @@ def reconstruct(
     session
         SESSION/ folder.
     want
-        Names of maps; which there are depends on the rig, see :data:`RECIPES`.
+        Names of maps; which there are depends on the rig, see :data:`RECIPE_OF_STEP`.
     out
         The folder. Maps in it that are still current, by the hash of all that they depend on,
         are kept and not computed again.
@@ -172,26 +172,11 @@ def reconstruct(
     opened = Session.open(session)
     recipe = recipe_of(opened)
     store.require_free(out)
-    of_domes = {"hold-out": hold_out, "rank": rank, "scan": scan, "basis": basis}
-    given = [name for name, value in of_domes.items() if value is not None]
-    if given and recipe.maps_of_rank is None:
-        raise EvidenceError(
-            f"{', '.join(given)}: {opened.path} is no session of the dome; leave out what only it "
-            "takes"
-        )
-    for name, file in (("scan", scan), ("landmarks", landmarks)):
-        if file is not None and not Path(file).is_file():
-            raise EvidenceError(f"{name}: {file} is no file")
-    if rank is not None and rank < 1:
-        raise EvidenceError(f"rank: got {rank}, expected 1 or more")
-    if rank is not None and recipe.maps_of_rank is not None:
-        recipe = replace(recipe, maps=recipe.maps_of_rank(rank))
-    known = ", ".join(recipe.maps)
-    if not want:
-        raise EvidenceError(f"want: got nothing, expected names out of {known}")
-    unknown = [name for name in want if name not in recipe.maps]
-    if unknown:
-        raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
+    dome_options = {"hold-out": hold_out, "rank": rank, "scan": scan, "basis": basis}
+    _require_fitting_options(opened, recipe, dome_options)
+    _require_files({"scan": scan, "landmarks": landmarks})
+    recipe = _recipe_of_rank(recipe, rank)
+    _require_known(want, recipe.maps)
     evidence = Evidence.of(
         opened,
         calibration,
@@ -206,54 +191,109 @@ def reconstruct(
     if hold_out is not None:
         evidence.hold_out = HoldOut.parse(hold_out) if isinstance(hold_out, str) else hold_out
     graph = recipe.graph(evidence)
-    kept_names = recipe.expand(opened, (*recipe.maps, *recipe.files))
-    want = recipe.expand(opened, (*want, *recipe.always))
-    # a stage's other maps cost nothing more, and only whole stages can be reused
-    want = [
-        name
-        for stage in graph
-        if set(stage.makes) & set(want)
-        for name in stage.makes
-        if name in kept_names
-    ]
-    previous = _previous(Path(out))
-    outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
-    earlier = {} if previous is None else _recorded_keys(previous)
-    work = stage_record.record(graph, outcome, _made_keys(graph, previous, earlier))
+    products = _planned_products(graph, recipe, opened, want)
+    previous = _Previous.of(Path(out))
+    outcome = stages.run(graph, products, cache=_Kept(graph, previous), progress=progress)
+    work = stage_record.record(graph, outcome, previous.made_keys(graph))
     outcome = replace(outcome, assumed=tuple(evidence.assumed), work=work)
     # what the subject agreed to goes wherever the maps go
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
-    current = previous is not None and previous.parameters.get("consent", []) == consent
-    if not outcome.ran and previous is not None and current:
-        if set(want) <= set(_contents(previous)):
-            return outcome
+    current = previous.exists and previous.parameters.get("consent", []) == consent
+    if not outcome.ran and current and set(products) <= set(previous.contents):
+        return outcome
+    parameters = {
+        "kind": "appearance",
+        "session": Path(session).name,
+        "state": state,
+        "truth": truth,
+        "consent": consent,
+    }
+    store.write(out, _appearance(evidence, graph, outcome, products, previous, parameters))
+    return outcome
+
+
+def _require_fitting_options(
+    session: Session, recipe: Recipe, dome_options: Mapping[str, object]
+) -> None:
+    given = [name for name, value in dome_options.items() if value is not None]
+    if given and recipe.maps_of_rank is None:
+        raise EvidenceError(
+            f"{', '.join(given)}: {session.path} is no session of the dome; leave out what only it "
+            "takes"
+        )
+
+
+def _require_files(files: Mapping[str, str | Path | None]) -> None:
+    for name, file in files.items():
+        if file is not None and not Path(file).is_file():
+            raise EvidenceError(f"{name}: {file} is no file")
+
+
+def _recipe_of_rank(recipe: Recipe, rank: int | None) -> Recipe:
+    """Return the recipe whose maps are those of a chosen number of lobes."""
+    if rank is not None and rank < 1:
+        raise EvidenceError(f"rank: got {rank}, expected 1 or more")
+    if rank is None or recipe.maps_of_rank is None:
+        return recipe
+    return replace(recipe, maps=recipe.maps_of_rank(rank))
+
+
+def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
+    known = ", ".join(maps)
+    if not want:
+        raise EvidenceError(f"want: got nothing, expected names out of {known}")
+    unknown = [name for name in want if name not in maps]
+    if unknown:
+        raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
+
+
+def _planned_products(
+    graph: Sequence[stages.Stage], recipe: Recipe, session: Session, want: Sequence[str]
+) -> list[str]:
+    """Return the products of all stages that make something wanted.
+
+    A stage's other maps cost nothing more, and only whole stages can be reused.
+    """
+    kept_names = recipe.expand(session, (*recipe.maps, *recipe.files))
+    wanted = set(recipe.expand(session, (*want, *recipe.always)))
+    return [
+        name
+        for stage in graph
+        if wanted.intersection(stage.makes)
+        for name in stage.makes
+        if name in kept_names
+    ]
+
+
+def _appearance(
+    evidence: Evidence,
+    graph: Sequence[stages.Stage],
+    outcome: stages.Outcome,
+    products: Sequence[str],
+    previous: _Previous,
+    parameters: Mapping[str, object],
+) -> SkinAppearance:
+    """Return what was made, with what an older folder holds that is still current."""
     keys = _all_keys(graph)
-    kept = {name: outcome.products[name] for name in want}
+    kept = {name: outcome.products[name] for name in products}
+    for stage in graph:
+        if previous.keys.get(stage.name) == keys[stage.name]:
+            for name in stage.makes:
+                if name in previous.contents:
+                    kept.setdefault(name, previous.contents[name])
     noted = dict(evidence.noted)
-    if previous is not None:
-        recorded = _recorded_keys(previous)
-        before = _contents(previous)
-        for stage in graph:
-            if recorded.get(stage.name) == keys[stage.name]:
-                for name in stage.makes:
-                    if name in before:
-                        kept.setdefault(name, before[name])
-        if dict(previous.inputs) == evidence.hashes:
-            names = previous.parameters.get("noted", [])
-            for name in names if isinstance(names, list) else []:
-                noted.setdefault(str(name), previous.parameters.get(str(name)))
-    appearance = SkinAppearance(
+    if previous.exists and previous.inputs == evidence.hashes:
+        names = previous.parameters.get("noted", [])
+        for name in names if isinstance(names, list) else []:
+            noted.setdefault(str(name), previous.parameters.get(str(name)))
+    return SkinAppearance(
         maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
-        source=opened.source,
+        source=evidence.session.source,
         parameters={
-            "kind": "appearance",
-            "session": Path(session).name,
-            "state": state,
-            "truth": truth,
+            **parameters,
             "stages": {stage.name: keys[stage.name] for stage in graph},
-            "work": [dict(entry) for entry in work],
+            "work": [dict(entry) for entry in outcome.work],
             "assumed": evidence.assumed,
-            "consent": consent,
             "noted": sorted(noted),
             **noted,
         },
@@ -261,63 +301,64 @@ def reconstruct(
         versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
         left_out=outcome.left_out,
         files={name: value for name, value in kept.items() if isinstance(value, bytes)},
-        seed=opened.seed,
+        seed=evidence.session.seed,
     )
-    store.write(out, appearance)
-    return outcome
+
+
+@dataclass(frozen=True, slots=True)
+class _Previous:
+    """An older APPEARANCE/ folder; empty where there is none."""
+
+    exists: bool
+    contents: Mapping[str, SkinMap | bytes]
+    """Maps and files by name."""
+    parameters: Mapping[str, object]
+    inputs: Mapping[str, str]
+    keys: Mapping[str, str]
+    """Input hash of each stage, as recorded."""
+
+    @classmethod
+    def of(cls, out: Path) -> _Previous:
+        if not (out / store.DOCUMENT_FILE).is_file():
+            return cls(False, {}, {}, {}, {})
+        try:
+            found = store.read(out)
+        except store.StoreError as error:
+            raise EvidenceError(
+                f"{error}; nothing was written: remove {out}, or name another, to make all anew"
+            ) from error
+        recorded = found.parameters.get("stages", {})
+        keys = recorded.items() if isinstance(recorded, dict) else ()
+        return cls(
+            True,
+            {**found.maps, **found.files},
+            found.parameters,
+            dict(found.inputs),
+            {str(name): str(key) for name, key in keys},
+        )
+
+    def made_keys(self, graph: Sequence[stages.Stage]) -> dict[str, str]:
+        """Return the input hashes of the stages that the folder holds something of."""
+        made = {stage.name for stage in graph if any(name in self.contents for name in stage.makes)}
+        return {name: key for name, key in self.keys.items() if name in made}
 
 
 class _Kept:
     """Finished maps in an older APPEARANCE/ folder, by the hash of their stage."""
 
-    def __init__(self, graph: Sequence[stages.Stage], previous: SkinAppearance | None) -> None:
+    def __init__(self, graph: Sequence[stages.Stage], previous: _Previous) -> None:
         self._by_key: dict[str, Mapping[str, SkinMap | bytes]] = {}
-        if previous is None:
-            return
-        recorded = _recorded_keys(previous)
-        before = _contents(previous)
         for stage in graph:
-            kept = {name: before[name] for name in stage.makes if name in before}
-            if stage.name in recorded and kept:
-                self._by_key[recorded[stage.name]] = kept
+            contents = previous.contents
+            kept = {name: contents[name] for name in stage.makes if name in contents}
+            if stage.name in previous.keys and kept:
+                self._by_key[previous.keys[stage.name]] = kept
 
     def load(self, key: str) -> Mapping[str, Any] | None:
         return self._by_key.get(key)
 
     def save(self, key: str, products: Mapping[str, Any]) -> None:
         """Nothing: the finished folder is what is kept."""
-
-
-def _previous(out: Path) -> SkinAppearance | None:
-    if not (out / store.DOCUMENT).is_file():
-        return None
-    try:
-        return store.read(out)
-    except store.StoreError as error:
-        raise EvidenceError(
-            f"{error}; nothing was written: remove {out}, or name another, to make all anew"
-        ) from error
-
-
-def _contents(appearance: SkinAppearance) -> dict[str, SkinMap | bytes]:
-    """Return the maps and the files of an appearance by their names."""
-    return {**appearance.maps, **appearance.files}
-
-
-def _recorded_keys(appearance: SkinAppearance) -> dict[str, str]:
-    recorded = appearance.parameters.get("stages", {})
-    return {str(k): str(v) for k, v in recorded.items()} if isinstance(recorded, dict) else {}
-
-
-def _made_keys(
-    graph: Sequence[stages.Stage], previous: SkinAppearance | None, recorded: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the input hashes of the stages that an appearance holds something of."""
-    if previous is None:
-        return {}
-    before = _contents(previous)
-    made = {stage.name for stage in graph if any(name in before for name in stage.makes)}
-    return {name: key for name, key in recorded.items() if name in made}
 
 
 def _all_keys(graph: Sequence[stages.Stage]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import texture_fill
@@ -84,7 +84,7 @@ class SurfaceTexture:
 
     def normals(self, found: PointValues, description: str) -> SkinMap:
         """Return a map of unit normals, with angles in rad as standard errors."""
-        drawn = self.map(found.values, found.stderr, found.valid, UNITS["normals"], description)
+        drawn = self.map(found.values, found.stderr, found.valid, MAP_UNITS["normals"], description)
         length = np.linalg.norm(drawn.values, axis=-1, keepdims=True)
         unit = np.where(length > 0, drawn.values / np.maximum(length, 1e-9), (0.0, 0.0, 1.0))
         return SkinMap(unit.astype(np.float32), drawn.unit, drawn.stderr, drawn.valid, description)

@@ -25,11 +25,11 @@ from numpy.typing import ArrayLike
 from model import texture_resampling as resampling
 from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
 from model.wrinkles.evaluation import WrinkleModel
-from model.wrinkles.expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTable
+from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, Clamp, ExpressionTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.wrinkles.texels import (
-    TOLERANCE,
+    SOLVER_TOL,
     Derivatives,
     Texels,
     derivatives_of,
@@ -45,10 +45,10 @@ from reconstruction.wrinkles.weights import (
 
 Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 
-ROUNDS = 20
-ROUGH = 256
+FIT_ROUNDS = 20
+COARSE_SIDE = 256
 """Texels a side of the map with which weights are sought."""
-SETTLED = 1e-5
+MISFIT_TOL = 1e-5
 """Fall of the misfit in a round, relative to the differences, at which the fit ends."""
 
 
@@ -70,7 +70,7 @@ class WrinkleFit:
     rounds : int
         Of map and weights in turn; 0 where the weights were given.
     settled : bool
-        The last round explained no more than `SETTLED` of the differences in addition.
+        The last round explained no more than `MISFIT_TOL` of the differences in addition.
     clamp : {"unit", "signed"}
         Range of the weights.
     """
@@ -131,11 +131,13 @@ def fit_weights(
     -------
     ZoneWeights
     """
-    if clamp not in CLAMPS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
+    if clamp not in ZONE_SUM_LIMITS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
     difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
     wrinkle = _read(np.asarray(layer.wrinkle, np.float64), difference.weight.shape)
-    return zone_weights(np.asarray(layer.masks, np.float64), wrinkle, difference, CLAMPS[clamp])
+    return zone_weights(
+        np.asarray(layer.masks, np.float64), wrinkle, difference, ZONE_SUM_LIMITS[clamp]
+    )
 
 
 def fit(
@@ -177,8 +179,8 @@ def fit(
     WrinkleError
         For sizes that do not fit, or no expression.
     """
-    if clamp not in CLAMPS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
+    if clamp not in ZONE_SUM_LIMITS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
     if not expressions:
         raise WrinkleError("expressions: got none, expected at least one")
     stack = mask_stack(masks).astype(np.float64)
@@ -197,7 +199,10 @@ def fit(
         rows, rounds, settled = _in_turn(stack, data, base, size, clamp)
     texels = _shown_by(stack, rows, data, size)
     wrinkle = _read(texels.values, base.valid.shape)
-    found = {name: zone_weights(stack, wrinkle, one, CLAMPS[clamp]) for name, one in data.items()}
+    found = {
+        name: zone_weights(stack, wrinkle, one, ZONE_SUM_LIMITS[clamp])
+        for name, one in data.items()
+    }
     source = "fitted to normals" if table is None else table.source
     if table is None:
         rows = {name: one.weights for name, one in found.items()}
@@ -232,22 +237,22 @@ def _in_turn(
     if len(data) == 1:
         return rows, 0, True  # every weight is 1
     shape = base.valid.shape
-    rough = min(size[0], ROUGH), min(size[1], ROUGH)
+    rough = min(size[0], COARSE_SIDE), min(size[1], COARSE_SIDE)
     texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
     small = min(2 * texels[0], shape[0]), min(2 * texels[1], shape[1])
     data = {name: _reduced(one, small) for name, one in data.items()}
     bounds = (0.0 if clamp == "unit" else -math.inf, math.inf)
     left = math.inf
-    for rounds in range(1, ROUNDS + 1):
+    for rounds in range(1, FIT_ROUNDS + 1):
         equations = _equations(masks, _shown_by(masks, rows, data, rough, tolerance=1e-7), data)
         free = {name: one.least(bounds) for name, one in equations.items()}
         rows = _limited(free)
         misfit = sum(equations[name].misfit(row) for name, row in free.items())
         total = sum(one.total for one in equations.values())
-        if left - misfit <= SETTLED * total:
+        if left - misfit <= MISFIT_TOL * total:
             return rows, rounds, True
         left = misfit
-    return rows, ROUNDS, False
+    return rows, FIT_ROUNDS, False
 
 
 def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
@@ -303,7 +308,7 @@ def _pixel_weights(variance: FloatArray, good: BoolArray) -> Float32Array:
 
 
 def _zone_names(count: int) -> tuple[str, ...]:
-    known = JIMENEZ2011.zones
+    known = JIMENEZ2011_TABLE.zones
     return known if count == len(known) else tuple(f"zone {z}" for z in range(count))
 
 
@@ -318,7 +323,7 @@ def _shown_by(
     data: Mapping[str, Difference],
     size: tuple[int, int],
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float = SOLVER_TOL,
 ) -> Texels:
     """Return the map that expressions with known weights show best."""
     parts = []
@@ -333,7 +338,7 @@ def _map_of(
     parts: list[tuple[FloatArray, Difference]],
     size: tuple[int, int],
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float = SOLVER_TOL,
 ) -> Texels:
     """Return the map that differences show, each with a strength (H, W)."""
     shape = parts[0][0].shape

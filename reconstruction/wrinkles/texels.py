@@ -23,15 +23,15 @@ from model.wrinkles import WrinkleError
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps
 
-STEEPEST = 4.0
+MAX_DERIVATIVE = 4.0
 """Derivatives beyond this, slopes of 76 degrees, are measured by too grazing light to count."""
-LEAST_COVERAGE = 0.1
+MIN_COVERAGE = 0.1
 """Part of a texel's weight that must be measured."""
-LEAST_STRENGTH = 1e-3
+MIN_STRENGTH = 1e-3
 """Sum of squared strengths, relative to the largest, below which a texel is not determined."""
-TOLERANCE = 1e-12
-DAMPING = 1e-10
-SILENT = 1e-9
+SOLVER_TOL = 1e-12
+RELATIVE_DAMPING = 1e-10
+MIN_DIAGONAL = 1e-9
 """Diagonal of the normal matrix, relative to the largest, below which a texel is left at 0."""
 
 
@@ -94,7 +94,7 @@ def derivatives_of(
             raise WrinkleError(f"{name}: got shape {np.shape(given)}, expected {n.shape[:2]}")
     if valid is not None:
         good &= np.asarray(valid, bool)
-    steep = good & (np.abs(report.derivatives) > STEEPEST).any(axis=2)
+    steep = good & (np.abs(report.derivatives) > MAX_DERIVATIVE).any(axis=2)
     count = int(np.count_nonzero(good))
     share = float(np.count_nonzero(steep)) / count if count else 0.0
     good &= ~steep
@@ -137,7 +137,7 @@ def fit_texels(
     covered: FloatArray,
     shape: tuple[int, int],
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float = SOLVER_TOL,
 ) -> Texels:
     """Return texels t whose bilinear reading B t makes sum_x weight (B t)^2 - 2 product B t least.
 
@@ -165,17 +165,17 @@ def fit_texels(
     full = gathered(by, bx, np.ones((1, 1)))
     coverage = gathered(by, bx, covered) / full
     relative = summed / (full * max(float(np.max(weight, initial=0.0)), 1e-300))
-    valid = (coverage >= LEAST_COVERAGE) & (relative >= LEAST_STRENGTH)
+    valid = (coverage >= MIN_COVERAGE) & (relative >= MIN_STRENGTH)
     values = np.zeros((*shape, 2))
     stderr = np.full((*shape, 2), np.inf)
     if not valid.any():
         return Texels(values, stderr, valid)
     diagonal = A.diagonal()
-    some = np.flatnonzero(diagonal > SILENT * diagonal.max())
+    some = np.flatnonzero(diagonal > MIN_DIAGONAL * diagonal.max())
     root = 1.0 / np.sqrt(diagonal[some])
     scaling = sparse.diags_array(root)
     matrix = scaling @ A[some][:, some] @ scaling
-    matrix = (matrix + DAMPING * sparse.eye_array(some.size)).tocsr()
+    matrix = (matrix + RELATIVE_DAMPING * sparse.eye_array(some.size)).tocsr()
     spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
     for c in (0, 1):
         b = gathered(by, bx, product[..., c]).ravel()[some]

@@ -18,11 +18,11 @@ from model import texture_resampling as resampling
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.wrinkles.texels import gathered, normal_matrix
 
-MOST_STDERR = 0.5
+MAX_STDERR = 0.5
 """A weight that is known no better tells nothing about [0, 1]."""
-BLOCKS = 16
+BLOCKS_PER_SIDE = 16
 """Squares a side into which the face is cut to see how misfit scatters."""
-SINGULAR = 1e-9
+MIN_EIGENVALUE = 1e-9
 """Eigenvalues of the scaled normal matrix below this leave a weight undetermined."""
 
 
@@ -56,7 +56,7 @@ class ZoneWeights:
         the misfit over the face lead to. Infinite where nothing determines the weight. The
         wrinkle map counts as known.
     valid : ndarray of bool, shape (Z,)
-        Determined, with a standard error below `MOST_STDERR`.
+        Determined, with a standard error below `MAX_STDERR`.
     at_bound : ndarray of bool, shape (Z,)
     covariance : ndarray, shape (Z, Z)
         Of the normals' stated errors alone; 0 for weights that are not determined.
@@ -103,11 +103,11 @@ class ZoneEquations:
     def determined(self) -> BoolArray:
         """Return which weights the equations hold fast, (Z,)."""
         diagonal = np.diag(self.matrix)
-        some = diagonal > SINGULAR * diagonal.max(initial=0.0)
+        some = diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0)
         if not some.any():
             return some
         values, vectors = np.linalg.eigh(self._scaled(some))
-        loose = vectors[:, values < SINGULAR * values[-1]]
+        loose = vectors[:, values < MIN_EIGENVALUE * values[-1]]
         fast = some.copy()
         fast[some] = (np.abs(loose) < 1e-6).all(axis=1)
         return fast
@@ -120,20 +120,22 @@ class ZoneEquations:
     def inverse(self) -> Float64Array:
         """Return the pseudo-inverse of the matrix; rows of undetermined weights mean nothing."""
         diagonal = np.diag(self.matrix)
-        root = np.sqrt(np.where(diagonal > SINGULAR * diagonal.max(initial=0.0), diagonal, np.inf))
+        root = np.sqrt(
+            np.where(diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0), diagonal, np.inf)
+        )
         scaled = self.matrix / np.outer(root, root)
-        return np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) / np.outer(root, root)
+        return np.linalg.pinv(scaled, rcond=MIN_EIGENVALUE, hermitian=True) / np.outer(root, root)
 
     def least(self, bounds: tuple[float, float]) -> Float64Array:
         """Return the weights within bounds that leave least; 0 for zones without a wrinkle."""
         diagonal = np.diag(self.matrix)
-        some = diagonal > SINGULAR * diagonal.max(initial=0.0)
+        some = diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0)
         weights = np.zeros(len(diagonal))
         if not some.any():
             return weights
         root = np.sqrt(diagonal[some])
         values, vectors = np.linalg.eigh(self._scaled(some))
-        kept = values > SINGULAR * values[-1]
+        kept = values > MIN_EIGENVALUE * values[-1]
         factor = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
         target = (vectors[:, kept].T @ (self.vector[some] / root)) / np.sqrt(values[kept])
         if not math.isfinite(bounds[0]):
@@ -231,7 +233,7 @@ def zone_weights(
     stderr = np.where(fast, np.sqrt(np.maximum(variance, 0.0)), np.inf)
     covariance[~fast] = 0.0
     covariance[:, ~fast] = 0.0
-    valid = fast & (stderr < MOST_STDERR)
+    valid = fast & (stderr < MAX_STDERR)
     weights[~valid] = 0.0
     total = equations.total
     return ZoneWeights(
@@ -258,7 +260,9 @@ def _scatter(
     strength = resampling.resampled(np.tensordot(weights, masks, axes=1), size)
     left = difference.values - strength[..., None] * wrinkle
     score = np.einsum("hwc,hwc->hw", wrinkle, left) * difference.weight
-    rows, columns = (np.arange(min(BLOCKS, n)) * n // min(BLOCKS, n) for n in size)
+    rows, columns = (
+        np.arange(min(BLOCKS_PER_SIDE, n)) * n // min(BLOCKS_PER_SIDE, n) for n in size
+    )
     sums = []
     for mask in masks:
         image = resampling.resampled(mask, size) * score

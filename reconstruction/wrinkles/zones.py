@@ -27,16 +27,16 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.wrinkles.fit import Measured, differences
 from reconstruction.wrinkles.texels import derivatives_of
 
-LEAST_SIGNAL = 3.0
+MIN_SIGNAL = 3.0
 """A texel's pattern counts when its energy is so many times the scatter that stated errors lead
 to: their variance over the square root of pixels an expression."""
-LEAST_ENERGY = 1e-3
+MIN_ENERGY = 1e-3
 """And so large a part of the strongest texel's."""
-ROUNDS = 40
-STEPS = 60
-PRIOR = 0.03
+ZONE_ROUNDS = 40
+GRADIENT_STEPS = 60
+LAYOUT_WEIGHT = 0.03
 """Weight of the first layout, against the data of a texel well above noise."""
-ALIKE = 0.98
+PROPORTIONAL_COSINE = 0.98
 """Cosine above which two zones' weights count as proportional."""
 
 
@@ -133,9 +133,9 @@ def amplitudes(
     direction = np.moveaxis(vectors[..., -1], -1, 0)
     peak = np.take_along_axis(direction, np.abs(direction).argmax(axis=0)[None], axis=0)
     energy = leading * peak[0] ** 2
-    valid = (part > 0.1) & (leading > 0) & (energy >= LEAST_ENERGY * energy.max(initial=0.0))
+    valid = (part > 0.1) & (leading > 0) & (energy >= MIN_ENERGY * energy.max(initial=0.0))
     pixels = np.maximum(part * seen.size / (size[0] * size[1]), 1.0)
-    valid &= energy > LEAST_SIGNAL * noise * np.sqrt(count / pixels)
+    valid &= energy > MIN_SIGNAL * noise * np.sqrt(count / pixels)
     amplitude = np.where(valid, direction / np.where(peak == 0, 1.0, peak), 0.0)
     share = np.divide(leading, np.maximum(trace, leading), out=np.zeros_like(leading), where=valid)
     return Amplitudes(amplitude, np.where(valid, energy, 0.0), share, valid, names)
@@ -185,7 +185,7 @@ def fit_zones(
     trust = np.where(found.valid.ravel(), relative / (relative + 0.1), 0.0)
     masks = prior.copy()
     weights = np.zeros((count, target.shape[1]))
-    for _ in range(ROUNDS):
+    for _ in range(ZONE_ROUNDS):
         before = weights
         weights = _weights_of(masks, target, strength)
         masks = _on_simplex_fit(masks, prior, target, weights, trust)
@@ -258,10 +258,10 @@ def _on_simplex_fit(
     Projected gradient; every texel has the same matrix up to its trust.
     """
     gram = weights @ weights.T
-    scale = 1.0 / (np.linalg.eigvalsh(gram)[-1] + PRIOR)
+    scale = 1.0 / (np.linalg.eigvalsh(gram)[-1] + LAYOUT_WEIGHT)
     pull = target @ weights.T
-    for _ in range(STEPS):
-        slope = trust[:, None] * (masks @ gram - pull) + PRIOR * (masks - prior)
+    for _ in range(GRADIENT_STEPS):
+        slope = trust[:, None] * (masks @ gram - pull) + LAYOUT_WEIGHT * (masks - prior)
         masks = _projected(masks - scale * slope)
     return masks
 
@@ -281,6 +281,6 @@ def _distinct(weights: Float64Array) -> int:
     lengths = np.linalg.norm(weights, axis=1)
     kept: list[Float64Array] = []
     for row in weights[lengths > 1e-6] / lengths[lengths > 1e-6, None]:
-        if all(abs(float(row @ other)) < ALIKE for other in kept):
+        if all(abs(float(row @ other)) < PROPORTIONAL_COSINE for other in kept):
             kept.append(row)
     return len(kept)

@@ -37,7 +37,7 @@ def assumed_by(appearance: SkinAppearance) -> list[str]:
 
 def document_digest(folder: Path) -> str:
     """Return the SHA-256 of an APPEARANCE/ folder's document."""
-    return hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+    return hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
 
 
 def versions() -> dict[str, str]:

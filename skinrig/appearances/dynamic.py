@@ -155,7 +155,7 @@ def read(
 
 
 def _previous(out: Path) -> SkinAppearance | None:
-    if not (out / store.DOCUMENT).is_file():
+    if not (out / store.DOCUMENT_FILE).is_file():
         return None
     kind = store.read_document(out).parameters.get("kind")
     if kind != DYNAMIC_KIND:

@@ -230,7 +230,7 @@ def _truth(path: Path, found: SkinAppearance) -> Path | None:
     if not isinstance(name, str) or not name or Path(name).name != name:
         return None
     folder = path.resolve().parent / name
-    return folder if (folder / store.DOCUMENT).is_file() else None
+    return folder if (folder / store.DOCUMENT_FILE).is_file() else None
 
 
 def _point(values: list[float]) -> Point:

@@ -20,7 +20,7 @@ def truth_of_state(session: Path, state: str) -> Path | None:
     """
     first = truth_folder(session)
     for named in (first, first.with_name(f"{first.name}-{state}")):
-        if (named / store.DOCUMENT).is_file():
+        if (named / store.DOCUMENT_FILE).is_file():
             if store.read_document(named).parameters.get("state") == state:
                 return named
     return None
@@ -35,4 +35,4 @@ def truth_beside(session: Path, state: str = DEFAULT_STATE) -> Path | None:
     if found is not None or state != DEFAULT_STATE:
         return found
     folder = truth_folder(session)
-    return folder if (folder / store.DOCUMENT).is_file() else None
+    return folder if (folder / store.DOCUMENT_FILE).is_file() else None

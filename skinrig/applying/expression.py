@@ -15,9 +15,9 @@ import numpy as np
 from model import color_table, store
 from model.facial_color import HemoglobinRig
 from model.facial_color import rig as facial_color
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from skinrig import consent
@@ -204,7 +204,7 @@ def apply_expression(
     if not done.maps:
         reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
         raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
-    content = (path / store.DOCUMENT).read_bytes()
+    content = (path / store.DOCUMENT_FILE).read_bytes()
     store.write(
         out,
         SkinAppearance(
@@ -236,7 +236,7 @@ def _check_target(out: Path, path: Path) -> None:
     """Raise where the result would replace what it is made of, or anything but a result."""
     if out.resolve() == path.resolve():
         raise ApplyError(f"{out}: is the fitted folder itself; name another with --out")
-    if (out / store.DOCUMENT).is_file():
+    if (out / store.DOCUMENT_FILE).is_file():
         kind = store.read_document(out).parameters.get("kind")
         if kind != EXPRESSION_KIND:
             raise ApplyError(
@@ -269,9 +269,9 @@ def _source(appearance: SkinAppearance, expression: Expression) -> str:
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
-    from model.facial_color.document import DOCUMENT, from_maps_and_document
+    from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 
-    return from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
+    return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
 
 
 def _facial_color(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
@@ -289,7 +289,7 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     held = np.where(good, blend.hemoglobin, 0.0).astype(np.float32)
     done.maps["hemoglobin"] = SkinMap(
         held,
-        UNITS["hemoglobin"],
+        MAP_UNITS["hemoglobin"],
         np.where(good, blend.stderr, 0.0).astype(np.float32),
         good,
         "blend of measured states",

@@ -301,7 +301,7 @@ def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
         )
     tables = [landmark_table.read(path) for path in landmarks]
     own, other = tables if tables else (None, None)
-    read = {"onto": onto / store.DOCUMENT}
+    read = {"onto": onto / store.DOCUMENT_FILE}
     read |= dict(zip(("landmarks of the rig", "landmarks of the other"), landmarks, strict=False))
     found = store.read(onto)
     hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in read.items()}

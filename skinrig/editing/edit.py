@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import TraitLibrary
-from model.traits.vectors import DOUBTFUL_P, TraitVector
+from model.traits.vectors import MAX_P_VALUE, TraitVector
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
@@ -174,7 +174,7 @@ def edit(
     face = face_textures.read(path, order.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
-        "appearance": face_textures.digest(path / store.DOCUMENT),
+        "appearance": face_textures.digest(path / store.DOCUMENT_FILE),
     }
     for name, file in (("mask", order.mask), ("landmarks", order.landmarks)):
         if file is not None:
@@ -302,7 +302,7 @@ def _chosen(
         if order.parts is not None:
             use = [p for p in possible if p in order.parts]
         else:
-            use = [p for p in possible if have[p][name].confidence.p_value <= DOUBTFUL_P]
+            use = [p for p in possible if have[p][name].confidence.p_value <= MAX_P_VALUE]
             for p in possible if use else []:
                 if p not in use:
                     chance = have[p][name].confidence.p_value

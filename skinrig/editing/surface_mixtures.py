@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
-from model.skin_reflectance import BASIS_FILE, WEIGHT
+from model.skin_reflectance import BASIS_FILE, WEIGHT_PREFIX
 from skinrig.arrays import BoolArray, Float64Array
 
 OUTLIER_STRENGTH_RATIO: Final = 6.0
@@ -97,7 +97,7 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     """
     if BASIS_FILE not in appearance.files:
         raise SurfaceMixtureError(
-            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT}0` makes it"
+            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT_PREFIX}0` makes it"
         )
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as file:
@@ -113,12 +113,13 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
         )
     maps = []
     for k in range(len(mix)):
-        if f"{WEIGHT}{k}" not in appearance.maps:
+        if f"{WEIGHT_PREFIX}{k}" not in appearance.maps:
             raise SurfaceMixtureError(
-                f"{WEIGHT}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; reconstruct all of "
+                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; "
+                "reconstruct all of "
                 "them"
             )
-        maps.append(appearance.maps[f"{WEIGHT}{k}"])
+        maps.append(appearance.maps[f"{WEIGHT_PREFIX}{k}"])
     return SurfaceMixtures(tuple(maps), mix, names, stored)
 
 
@@ -164,6 +165,6 @@ def written(edited: SurfaceMixtures, materials: BrdfBasis) -> bytes:
 
 def replaced(appearance: SkinAppearance, edited: SurfaceMixtures, file: bytes) -> SkinAppearance:
     """Return an appearance with other lobes."""
-    maps = {n: m for n, m in appearance.maps.items() if not n.startswith(WEIGHT)}
-    maps |= {f"{WEIGHT}{k}": one for k, one in enumerate(edited.maps)}
+    maps = {n: m for n, m in appearance.maps.items() if not n.startswith(WEIGHT_PREFIX)}
+    maps |= {f"{WEIGHT_PREFIX}{k}": one for k, one in enumerate(edited.maps)}
     return dataclasses.replace(appearance, maps=maps, files={**appearance.files, BASIS_FILE: file})

@@ -14,8 +14,9 @@ from model import metrics
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
+from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
-from reconstruction.pipeline.dome.stages import BASIS_FILE, weight_names
+from reconstruction.pipeline.dome.lobes import weight_names
 from reconstruction.surface.estimates import transmitted
 from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere

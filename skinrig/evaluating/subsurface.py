@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
-from reconstruction.pipeline.probe.stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
+from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
 
 MAX_MEDIAN_ERROR, MAX_WORST_ERROR = 0.03, 0.08
 """Relative error of sigma_tr on homogeneous media, median and worst."""
-RECOMMENDED_METHOD = METHODS[0]
+RECOMMENDED_METHOD = METHOD_NAMES[0]
 MIN_SIGNAL_TO_NOISE = 10.0
 """A fibre's reading tells something of the profile from here on."""
 
@@ -106,7 +107,7 @@ def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[
         true = known.get(name_of(entry))
         if true is None:
             continue
-        for number, channel in enumerate(CHANNELS):
+        for number, channel in enumerate(CHANNEL_NAMES):
             one = entry["channels"][channel]
             found, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             real = np.asarray(true["reflectance_per_mm2"], float)[:, number]
@@ -138,7 +139,7 @@ def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitE
         if true is None:
             continue
         for fit in entry["fits"]:
-            sigma_tr = float(true["sigma_tr_per_mm"][CHANNELS.index(fit["channel"])])
+            sigma_tr = float(true["sigma_tr_per_mm"][CHANNEL_NAMES.index(fit["channel"])])
             low, high = numbers(fit["interval_per_mm"]).tolist()
             rows.append(
                 FitError(
@@ -174,7 +175,7 @@ class MethodError:
 def by_method(rows: Sequence[FitError]) -> list[MethodError]:
     """Return the errors of each method over its valid fits."""
     found = []
-    for method in METHODS:
+    for method in METHOD_NAMES:
         chosen = [row for row in rows if row.method == method and row.valid]
         if not chosen:
             continue

@@ -131,7 +131,7 @@ def merl_table(brdf: Brdf) -> merl.MerlTable:
     """
     theta_h, theta_d, phi_d = merl.bin_centers()
     d, phi = np.meshgrid(theta_d, phi_d, indexing="ij")
-    values = np.full((*merl.SHAPE, 3), -1.0)
+    values = np.full((*merl.TABLE_SHAPE, 3), -1.0)
     for i, h in enumerate(theta_h):
         light, view = merl.to_directions(h, d, phi)
         above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)

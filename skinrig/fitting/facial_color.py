@@ -100,7 +100,7 @@ def fit_facial_color(
         FACIAL_COLOR,
         Part(
             maps=maps,
-            files={facial_color_document.DOCUMENT: document},
+            files={facial_color_document.RIG_DOCUMENT: document},
             parameters={
                 "sessions": [path.name for path in sessions],
                 "states": list(found.hemoglobin),

@@ -108,7 +108,7 @@ def fit_microstructure(
     }
     everything = [one for group in by_site.values() for one in group]
     inputs = {
-        f"{site} {number}": hashlib.sha256((path / store.DOCUMENT).read_bytes()).hexdigest()
+        f"{site} {number}": hashlib.sha256((path / store.DOCUMENT_FILE).read_bytes()).hexdigest()
         for site, group in by_site.items()
         for number, (path, _) in enumerate(group)
     }

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
 from skinrig.arrays import Float32Array, Float64Array
@@ -198,8 +198,8 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
     none = (math.nan, math.inf)
     return {
         name: (
-            tuple(by.get(c, none)[0] for c in CHANNELS),
-            tuple(by.get(c, none)[1] for c in CHANNELS),
+            tuple(by.get(c, none)[0] for c in CHANNEL_NAMES),
+            tuple(by.get(c, none)[1] for c in CHANNEL_NAMES),
         )
         for name, by in found.items()
     }

@@ -11,7 +11,7 @@ import numpy as np
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance, SkinMap
-from model.skin_reflectance import TRANSLUCENCY, SkinReflectance
+from model.skin_reflectance import TRANSLUCENCY_MAP, SkinReflectance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
 from skinrig import consent
@@ -102,7 +102,7 @@ def fit_reflectance(
         assumed.append(what)
     model = skin_reflectance.assemble(surface, translucency=depth)
     appearance = SkinAppearance(
-        maps={**surface.maps, TRANSLUCENCY: depth},
+        maps={**surface.maps, TRANSLUCENCY_MAP: depth},
         source="simulated" if "simulated" in sources else "measured",
         parameters={
             **surface.parameters,
@@ -182,7 +182,7 @@ def _assumed(appearance: SkinAppearance) -> tuple[str, ...]:
 
 
 def _digest(folder: Path) -> str:
-    return hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+    return hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
 
 
 def _record(placed: PlacedTranslucency | None) -> dict[str, object]:

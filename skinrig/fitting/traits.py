@@ -140,7 +140,7 @@ def fit_traits(
             },
             landmarks=sorted({face.marked_by for face in faces}),
             inputs={"labels": face_textures.digest(labels)}
-            | {f.name: face_textures.digest(f.path / store.DOCUMENT) for f in faces},
+            | {f.name: face_textures.digest(f.path / store.DOCUMENT_FILE) for f in faces},
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),

@@ -13,7 +13,7 @@ import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline.dome.stages import MESH_FILE
 from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
@@ -134,7 +134,7 @@ def fit_wrinkles(
                 },
             },
             inputs={
-                state: hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+                state: hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
                 for state, (folder, _) in read.items()
             },
             source="simulated" if "simulated" in sources else "measured",

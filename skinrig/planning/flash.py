@@ -17,7 +17,7 @@ import numpy as np
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from reconstruction.chromophores.detectability import detectable
-from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
+from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.flash_observation import (
@@ -79,7 +79,7 @@ def predict(observation: Observation, *, repeats: int, power: float, darks: int)
     variance = (frame / repeats + dark) * observation.shares
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = variance / np.square(power * observation.light)
-    skin = observation.skin & (relative < 1.0 / DARKEST_SIGMAS**2).all(axis=-1)
+    skin = observation.skin & (relative < 1.0 / MIN_SIGNAL_SIGMAS**2).all(axis=-1)
     bounds = relative_bounds(
         observation.table,
         observation.melanin[skin],

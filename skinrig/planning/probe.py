@@ -142,7 +142,7 @@ def confirm(
     """Simulate the skin of a choice and the phantom, reconstruct, compare with the truth."""
     from model import store
     from reconstruction.pipeline import recipes as pipeline
-    from reconstruction.pipeline.probe.stages import METHODS
+    from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.evaluating import subsurface
     from skinrig.simulating.simulation import simulate_session
@@ -167,7 +167,7 @@ def confirm(
         for row in subsurface.compare_fits(
             store.read(out / "appearance"), store.read(out / "truth-face")
         )
-        if row.method == METHODS[0]
+        if row.method == METHOD_NAMES[0]
     ]
     good = [abs(row.relative) for row in rows if row.valid]
     median = 100.0 * float(np.median(good)) if good else math.inf

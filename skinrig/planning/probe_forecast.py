@@ -191,7 +191,7 @@ def _fitted(
     """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fiber.probe_calibration import FiberReflectance
     from reconstruction.pipeline.probe.images import Measurement
-    from reconstruction.pipeline.probe.stages import Profile, fit_profiles
+    from reconstruction.pipeline.probe.profile_fits import Profile, fit_profiles
 
     names = tuple(fibre.name for fibre in observation.probe.fibres)
     radius = np.array(observation.probe.radius_mm)

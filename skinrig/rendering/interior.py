@@ -114,7 +114,7 @@ class Interior:
         rows: Rows,
         entered_at: Float64Array,
         *,
-        tolerance: float = dipole_gather.TOLERANCE,
+        tolerance: float = dipole_gather.GATHER_TOL,
     ) -> Float64Array:
         """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
 

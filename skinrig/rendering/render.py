@@ -20,7 +20,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from model.dipole.gather import TOLERANCE
+from model.dipole.gather import GATHER_TOL
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
@@ -105,7 +105,7 @@ def render(
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float = GATHER_TOL,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model.

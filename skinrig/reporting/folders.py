@@ -66,7 +66,7 @@ class Findings:
         """Return whether people or a simulation were captured, as far as the folders say so."""
         sources = []
         for path in (*self.appearances.values(), *self.sessions):
-            for name in (store.DOCUMENT, "session.json"):
+            for name in (store.DOCUMENT_FILE, "session.json"):
                 with contextlib.suppress(OSError, ValueError, AttributeError):
                     sources.append(json.loads((path / name).read_bytes()).get("source"))
         if not sources:
@@ -109,15 +109,15 @@ def discover(paths: Sequence[Path]) -> Findings:
 
 
 def _sort_in(entry: Path, found: Findings) -> None:
-    if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT:
-        if (entry.parent / store.DOCUMENT).is_file():
+    if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT_FILE:
+        if (entry.parent / store.DOCUMENT_FILE).is_file():
             return  # of the appearance itself, which its section shows
         if _is_of_a_calibration(entry):
             return  # its folder's section tells all of them
         text = entry.read_text(encoding="utf-8", errors="replace")
         if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
             found.documents.append(entry)
-    elif (entry / store.DOCUMENT).is_file():
+    elif (entry / store.DOCUMENT_FILE).is_file():
         kind = store.read_document(entry).parameters.get("kind")
         (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
     elif (entry / "session.json").is_file():

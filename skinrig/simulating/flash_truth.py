@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.arrays import BoolArray
 from skinrig.simulating.orders import SimulationError
 
@@ -115,7 +115,7 @@ def truth_of(
         inside, valid = (at_rest, whole_at_rest) if unmoved else (mask, whole)
         small = to_superpixels(np.asarray(values, np.float64), inside).astype(np.float32)
         known = name.removesuffix("_at_rest").removesuffix("_blurred")
-        unit = "mm" if name.endswith("_mm") else UNITS.get(known, "1")
+        unit = "mm" if name.endswith("_mm") else MAP_UNITS.get(known, "1")
         kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=valid)
     kept["mask"] = SkinMap(whole.astype(np.float32), "1")
     return SkinAppearance(

@@ -140,7 +140,7 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
     """
     if path is not None:
         return trait_storage.load(path), hashlib.sha256(path.read_bytes()).hexdigest()
-    packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED)
+    packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE)
     if not packaged.is_file():
         raise TraitLibraryError(
             "traits: no library comes with this package; name one with --space FILE "

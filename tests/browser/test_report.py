@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import report
 
 WIDTHS = (1250, 400)
@@ -22,7 +22,7 @@ def pages(tmp_path_factory):
         maps = {
             name: SkinMap(
                 melanin + rng.normal(0.0, 0.002, melanin.shape),
-                UNITS[name],
+                MAP_UNITS[name],
                 np.full(melanin.shape, 0.002),
             )
             for name in ("melanin", "hemoglobin")
@@ -39,7 +39,7 @@ def pages(tmp_path_factory):
             ),
         )
         truth = {
-            f"{name}{suffix}": SkinMap(melanin, UNITS[name] if not suffix else "1")
+            f"{name}{suffix}": SkinMap(melanin, MAP_UNITS[name] if not suffix else "1")
             for name in ("melanin", "hemoglobin")
             for suffix in ("", "_blurred")
         }

@@ -194,7 +194,7 @@ def test_light_spreads_on_the_screen_as_the_model_says(viewer, scene, texturing)
     source = viewer.read("irradiance").astype(np.float64)
     albedo = viewer.read("albedo")[..., :3].astype(np.float64)
     specular = viewer.read("specular").astype(np.float64)
-    before, behind = screen_scattering.POWERS[texturing]
+    before, behind = screen_scattering.ALBEDO_POWERS[texturing]
     _, _, focal = _camera(params, 256)
     profile = scene.facts["scattering"]
     spread = screen_scattering.scatter(

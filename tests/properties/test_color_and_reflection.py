@@ -11,7 +11,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, polarization
 from reconstruction.chromophores import detectability, shading_prior, tsumura
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.gradient_normals import lobe_response
+from reconstruction.gradient_normals import lobe_response, sphere_lights
 from reconstruction.normal_integration import relief_errors
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
@@ -338,15 +338,15 @@ def test_independent_components_of_a_picture_know_no_exposure(seed, scale):
 @given(place=st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), view=VECTOR)
 def test_places_of_normals_come_back(place, view):
     at = np.array(place)
-    normal = lobe_response.normal_at(at)
+    normal = sphere_lights.normal_at(at)
     assert np.linalg.norm(normal) == pytest.approx(1.0)
     if normal[2] > 0.05:
-        np.testing.assert_allclose(lobe_response.place_of(normal), at, atol=1e-6)
-    frame = lobe_response.frame_of(unit(view))
+        np.testing.assert_allclose(sphere_lights.place_of(normal), at, atol=1e-6)
+    frame = sphere_lights.frame_of(unit(view))
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
 
 
-RING = lobe_response.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
+RING = sphere_lights.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
 
 
 @CHEAP
@@ -359,13 +359,13 @@ RING = lobe_response.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
 def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, mirror):
     across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
     if abs(unit(view)[1]) > 0.9999995:
-        with pytest.raises(lobe_response.SphereLightsError, match="analyser"):
+        with pytest.raises(sphere_lights.SphereLightsError, match="analyser"):
             lobe_response.facet_reflectance(RING, unit(view), eta)
     else:
         sent = lobe_response.facet_reflectance(RING, unit(view), eta)
         assert sent.shape == (6,)
         assert ((sent >= 0.0) & (sent * across <= 1.0 + 1e-9)).all()
-    place, slope = lobe_response.seen(np.array([vector]), mirror)
+    place, slope = lobe_response.direction_from_moments(np.array([vector]), mirror)
     assert np.hypot(*place[0]) <= 2.0 + 1e-9
     assert np.isfinite(slope).all() or not np.any(vector)
 
@@ -374,25 +374,25 @@ def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, m
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
 def test_lobes_of_what_is_not_finite_are_an_error(bad):
     up = np.array([0.0, 0.0, 1.0])
-    with pytest.raises(lobe_response.SphereLightsError, match="place"):
-        lobe_response.normal_at(np.array([0.1, bad]))
-    with pytest.raises(lobe_response.SphereLightsError, match="normal"):
-        lobe_response.place_of(np.array([0.1, bad, 1.0]))
-    with pytest.raises(lobe_response.SphereLightsError, match="view"):
-        lobe_response.frame_of([0.0, bad, 1.0])
-    with pytest.raises(lobe_response.SphereLightsError, match="view"):
-        lobe_response.frame_of([0.0, 0.0, 0.0])
-    with pytest.raises(lobe_response.SphereLightsError, match="view"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="place"):
+        sphere_lights.normal_at(np.array([0.1, bad]))
+    with pytest.raises(sphere_lights.SphereLightsError, match="normal"):
+        sphere_lights.place_of(np.array([0.1, bad, 1.0]))
+    with pytest.raises(sphere_lights.SphereLightsError, match="view"):
+        sphere_lights.frame_of([0.0, bad, 1.0])
+    with pytest.raises(sphere_lights.SphereLightsError, match="view"):
+        sphere_lights.frame_of([0.0, 0.0, 0.0])
+    with pytest.raises(sphere_lights.SphereLightsError, match="view"):
         lobe_response.facet_reflectance(RING, np.array([bad, 0.0, 1.0]), 1.4)
-    with pytest.raises(lobe_response.SphereLightsError, match="eta"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="eta"):
         lobe_response.facet_reflectance(RING, up, bad)
-    with pytest.raises(lobe_response.SphereLightsError, match="vector"):
-        lobe_response.seen(np.array([[0.0, bad, 1.0]]), True)
-    with pytest.raises(lobe_response.SphereLightsError, match="alpha"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="vector"):
+        lobe_response.direction_from_moments(np.array([[0.0, bad, 1.0]]), True)
+    with pytest.raises(sphere_lights.SphereLightsError, match="alpha"):
         lobe_response.specular(RING, view=up, alpha=bad, eta=1.4)
-    with pytest.raises(lobe_response.SphereLightsError, match="alpha_stderr"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="alpha_stderr"):
         lobe_response.specular(RING, view=up, alpha=0.3, eta=1.4, alpha_stderr=bad)
-    with pytest.raises(lobe_response.SphereLightsError, match="eta"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="eta"):
         lobe_response.diffuse(RING, view=up, eta=bad)
 
 

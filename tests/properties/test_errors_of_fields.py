@@ -64,7 +64,7 @@ def test_the_error_of_a_mean_has_the_unit_of_values_and_no_place_of_zero(seed, s
 
 
 @CHEAP
-@given(count=st.integers(0, block_errors.LEAST_BLOCKS - 1))
+@given(count=st.integers(0, block_errors.MIN_BLOCKS - 1))
 def test_too_few_blocks_have_an_endless_error(count):
     told = block_errors.stderr_of_mean(np.zeros(count), np.ones(count), np.zeros((count, 2)))
     assert told == (np.inf, 1.0)

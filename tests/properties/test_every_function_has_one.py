@@ -49,20 +49,25 @@ NOT_DRIVEN = {
         (
             SESSION,
             {
-                "reconstruction.pipeline.dome.calibrated": "apart calibrated rows seen_from",
+                "reconstruction.pipeline.dome.calibrated": (
+                    "calibrated reorder_lights seen_from split_exposures"
+                ),
                 "reconstruction.pipeline.dome.motion": "follow_head",
-                "reconstruction.pipeline.dome.registration": "register spread",
-                "reconstruction.pipeline.dome.stages": "graph maps_of weight_names",
+                "reconstruction.pipeline.dome.registration": "farthest_point_sample register",
+                "reconstruction.pipeline.dome.lobes": "fit_lobes refine_normals weight_names",
+                "reconstruction.pipeline.dome.stages": "graph maps_of",
                 "reconstruction.pipeline.flash.facial_color": (
                     "alignment_document fit repeats_document"
                 ),
                 "reconstruction.pipeline.flash.stages": "diffuse_of_each graph inputs_of",
-                "reconstruction.pipeline.gradient.images": "state_name",
                 "reconstruction.pipeline.gradient.stages": "graph products",
                 "reconstruction.pipeline.recipes": "light_list recipe_of reconstruct",
                 "reconstruction.pipeline.probe.images": "measurement_name",
-                "reconstruction.pipeline.probe.stages": "fit_profiles graph products site_values",
-                "reconstruction.pipeline.flash.sequence_blood": "blood_of_discs usable",
+                "reconstruction.pipeline.probe.profile_fits": (
+                    "fit_profiles profile_groups site_values"
+                ),
+                "reconstruction.pipeline.probe.stages": "graph products",
+                "reconstruction.pipeline.flash.sequence_blood": "blood_of_discs",
                 "reconstruction.pipeline.flash.sequence": "graph products",
                 "reconstruction.pipeline.gradient.skin_strain": "measure_states skin_mask",
                 "reconstruction.pipeline.light_stack": "graph",
@@ -116,7 +121,7 @@ NOT_DRIVEN = {
                 ),
                 "reconstruction.chromophores.face_distribution": "fit",
                 "reconstruction.kernel_fit.fit": "convolved_histogram fit_kernel",
-                "reconstruction.kernel_fit.outcome": "described",
+                "reconstruction.kernel_fit.outcome": "summarize_search",
                 "reconstruction.kernel_fit.search": "exhaustive gentlest hierarchical",
                 "reconstruction.kernel_fit.neutral_relief": "convolved",
                 "reconstruction.facial_color.shared_melanin": "estimate_shared_melanin",
@@ -138,6 +143,14 @@ NOT_DRIVEN = {
             INNER,
             {
                 "model.brdf.recipe": "materials",
+                "model.vectors": "unit_vectors",
+                "reconstruction.gradient_normals.inversion": (
+                    "analyzer_of grid_of invert_moments places_of views_of"
+                ),
+                "reconstruction.gradient_normals.reflection": "separate_reflection",
+                "reconstruction.gradient_normals.sphere_lights": (
+                    "require_finite require_unit_vectors"
+                ),
                 "model.facial_color.basis": "fitted transferred",
                 "model.texture_statistics.space": "weight_of",
                 "reconstruction.chromophores.lines": "lines_of",

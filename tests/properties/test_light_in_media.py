@@ -304,7 +304,7 @@ def test_an_index_that_no_matter_has_is_an_error(average, eta):
 def test_averages_of_any_index_are_finite_or_refused(eta):
     assert 0.0 <= fresnel.reflectance(0.3, eta) <= 1.0
     assert 0.0 <= fresnel.reflectance(0.3, 1.0 / eta) <= 1.0
-    if eta > fresnel.LARGEST_INDEX:
+    if eta > fresnel.MAX_INDEX:
         with pytest.raises(ValueError, match="eta"):
             fresnel.boundary_factor(eta)
     else:
@@ -481,11 +481,11 @@ def test_even_light_comes_back_as_albedo_and_sums_agree(r_d, length, level, seed
     area, light = np.full(40, 2.5), np.full((40, 3), level)
     args = (points, area, light, points[:4], r_d, length)
     even = dipole_gather.exitance(*args)
-    np.testing.assert_allclose(even, r_d * level, rtol=dipole_gather.TOLERANCE)
+    np.testing.assert_allclose(even, r_d * level, rtol=dipole_gather.GATHER_TOL)
     light *= rng.uniform(0.0, 1.0, (40, 3))
     quick = dipole_gather.exitance(*args)
     slow = dipole_sum.exitance_directly(*args)
-    np.testing.assert_allclose(quick, slow, atol=dipole_gather.TOLERANCE * max(level, 1e-300))
+    np.testing.assert_allclose(quick, slow, atol=dipole_gather.GATHER_TOL * max(level, 1e-300))
     tree = dipole_gather.SourceTree.of(points, area)
     told = dipole_gather.gather(tree, light, points[:4], r_d, length)
     np.testing.assert_array_equal(told.exitance, quick)

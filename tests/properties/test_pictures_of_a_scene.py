@@ -85,7 +85,7 @@ def test_restored_normals_are_unit_vectors_and_what_is_not_valid_is_not_read(
     first = lens_restoration.restore(normals, lens=lens, valid=valid, smooth_px=smooth)
     np.testing.assert_allclose(np.linalg.norm(first.normals, axis=-1), 1.0, atol=1e-9)
     assert (first.normals[~valid] == (0.0, 0.0, 1.0)).all()
-    assert 0.0 <= first.kept_noise <= lens_restoration.MOST_GAIN * first.noise * (1 + 1e-9)
+    assert 0.0 <= first.kept_noise <= lens_restoration.MAX_GAIN * first.noise * (1 + 1e-9)
     spoilt = np.where(valid[..., None], normals, bad)
     again = lens_restoration.restore(spoilt, lens=lens, valid=valid, smooth_px=smooth)
     np.testing.assert_array_equal(again.normals, first.normals)

@@ -340,7 +340,7 @@ def test_the_scan_is_laid_onto_the_ellipsoid(found):
 def test_what_was_made_once_is_not_made_again(found):
     folder, first = found
     assert first.outcome.assumed == ()
-    document = folder / "appearance" / store.DOCUMENT
+    document = folder / "appearance" / store.DOCUMENT_FILE
     written = document.stat().st_mtime_ns
     again = pipeline.reconstruct(
         folder / "session-ellipsoid",

@@ -9,7 +9,7 @@ import pytest
 from capture.session import Session
 from model import store
 from reconstruction.kernel_fit import fit_kernel
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.evidence import EvidenceError
@@ -167,7 +167,7 @@ def test_a_kernel_halves_the_distance_of_the_true_histograms_at_every_step():
             axis="x",
             pixel_um=pixel_um,
             stretch_across=state.stretch_t,
-            alphas=ALPHAS[::5],
+            alphas=ALPHA_GRID[::5],
             sigmas_um=SIGMAS_UM[::5],
         )
         assert fit.distance <= 0.5 * fit.distance_before, (r, fit.distance, fit.distance_before)

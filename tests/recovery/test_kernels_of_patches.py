@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reconstruction.kernel_fit import fit_kernel
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
-from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, grid_of
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
+from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, grid_of
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.normal_integration.height_filters import high_pass
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -24,7 +24,7 @@ def shown(state, shape):
 
 def blocks_of(rest, strained, sides):
     """Count a strained piece's normals in the blocks of the same skin at rest."""
-    grid = grid_of(rest.shape, BLOCKS)
+    grid = grid_of(rest.shape, BLOCKS_PER_SIDE)
     rows, columns = np.indices(strained.shape)
     down, right = (
         np.floor((0.5 * n + (place - 0.5 * (m - 1)) / side) * parts / n).astype(int)
@@ -47,7 +47,12 @@ def test_kernels_of_small_patches_hold_those_of_the_skin_they_are_of():
     if both maps were taken for different skin.
     Tolerance: two deviations of 24 independent pieces; pieces and states of a skin are alike.
     """
-    grid = {"alphas": ALPHAS[::3], "sigmas_um": SIGMAS_UM[::3], "axis": "x", "pixel_um": PIXEL_UM}
+    grid = {
+        "alphas": ALPHA_GRID[::3],
+        "sigmas_um": SIGMAS_UM[::3],
+        "axis": "x",
+        "pixel_um": PIXEL_UM,
+    }
     held, held_95, narrower = [], [], []
     for seed in range(520, 532):
         skin = make_micro_skin(SITES[seed % 3], seed=seed, size_mm=3.4)

@@ -78,4 +78,4 @@ def test_sites_are_placed_by_a_table_of_landmarks(bench, tmp_path):
         )
         made.append(store.read(tmp_path / name).maps["translucency"].stderr[..., 1])
     assert made[1][128, 200] < 0.5 * made[0][128, 200]
-    assert json.loads((tmp_path / "moved" / store.DOCUMENT).read_text())["inputs"]["landmarks"]
+    assert json.loads((tmp_path / "moved" / store.DOCUMENT_FILE).read_text())["inputs"]["landmarks"]

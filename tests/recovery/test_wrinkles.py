@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from model import metrics, wrinkles
-from model.wrinkles import JIMENEZ2011
+from model.wrinkles import JIMENEZ2011_TABLE
 from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import zones as wrinkle_zones
@@ -38,8 +38,8 @@ def test_furrows_that_deepen_and_narrow_are_mostly_one_map_times_weights():
     left = part_of_neutral_s_error(fit.model(), neutral, states, covered)
     assert left < 0.4
     # weights follow the table that raised the furrows, up to each zone's scale and law
-    got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011.rows])
-    true = np.array(list(JIMENEZ2011.rows.values()))
+    got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011_TABLE.rows])
+    true = np.array(list(JIMENEZ2011_TABLE.rows.values()))
     for z in range(8):
         assert np.corrcoef(got[:, z], true[:, z])[0, 1] > 0.9
     # zones in wrong places must show: the test can fail

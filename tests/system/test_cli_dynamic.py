@@ -8,7 +8,7 @@ import pytest
 from model import store
 from model.facial_color import HemoglobinRig
 from model.facial_color import document as facial_color_document
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.appearances import dynamic
 from skinrig.cli import main
 
@@ -21,8 +21,8 @@ def moving(tmp_path):
     neutral = np.clip(0.02 + 0.004 * rng.standard_normal((SIDE, SIDE)), 0.005, 0.05)
     rig = HemoglobinRig.from_maps(neutral, {"smile": 1.5 * neutral}, radius_px=6.0)
     maps, document = facial_color_document.to_maps(rig)
-    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
-    files = {facial_color_document.DOCUMENT: document}
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), MAP_UNITS["melanin"])
+    files = {facial_color_document.RIG_DOCUMENT: document}
     dynamic.add(
         tmp_path / "moving", dynamic.FACIAL_COLOR, dynamic.Part(maps, files, {}, {}, "simulated")
     )
@@ -48,7 +48,7 @@ def test_an_expression_is_evaluated_and_told_in_one_document(moving, tmp_path, c
     assert document["schema"] == "skinrig.apply/1"
     assert set(document["maps"]) == {"hemoglobin", "melanin", "color"}
     assert document["figures"]["facial_color"]["clipped_fraction"] == 0.0
-    assert (out / store.DOCUMENT).is_file()
+    assert (out / store.DOCUMENT_FILE).is_file()
 
 
 @pytest.mark.parametrize(

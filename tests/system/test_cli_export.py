@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 from model import store
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
-from model.skin import UNITS, SkinAppearance, SkinMap
-from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from model.skin_reflectance import BASIS_FILE
+from reconstruction.pipeline.dome.lobes import _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.cli import app, main
@@ -123,8 +124,8 @@ def test_a_folder_that_is_not_there_is_named(tmp_path, capsys):
 
 
 def test_simulated_maps_need_no_use(tmp_path, capsys):
-    melanin = SkinMap(np.full((4, 6), 0.05), UNITS["melanin"])
-    blood = SkinMap(np.full((4, 6), 0.03), UNITS["hemoglobin"])
+    melanin = SkinMap(np.full((4, 6), 0.05), MAP_UNITS["melanin"])
+    blood = SkinMap(np.full((4, 6), 0.03), MAP_UNITS["hemoglobin"])
     folder = store.write(
         tmp_path / "flash", SkinAppearance({"melanin": melanin, "hemoglobin": blood}, "simulated")
     )

@@ -282,7 +282,7 @@ def recipes():
         "gradient": "Maps of the gradient rig",
         "fibres": "Maps of the fibre probe",
     }
-    found = {headings[kind]: recipe() for kind, recipe in pipeline.RECIPES.items()}
+    found = {headings[kind]: recipe() for kind, recipe in pipeline.RECIPE_OF_STEP.items()}
     return {**found, "Maps of pictures under listed lights": pipeline.light_list()}
 
 

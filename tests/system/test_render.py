@@ -8,7 +8,7 @@ import pytest
 
 from model import store
 from model.brdf import tables as brdf_tables
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.cli import main
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.lights import Light
@@ -62,10 +62,10 @@ def folder(tmp_path_factory):
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     valid = np.ones((SIZE, SIZE), bool)
     maps = {
-        "position": SkinMap(np.stack([x, y, z], -1), UNITS["position"], valid=valid),
-        "normals": SkinMap(normals, UNITS["normals"], valid=valid),
+        "position": SkinMap(np.stack([x, y, z], -1), MAP_UNITS["position"], valid=valid),
+        "normals": SkinMap(normals, MAP_UNITS["normals"], valid=valid),
         "r_d": SkinMap(
-            np.broadcast_to([0.6, 0.4, 0.3], (SIZE, SIZE, 3)), UNITS["r_d"], valid=valid
+            np.broadcast_to([0.6, 0.4, 0.3], (SIZE, SIZE, 3)), MAP_UNITS["r_d"], valid=valid
         ),
         "basis_weight_0": SkinMap(0.5 + 0.0 * x, "1", valid=valid),
         "basis_weight_1": SkinMap(1.0 + x / 120.0, "1", valid=valid),

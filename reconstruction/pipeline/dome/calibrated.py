@@ -128,15 +128,15 @@ def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
     return Dome(images, cameras, lights, lights, response, absolute, evidence.tell)
 
 
-def apart(dome: Dome) -> Dome:
+def split_exposures(dome: Dome) -> Dome:
     """Return the dome with each exposure an image of its own, as a moving head needs them."""
     images = dome.images.apart()
     order = [images.lights.index(light) for light, _ in images.captures]
     names = [f"{name} {exposure}" for name, exposure in images.captures]
-    return dataclasses.replace(dome, images=images, lights=rows(dome.table, order, names))
+    return dataclasses.replace(dome, images=images, lights=reorder_lights(dome.table, order, names))
 
 
-def rows(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
+def reorder_lights(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
     """Return a table with the rows of another in a given order, also more than once."""
     kept = {
         field: getattr(lights, field)[order]

@@ -12,7 +12,7 @@ from capture import hdr, raw
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.evidence import EvidenceError
-from reconstruction.pipeline.hold_out import NOTHING, HoldOut
+from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["DomeImage", "DomeImages", "SensorNoise"]
@@ -87,7 +87,7 @@ class DomeImages:
         noise: dict[str, SensorNoise] | None = None,
         kind: str = "olat",
         merge: bool = True,
-        without: HoldOut = NOTHING,
+        without: HoldOut = NO_HOLD_OUT,
     ) -> None:
         self._session = session
         self._noise = dict(noise or {})

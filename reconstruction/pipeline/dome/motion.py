@@ -18,7 +18,7 @@ from reconstruction.registration import head_motion
 from reconstruction.scan.mesh import RefinedScan
 
 TRACKED_POINTS: Final = 6_000
-STILL_PX: Final = 0.15
+MAX_STILL_MOTION_PX: Final = 0.15
 """Motion, in pixels of an image, below which the head counts as still."""
 
 
@@ -134,7 +134,7 @@ def follow_head(
     moved = np.einsum("nij,pj->npi", poses[:, :3, :3], points) + poses[:, None, :3, 3] - points
     apart = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
     usable = found.covered(when)
-    still = bool(usable.all() and apart.max(initial=0.0) < STILL_PX * pixel_mm)
+    still = bool(usable.all() and apart.max(initial=0.0) < MAX_STILL_MOTION_PX * pixel_mm)
     if not usable.any():
         raise EvidenceError(
             f"{session.path}: no image lies between two tracking frames that tell where the "

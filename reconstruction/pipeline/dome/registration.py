@@ -6,8 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.pipeline.dome.calibrated import Dome, rows
+from reconstruction.pipeline.dome.calibrated import Dome, reorder_lights
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.scan import registration as scan_registration
 from reconstruction.scan.registration import RigidFit
@@ -15,7 +16,7 @@ from reconstruction.scan.repair import TriangleMesh
 
 ALIGNING_LIGHTS: Final = 40
 """Lights whose images say where the mesh is."""
-SIGNAL: Final = 5.0
+MIN_SIGNAL_TO_NOISE: Final = 5.0
 """Times its noise from which on a pixel shows something."""
 
 
@@ -34,7 +35,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
     EvidenceError
         No light stands before the face, or the mesh is not found in the images.
     """
-    chosen = spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+    chosen = farthest_point_sample(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
     shares = []
 
     def stacks(view: int) -> Float32Array:
@@ -43,7 +44,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
             image = dome.image(view, capture)
             gray = image.rgb.mean(axis=-1)
             noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
-            seen = image.valid & (gray > SIGNAL * noise)
+            seen = image.valid & (gray > MIN_SIGNAL_TO_NOISE * noise)
             shares.append((np.mean(~image.valid), np.mean(seen)))
             layers.append(np.where(image.valid, gray, np.nan))
         return np.asarray(layers, np.float32)
@@ -52,7 +53,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         return scan_registration.align(
             mesh,
             cameras=dome.cameras,
-            lights=rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+            lights=reorder_lights(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
             stacks=stacks,
             binning=2,
             rng=np.random.default_rng(0),
@@ -65,9 +66,9 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         ) from exc
 
 
-def spread(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
+def farthest_point_sample(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
     """Choose lights that light the face, each next one the farthest from those before."""
-    way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
+    way = unit_vectors(position_mm)
     front = np.flatnonzero(usable & (way[:, 2] > -0.1))
     if not len(front):
         raise EvidenceError("lights: none that can be used stands before the face")

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import math
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from model.brdf import tables as brdf_tables
-from model.brdf.tables import BrdfBasis
 from model.skin import SkinMap
-from reconstruction import brdf_basis, photometric_stereo
-from reconstruction.arrays import Float64Array
-from reconstruction.lumitexels import Lumitexels, Surface
+from model.skin_reflectance import BASIS_FILE
+from model.vectors import unit_vectors
+from reconstruction import photometric_stereo
+from reconstruction.lumitexels import Surface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.dome.calibrated import Dome, apart, calibrated
+from reconstruction.pipeline.dome.calibrated import Dome, calibrated, split_exposures
 from reconstruction.pipeline.dome.images import DomeImages
+from reconstruction.pipeline.dome.lobes import (
+    BASIS_RANK,
+    RECORDED_RANKS,
+    Samples,
+    fit_lobes,
+    refine_normals,
+    weight_names,
+)
 from reconstruction.pipeline.dome.motion import Motion, follow_head
 from reconstruction.pipeline.dome.registration import register
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
@@ -36,18 +40,10 @@ from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 
-REVISION = 4
+STAGE_REVISION = 4
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-RANK: Final = 4
-"""Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
-UNUSUAL: Final = 6.0
-"""Times the usual strength from which on a point's mixture is not used to find the common ones."""
-RANKS: Final = (1, 2, RANK, 2 * RANK, 24)
-"""Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
-BASIS_POINTS: Final = 5_000
-"""Points, drawn at random, that the mixtures are found on."""
-SCAN: Final = "scan.ply"
+SCAN_FILE: Final = "scan.ply"
 MEMORY_BYTES: Final = 2**30
 """Size of the table of samples from which on it lies in files and not in memory."""
 FACE_MM2: Final = 60_000.0
@@ -56,18 +52,7 @@ POINT_LIMITS: Final = (8_000, 1_000_000)
 TEXTURE_LIMITS: Final = (128, 2048)
 
 
-def weight_names(rank: int = RANK) -> tuple[str, ...]:
-    """Return the names of the maps of shares of so many lobes.
-
-    Examples
-    --------
-    >>> weight_names(2)
-    ('basis_weight_0', 'basis_weight_1')
-    """
-    return tuple(f"basis_weight_{k}" for k in range(rank))
-
-
-def maps_of(rank: int = RANK) -> tuple[str, ...]:
+def maps_of(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps that can be made of a dome session."""
     return (
         "position",
@@ -81,46 +66,24 @@ def maps_of(rank: int = RANK) -> tuple[str, ...]:
     )
 
 
-REFINEMENTS = 2
-"""Turns of fitting normals by the lobes, and the lobes at the normals."""
-WEIGHTS = weight_names()
-MAPS = maps_of()
+WEIGHT_NAMES = weight_names()
+MAP_NAMES = maps_of()
 """Maps that can be made of a dome session, unless another rank is asked for."""
-BASIS_FILE = "brdf_basis.npz"
 MESH_FILE = "mesh.obj"
-FILES = (MESH_FILE, BASIS_FILE)
+FILE_NAMES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Samples:
-    """Lumitexels of the surface, and the folder that holds them where they are many."""
-
-    store: LumitexelStore
-    folder: Any
-    lights: int
-    """Lights of the dome: where exposures stay apart, several captures are of one."""
-
-    def collect(
-        self,
-        estimate: Callable[[slice, Lumitexels], PointValues],
-        progress: Callable[[float], None] | None = None,
-    ) -> PointValues:
-        """Estimate at all points; see `estimates.collect`."""
-
-        def by_light(part: slice, samples: Lumitexels) -> PointValues:
-            return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
-
-        return estimates.collect(self.store, by_light, progress=progress)
 
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(evidence)
-    base: dict[str, Any] = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base: dict[str, Any] = {
+        "revision": STAGE_REVISION,
+        "inputs": dict(sorted(evidence.hashes.items())),
+    }
     if evidence.hold_out:
         base["held_out"] = evidence.hold_out.record()
-    weights_made = weight_names(evidence.rank or RANK)
+    weights_made = weight_names(evidence.rank or BASIS_RANK)
 
     unscaled = (
         ""
@@ -141,14 +104,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     ) -> stages.Stage:
         return stages.Stage(name, needs, makes, run, {**base, **more}, refused)
 
+    known = ("surface", "lumitexels", "point_normals", "point_r_d")
     return [
         stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
-        stage(
-            "texture",
-            ("surface",),
-            ("texture", "position", MESH_FILE),
-            lambda surface: _texture(dome, surface),
-        ),
+        stage("texture", ("surface",), ("texture", "position", MESH_FILE), partial(_texture, dome)),
         stage(
             "motion",
             ("surface",),
@@ -161,61 +120,38 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             ("lumitexels",),
             lambda surface, motion: {"lumitexels": _lumitexels(dome, surface, motion)},
         ),
-        stage(
-            "sample counts",
-            ("lumitexels", "texture"),
-            ("samples",),
-            lambda lumitexels, texture: _counts(dome, lumitexels, texture),
-        ),
+        stage("sample counts", ("lumitexels", "texture"), ("samples",), partial(_counts, dome)),
         stage(
             "half-vector normals",
             ("lumitexels", "texture"),
             ("half_vector_normals",),
-            lambda lumitexels, texture: _half_vectors(dome, lumitexels, texture),
+            partial(_half_vectors, dome),
         ),
         stage(
             "normals",
             ("surface", "lumitexels", "texture"),
             ("point_normals", "normals"),
-            lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture),
+            partial(_normals, dome),
         ),
         stage(
             "albedo",
             ("surface", "lumitexels", "point_normals", "texture"),
             ("point_r_d", "r_d"),
-            lambda surface, lumitexels, point_normals, texture: _albedo(
-                dome, surface, lumitexels, point_normals, texture
-            ),
+            partial(_albedo, dome),
             unscaled,
         ),
         stage(
             "lobes",
             ("lumitexels", "point_normals", "point_r_d"),
             ("basis", "weights", "basis_file"),
-            lambda lumitexels, point_normals, point_r_d: _lobes(
-                evidence, lumitexels, point_normals, point_r_d
-            ),
-            ranks=list(RANKS),
+            partial(fit_lobes, evidence),
+            ranks=list(RECORDED_RANKS),
         ),
         stage(
             "refined normals",
-            (
-                "surface",
-                "lumitexels",
-                "point_normals",
-                "point_r_d",
-                "basis",
-                "weights",
-                "basis_file",
-                "texture",
-            ),
+            (*known, "basis", "weights", "basis_file", "texture"),
             ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
-            lambda surface, lumitexels, point_normals, point_r_d, basis, weights, file, texture: {
-                BASIS_FILE: file,
-                **_refined(
-                    dome, surface, lumitexels, point_normals, point_r_d, basis, weights, texture
-                ),
-            },
+            partial(refine_normals, dome),
         ),
     ]
 
@@ -243,14 +179,14 @@ def _dome(evidence: Evidence) -> Dome:
 def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
     session = evidence.session
-    if evidence.scan is None and SCAN not in session.attachments():
+    if evidence.scan is None and SCAN_FILE not in session.attachments():
         raise EvidenceError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
-    mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
+    mesh = session.attachment(SCAN_FILE) if evidence.scan is None else evidence.scan
     scan = scan_mesh.prepare(mesh, points=points)
     fit = register(dome, scan.coarse)
     evidence.noted["registration"] = {
@@ -277,7 +213,7 @@ def _require(dome: Dome) -> None:
             f"lights: got {lights} that can be used, expected at least {estimates.MIN_LIGHTS}"
         )
     place = dome.lights.position_mm[dome.lights.valid]
-    photometric_stereo.require_spread(place / np.linalg.norm(place, axis=1, keepdims=True))
+    photometric_stereo.require_spread(unit_vectors(place))
 
 
 def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
@@ -304,7 +240,7 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
     if motion is not None and motion.still:
         motion = None
     if motion is not None:
-        dome = apart(dome)
+        dome = split_exposures(dome)
     count = len(surface.points_mm) * len(dome.cameras) * len(dome.images.captures)
     folder = tempfile.TemporaryDirectory(prefix="skinrig-") if 12 * count > MEMORY_BYTES else None
     store = LumitexelStore(
@@ -382,151 +318,3 @@ def _albedo(
             "diffuse reflectance, camera RGB over that of a perfect white",
         ),
     }
-
-
-def _lobes(
-    evidence: Evidence, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
-) -> Mapping[str, Any]:
-    folder = evidence.basis
-    materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
-    store = lumitexels.store
-    rank = evidence.rank or RANK
-    good = np.flatnonzero(point_r_d.valid)
-    if len(good) < rank:
-        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
-    drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
-    fitted = []
-    for part, samples in store.chunks(estimates.chunk_points(store)):
-        rows = drawn[(drawn >= part.start) & (drawn < part.stop)] - part.start
-        if not len(rows):
-            continue
-        fitted.append(
-            brdf_basis.fit_weights(
-                estimates.surface_samples(
-                    estimates.rows_of(samples, rows),
-                    estimates.part_of(point_normals, part.start + rows),
-                    estimates.part_of(point_r_d, part.start + rows),
-                ),
-                materials,
-            ).weights
-        )
-    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * RANK))
-    most = min(shares.shape)
-    if rank > most:
-        raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
-    mixes = {
-        k: brdf_basis.reduce(shares, k, basis=materials)[1:]
-        for k in sorted({*RANKS, rank})
-        if k <= most
-    }
-    basis = materials.mixed(mixes[rank][0])
-    found = lumitexels.collect(
-        lambda part, samples: estimates.lobe_weights(
-            samples,
-            estimates.part_of(point_normals, part),
-            estimates.part_of(point_r_d, part),
-            basis,
-        ),
-        progress=partial(evidence.tell, "lobes"),
-    )
-    return {
-        "basis": basis,
-        "weights": found.values[:, :rank],
-        "basis_file": _basis_bytes(materials, rank, mixes),
-    }
-
-
-def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Float64Array:
-    """Return mixtures scaled to reflect equally much, without those that no sample holds down.
-
-    A lobe so narrow that no pair of light and view met it can have any share.
-    """
-    total = shares @ materials.strength()
-    some = total[total > 0]
-    usual = float(np.median(some)) if len(some) else 0.0
-    kept = (total > 0) & (total < UNUSUAL * usual)
-    if np.count_nonzero(kept) < least:
-        raise EvidenceError(
-            f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
-            f"reflects, expected at least {least}; more lights or views would show it"
-        )
-    return shares[kept] / total[kept, None]
-
-
-def _basis_bytes(
-    materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[Float64Array, float]]
-) -> bytes:
-    """Keep the lobes, and of every rank the mixtures of materials that they would be."""
-    mix = mixes[rank][0]
-    stream = io.BytesIO()
-    np.savez_compressed(
-        stream,
-        materials=np.array(materials.names),
-        mix=mix,
-        table=materials.mixed(mix).table[..., :rank],
-        light_radius_rad=materials.light_radius_rad,
-        ranks=np.array(list(mixes)),
-        error_by_rank=np.array([error for _, error in mixes.values()]),
-        mix_by_rank=np.concatenate([mix for mix, _ in mixes.values()]),
-    )
-    return stream.getvalue()
-
-
-def _refined(
-    dome: Dome,
-    surface: RefinedScan,
-    lumitexels: Samples,
-    point_normals: PointValues,
-    point_r_d: PointValues,
-    basis: BrdfBasis,
-    weights: Float64Array,
-    texture: SurfaceTexture,
-) -> Mapping[str, SkinMap]:
-    started = lumitexels.collect(
-        lambda part, samples: estimates.normals_from_remainder(
-            samples,
-            estimates.part_of(point_normals, part),
-            estimates.part_of(point_r_d, part),
-            weights[part],
-            basis,
-        ),
-        progress=partial(dome.tell, "normals by what lobes leave"),
-    )
-    known = point_normals.valid & point_r_d.valid
-    inside = PointValues(
-        np.where(started.valid[:, None], started.values, point_normals.values),
-        np.where(started.valid[:, None], started.stderr, point_normals.stderr),
-        known,
-    )
-    found, rank = inside, weights.shape[1]
-    for turn in range(REFINEMENTS):
-        normals, shares = found, weights
-        found = lumitexels.collect(
-            lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples,
-                estimates.part_of(inside, part),
-                estimates.part_of(point_r_d, part),
-                w[part],
-                basis,
-                now=n.values[part],
-            ),
-            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {REFINEMENTS}"),
-        )
-        fitted = lumitexels.collect(
-            lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
-                samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis
-            ),
-            progress=partial(dome.tell, f"lobes, {turn + 1} of {REFINEMENTS}"),
-        )
-        weights = fitted.values[:, :rank]
-    maps = {
-        name: texture.map(
-            fitted.values[:, k], fitted.stderr[:, k], fitted.valid, "1", "share of a common mixture"
-        )
-        for k, name in enumerate(weight_names(rank))
-    }
-    maps["lobe_residual"] = texture.map(
-        fitted.values[:, rank], None, fitted.valid, "1/sr", "weighted RMS of samples - model"
-    )
-    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
-    return {"normals_refined": texture.normals(found, "by the whole model, world frame"), **maps}

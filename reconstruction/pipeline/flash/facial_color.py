@@ -18,7 +18,7 @@ import numpy as np
 
 from model import color_table
 from model.facial_color import HemoglobinRig
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error, shading_prior
@@ -32,7 +32,7 @@ from reconstruction.facial_color.shared_melanin import SharedMelanin
 from reconstruction.pipeline.flash.stages import EXPOSURE_SPREAD
 from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
 
-CORRELATED_PX: Final = 3.0
+NOISE_CORRELATION_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
 RADIUS_SHARE: Final = 1 / 32
 """Radius of the disc over the larger side of the map, where none is given."""
@@ -185,7 +185,7 @@ def fit(
         one_face=subject.has_white,
     )
     blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
-    if not _valid(blood[NEUTRAL]).any():
+    if not blood[NEUTRAL].mask.any():
         raise UnknownBloodError(
             "blood at rest: expected pixels that tell it, got a standard error of more than half "
             "of it all over the face, as of very dark skin or little light; take more light, or "
@@ -193,17 +193,17 @@ def fit(
         )
     tell("scale and bias maps")
     rig = HemoglobinRig.from_maps(
-        np.where(_valid(blood[NEUTRAL]), blood[NEUTRAL].values, np.nan),
+        np.where(blood[NEUTRAL].mask, blood[NEUTRAL].values, np.nan),
         {
-            state: np.where(_valid(blood[state]), blood[state].values, np.nan)
+            state: np.where(blood[state].mask, blood[state].values, np.nan)
             for state in kept
             if state != NEUTRAL
         },
         radius_px=radius,
-        valid={state: _valid(blood[state]) for state in kept},
+        valid={state: blood[state].mask for state in kept},
         stderr={
             state: np.where(
-                _valid(blood[state]), shared.noise_stderr_hemoglobin[kept.index(state)], np.nan
+                blood[state].mask, shared.noise_stderr_hemoglobin[kept.index(state)], np.nan
             )
             for state in kept
         },
@@ -212,7 +212,7 @@ def fit(
     good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
     melanin = SkinMap(
         np.where(good, shared.melanin, 0.0),
-        UNITS["melanin"],
+        MAP_UNITS["melanin"],
         np.where(good, shared.stderr_melanin, 0.0),
         good,
         f"shared by {len(kept)} states",
@@ -253,8 +253,8 @@ def _align(
                 _light(fixed),
                 landmarks_moving=marks[0] if both else None,
                 landmarks_neutral=marks[1] if both else None,
-                valid_moving=_valid(diffuse),
-                valid_neutral=_valid(fixed),
+                valid_moving=diffuse.mask,
+                valid_neutral=fixed.mask,
             )
         except expression_alignment.AlignmentError as error:
             left_out.append((image.name, str(error)))
@@ -273,9 +273,9 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
         values, errors, good = [], [], []
         for one in aligned:
             found, noise = one.image.maps[name], one.image.maps[f"{name}_noise_stderr"]
-            both, error = (found.values, _valid(found)), noise.values
+            both, error = (found.values, found.mask), noise.values
             if one.alignment is not None:
-                error = one.alignment.warp_stderr(found.values, noise.values, _valid(found))
+                error = one.alignment.warp_stderr(found.values, noise.values, found.mask)
                 both = one.alignment.warp(*both)
             values.append(both[0])
             errors.append(error)
@@ -286,7 +286,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     melanin, melanin_error, melanin_good = over("melanin")
     try:
         compared = repeatability.compare(
-            blood, states, stderr=blood_error, valid=blood_good, correlated_px=CORRELATED_PX
+            blood, states, stderr=blood_error, valid=blood_good, correlated_px=NOISE_CORRELATION_PX
         )
     except RepeatabilityError:
         return None
@@ -299,7 +299,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
             [one.image.captured_s for one in aligned],
             stderr=melanin_error,
             valid=melanin_good,
-            correlated_px=CORRELATED_PX,
+            correlated_px=NOISE_CORRELATION_PX,
         )
     except RepeatabilityError:
         drifts = ()
@@ -307,12 +307,12 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
 
 
 def _light(diffuse: SkinMap) -> Float32Array:
-    return np.where(_valid(diffuse)[..., None], diffuse.values, np.nan).astype(np.float32)
+    return np.where(diffuse.mask[..., None], diffuse.values, np.nan).astype(np.float32)
 
 
 def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -> AlignedImage:
     stderr = np.zeros_like(diffuse.values) if diffuse.stderr is None else diffuse.stderr
-    good = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
+    good = diffuse.mask & (diffuse.values > 0).all(axis=-1)
     return AlignedImage(
         image,
         np.where(good[..., None], diffuse.values, 0.0),
@@ -367,7 +367,7 @@ def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good &= detectable(shared.hemoglobin[k], shared.stderr_hemoglobin[k], good)
     return SkinMap(
         np.where(good, shared.hemoglobin[k], 0.0),
-        UNITS["hemoglobin"],
+        MAP_UNITS["hemoglobin"],
         np.where(good, shared.stderr_hemoglobin[k], 0.0),
         good,
         "given the melanin that all states share",
@@ -379,16 +379,11 @@ def _change(shared: SharedMelanin, k: int) -> SkinMap:
     good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
     return SkinMap(
         np.where(good, shared.change[k], 0.0),
-        UNITS["hemoglobin"],
+        MAP_UNITS["hemoglobin"],
         np.where(good, shared.stderr_change[k], 0.0),
         good,
         "less the neutral state; errors that both share are left out",
     )
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:

@@ -25,19 +25,19 @@ from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.flash import sequence_blood
 from reconstruction.pipeline.flash import stages as flash_stages
 
-REVISION = 6
-CURVES = "perfusion_curves"
+STAGE_REVISION = 6
+CURVES_NAME = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
-MAPS = (*flash_stages.MAPS, CURVES)
+MAP_NAMES = (*flash_stages.MAP_NAMES, CURVES_NAME)
 """What can be made of a flash session."""
-FILES = (CURVES_FILE,)
+FILE_NAMES = (CURVES_FILE,)
 RADIUS_SHARE = 0.02
 """Radius of a place's disc, of the map's width: 5 mm of a face that fills the picture."""
-ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
+LANDMARK_ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
 """Landmarks that stand for a place where a table does not have the place itself."""
-STILL_PX = 0.1
+MAX_STILL_MOTION_PX = 0.1
 """A face whose median pixel moves less has not moved."""
-BEND = 0.07
+BLOOD_CURVE_STDERR = 0.07
 """Standard error of how the root of blood is bent over its change: not all vessels follow alike,
 and light that goes from skin to skin, of which the inversion knows nothing, is absorbed twice. Set
 on 14 events of seeds 0 to 19, 192 px across: the least with which 95 % intervals hold 92 % or
@@ -46,7 +46,7 @@ more (93 %); with none they hold 87 %."""
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
     """Return the files that names stand for."""
-    return {CURVES: (CURVES_FILE,)}
+    return {CURVES_NAME: (CURVES_FILE,)}
 
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
@@ -65,11 +65,11 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     return [
         *flash_stages.graph(evidence),
         stages.Stage(
-            CURVES,
+            CURVES_NAME,
             (),
             (CURVES_FILE,),
             curves,
-            {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+            {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
             | model_error.identity(),
             refused=refused,
         ),
@@ -156,13 +156,7 @@ def _places(
     evidence: Evidence, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
     """Return where the places lie on the face at rest, px."""
-    skin = (
-        np.mean(
-            [sequence_blood.usable(m) for m, rest in zip(maps, at_rest, strict=True) if rest],
-            axis=0,
-        )
-        > 0.5
-    )
+    skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
     if evidence.landmarks is None:
         evidence.assumed.append(
             "places: by the face's outline; a table of landmarks says where they are"
@@ -171,13 +165,13 @@ def _places(
     table = landmark_table.read(evidence.landmarks)
     found = {}
     for name in perfusion_curves.FACE_PLACES:
-        named = name if name in table else ALIASES.get(name, name)
+        named = name if name in table else LANDMARK_ALIASES.get(name, name)
         if named in table:
             found[name] = table[named]
     if not found:
         raise EvidenceError(
             f"{evidence.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
-            f"{', '.join((*perfusion_curves.FACE_PLACES, *ALIASES.values()))}"
+            f"{', '.join((*perfusion_curves.FACE_PLACES, *LANDMARK_ALIASES.values()))}"
         )
     return found
 
@@ -202,7 +196,7 @@ def _laid_over_rest(
         return still, list(maps)
     rows, columns = np.indices(off_valid.shape)
     shift = np.hypot(alignment.source_px[..., 0] - columns, alignment.source_px[..., 1] - rows)
-    if not alignment.valid.any() or np.median(shift[alignment.valid]) < STILL_PX:
+    if not alignment.valid.any() or np.median(shift[alignment.valid]) < MAX_STILL_MOTION_PX:
         return still, list(maps)
     both = on_valid & off_valid
     moved = np.array([_more_like(m, on, off, both) for m in maps])
@@ -217,14 +211,14 @@ def _laid_over_rest(
 
 def _mean(maps: Sequence[SkinMap], chosen: BoolArray) -> tuple[Float32Array, BoolArray]:
     picked = [m for m, take in zip(maps, chosen, strict=True) if take]
-    valid = np.logical_and.reduce([sequence_blood.usable(m) for m in picked])
+    valid = np.logical_and.reduce([m.mask for m in picked])
     mean = np.asarray(np.mean([m.values for m in picked], axis=0, dtype=np.float64), np.float32)
     return mean, np.asarray(valid, bool)
 
 
 def _more_like(image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray) -> bool:
     """Tell whether a frame is more like one picture than like another, in red: blood's least."""
-    good = both & sequence_blood.usable(image)
+    good = both & image.mask
     if not good.any():
         return False
 
@@ -306,7 +300,7 @@ def _fit_prompts(
         root,
         cycle_s=cycle_s,
         stderr=stderr,
-        bend=BEND,
+        bend=BLOOD_CURVE_STDERR,
         pose=PoseStep(blood.moved[known], of_pose),
     )
     return perfusion_fit.of_vessels(found)
@@ -329,7 +323,7 @@ def _of_event(
     at = time[known]
 
     def fit(which: Any) -> perfusion_fit.RelaxationFit:
-        found = perfusion_fit.fit_course(at, radius[which][..., known], bend=BEND)
+        found = perfusion_fit.fit_course(at, radius[which][..., known], bend=BLOOD_CURVE_STDERR)
         return perfusion_fit.of_vessels(found)
 
     fits = {names[k]: _of_fit(fit(k), 0) for k in usable}

@@ -32,7 +32,7 @@ POSE_SHARE = 0.10
 light, shadows and what lies under a pixel change with the pose. Most likely of the cheeks, where
 the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of noses 0.03, of
 places that hardly move less than 0.02."""
-ALWAYS = 0.9
+MIN_VALID_FRAME_FRACTION = 0.9
 """Part of the frames in which a pixel must be usable."""
 
 
@@ -103,12 +103,6 @@ def blood_of_discs(
     return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 
-def usable(skin_map: SkinMap) -> BoolArray:
-    """Return where a map means something, (H, W)."""
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
-
-
 def _of_place(
     maps: Sequence[SkinMap],
     name: str,
@@ -123,7 +117,7 @@ def _of_place(
     top, left = (max(0, int(p.min() - 2 * window_px)) for p in (rows, columns))
     bottom, right = (int(p.max() + 2 * window_px) + 1 for p in (rows, columns))
     patch = np.s_[top:bottom, left:right]
-    valid = np.array([usable(m)[patch] for m in maps])
+    valid = np.array([m.mask[patch] for m in maps])
     rgb = np.array([m.values[patch] for m in maps])
     errors = [np.zeros_like(m.values) if m.stderr is None else m.stderr for m in maps]
     variance = np.square([error[patch] for error in errors])
@@ -141,7 +135,7 @@ def _of_place(
         )
         good = blood.valid_states & ~blood.misfits & np.isfinite(blood.hemoglobin)
         # a pixel counts in nearly all frames or in none: who is in it would change the mean
-        good &= good.mean(axis=0) >= ALWAYS
+        good &= good.mean(axis=0) >= MIN_VALID_FRAME_FRACTION
         return disc_means(
             blood.hemoglobin, at, radius_px, stderr=blood.noise_stderr_hemoglobin, valid=good
         )

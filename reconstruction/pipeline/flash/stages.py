@@ -19,7 +19,7 @@ from capture.calibration.sensor import SensorCalibration
 from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
 from capture.session import FrameRecord, Session
 from model import color_table
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import polarization
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
@@ -30,10 +30,10 @@ from reconstruction.chromophores.detectability import detectable
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
 
-REVISION = 7
+STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-MAPS = (
+MAP_NAMES = (
     "melanin",
     "hemoglobin",
     "shading",
@@ -82,7 +82,7 @@ class Inputs:
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
     inputs = inputs_of(evidence)
-    base = {"revision": REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
+    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
     table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
     return [
         stages.Stage(
@@ -296,7 +296,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
         level = np.full_like(diffuse.rgb, _assumed_white(inputs))
         reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
         valid = np.ones(diffuse.valid.shape, bool)
-    dim = (reflectance < DARKEST_SIGMAS * np.sqrt(variance)).any(axis=-1)
+    dim = (reflectance < MIN_SIGNAL_SIGMAS * np.sqrt(variance)).any(axis=-1)
     valid = valid & diffuse.valid & ~dim
     return {
         "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
@@ -309,7 +309,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
     }
 
 
-DARKEST_SIGMAS = 5.0
+MIN_SIGNAL_SIGMAS = 5.0
 """Signal over noise below which a pixel is background, not skin."""
 ASSUMED_WHITE = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
@@ -338,11 +338,6 @@ def _map3(
     )
 
 
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
-
-
 def _stderr(skin_map: SkinMap) -> Float32Array:
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
@@ -352,9 +347,9 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     prior = shading_prior.of_faces()
     if inputs.white is None:
         prior = prior.broadened(EXPOSURE_SPREAD)
-    rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
+    rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(_stderr(diffuse))
-    errors = model_error.of_picture(diffuse.values, variance, _valid(diffuse))
+    errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
     # of a face in light of unknown strength its pixels together tell no more
     face = (
         None
@@ -388,11 +383,11 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         why = "invalid where noise and model error leave it unknown"
         return {
             name: SkinMap(
-                np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good, why
+                np.where(good, values, 0.0), MAP_UNITS[name], np.where(good, stderr, 0.0), good, why
             ),
             name + NOISE_STDERR: SkinMap(
                 np.where(good, without_model_error, 0.0),
-                UNITS[name],
+                MAP_UNITS[name],
                 valid=good,
                 description="standard error that noise alone would leave, without model error",
             ),
@@ -418,7 +413,7 @@ EXPOSURE_SPREAD = 1.0
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    valid = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
+    valid = diffuse.mask & (diffuse.values > 0).all(axis=-1)
     found = tsumura.tsumura_ica(diffuse.values, valid)
     note = "independent component of optical density, no absolute scale"
     return {

@@ -18,8 +18,14 @@ from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.flash import stages as flash_stages
 
 NEUTRAL = "neutral"
-ONCE = ("diffuse",)
-REPEATED = (*ONCE, "melanin", "hemoglobin", "melanin_noise_stderr", "hemoglobin_noise_stderr")
+SINGLE_MAPS = ("diffuse",)
+REPEATED_MAPS = (
+    *SINGLE_MAPS,
+    "melanin",
+    "hemoglobin",
+    "melanin_noise_stderr",
+    "hemoglobin_noise_stderr",
+)
 """Where states are repeated each image's own chromophores tell how far they repeat."""
 
 Landmarks = Mapping[str, tuple[float, float]]
@@ -143,7 +149,7 @@ def read(
             f"sessions: show {', '.join(sorted(set(named)))}, expected a state {NEUTRAL!r} that "
             "the others are laid over"
         )
-    maps = REPEATED if len(set(named)) < len(named) else ONCE
+    maps = REPEATED_MAPS if len(set(named)) < len(named) else SINGLE_MAPS
     for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
         began_s = (session.manifest.created_at - start).total_seconds()
         for state, repeat, since_s in pairs[number]:

@@ -9,26 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture import raw
+from capture.plan.gradient import state_name
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
-__all__ = ["GradientImages", "Patterns", "SkinState", "state_name"]
+__all__ = ["GradientImages", "Patterns", "SkinState"]
 
 Key = tuple[str, str]
-
-
-def state_name(angle_deg: float, step: int) -> str:
-    """Return what a state of the skin is called: the caliper's angle, and its step.
-
-    Examples
-    --------
-    >>> state_name(0, 0), state_name(45, -2), state_name(90, 3)
-    ('a000_n0', 'a045_m2', 'a090_p3')
-    """
-    side = "n" if step == 0 else "m" if step < 0 else "p"
-    return f"a{round(angle_deg):03d}_{side}{abs(step)}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,11 @@ from scipy import ndimage
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
+from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
-from reconstruction.gradient_normals.lobe_response import SphereLights
+from reconstruction.gradient_normals.sphere_lights import SphereLights
 from reconstruction.normal_integration import integrate_map, relief_errors
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.lens_restoration import Aperture, Restored, restore
@@ -34,13 +35,13 @@ from reconstruction.pipeline.gradient.strain_kernels import (
 )
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
-REVISION = 7
+STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-MAPS = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
+MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
 """What can be made of a session of the gradient sphere; see `products` for what it stands for."""
 STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE = "strain.json", "histograms.json", "kernels.json"
-FILES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
+FILE_NAMES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
 CUTOFF_UM = 1000.0
 """What is longer is bulge, not relief (Nagano et al. 2015, section 4)."""
@@ -56,7 +57,7 @@ STDERR_SIGMA_PX = 8.0
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
-    """Return the maps and files that each name of :data:`MAPS` stands for in a session."""
+    """Return the maps and files that each name of :data:`MAP_NAMES` stands for in a session."""
     states = GradientImages(session).states
     neutral = states[0].name
     return {
@@ -95,7 +96,7 @@ class Rig:
         points = self.points_mm(shape)
         way = np.concatenate([-points, np.zeros((*shape, 1), np.float32)], axis=-1)
         way += self.camera_mm.astype(np.float32)
-        return way / np.linalg.norm(way, axis=-1, keepdims=True)
+        return unit_vectors(way)
 
     def perspective(self, shape: tuple[int, int]) -> Perspective:
         """Return the camera's rays."""
@@ -105,7 +106,7 @@ class Rig:
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a session of the gradient sphere can go through."""
     rig = _rig(evidence)
-    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     states = rig.images.states
     neutral = rig.images.neutral
     heights = tuple(f"height_{state.name}" for state in states)
@@ -336,7 +337,7 @@ def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool =
         stderr = relief_errors.of_normals(found.normals, stderr, valid)
     return SkinMap(
         np.asarray(found.normals, np.float32),
-        UNITS["normals"],
+        MAP_UNITS["normals"],
         np.repeat(stderr[..., None], 3, axis=2),
         valid,
         f"unit normals {what}, rig frame, +x right, +y up, +z to the camera; errors in rad",

@@ -13,22 +13,23 @@ from model.microstructure import KernelTableError
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.kernel_fit import fit_kernel
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
 from reconstruction.kernel_fit.table import KernelTableFitError, direction_dependence, fit_table
-from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, grid_of
+from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, grid_of
 from reconstruction.normal_histogram.statistics import NormalStatistics, measure
 from reconstruction.pipeline.gradient.skin_strain import StateStrain
 
-LEAST_SAMPLES = 1000
+MIN_SAMPLES = 1000
 """Fewer pixels make no histogram."""
-LEAST_STRAIN = 0.01
+MIN_STRAIN = 0.01
 """A state nearer to neutral than this has no kernel of its own: it would be that of the noise."""
 LINE_POINTS = 61
 FULL_GRID_PX = 1_000_000
-"""Patches of fewer pixels tell kernels no finer than by `COARSER` steps of the paper's grid."""
-COARSER = 3
-HIDDEN = 0.1
+"""Patches of fewer pixels tell kernels no finer than by `COARSE_GRID_STEP` steps of the paper's
+grid."""
+COARSE_GRID_STEP = 3
+HIDDEN_VARIANCE_RATIO = 0.1
 """Of a variance, what pictures hide: slopes that do not come back, and those longer than a levelled
 patch. The root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at 1.19
 (seeds 0 to 5). It is no scatter: states and patches have it alike, and how much it is the pictures
@@ -57,8 +58,8 @@ def count_normals(
     found: dict[str, NormalStatistics] = {}
     for each in strains:
         height = heights[each.state.name]
-        both = _valid(height) & _common(each, strains[0], heights, there=True)
-        if np.count_nonzero(both) >= LEAST_SAMPLES:
+        both = height.mask & _common(each, strains[0], heights, there=True)
+        if np.count_nonzero(both) >= MIN_SAMPLES:
             found[each.state.name] = measure(
                 height.values, pixel=pixel_um, valid=both, angle_rad=each.state.angle_rad
             )
@@ -71,7 +72,8 @@ def histogram_document(
     """Return the histograms as a document.
 
     Standard errors of its variances hold what another patch of the same skin and size would show,
-    and `HIDDEN`; of histograms and variances alike the relief is the one that heights show.
+    and `HIDDEN_VARIANCE_RATIO`; of histograms and variances alike the relief is the one that
+    heights show.
     """
     return {
         "schema": "skinrig.histograms/1",
@@ -87,9 +89,13 @@ def histogram_document(
                 "samples_per_bucket": one.samples_per_bucket,
                 "aliased": one.aliased,
                 "variance_s": one.variance_x,
-                "variance_s_stderr": math.hypot(one.stderr_x, HIDDEN * one.variance_x),
+                "variance_s_stderr": math.hypot(
+                    one.stderr_x, HIDDEN_VARIANCE_RATIO * one.variance_x
+                ),
                 "variance_t": one.variance_y,
-                "variance_t_stderr": math.hypot(one.stderr_y, HIDDEN * one.variance_y),
+                "variance_t_stderr": math.hypot(
+                    one.stderr_y, HIDDEN_VARIANCE_RATIO * one.variance_y
+                ),
             }
             for each in strains
             if (one := found.get(each.state.name)) is not None
@@ -111,7 +117,7 @@ def _common(
     shape = both[0].values.shape[:2]
     if not each.usable:
         return np.ones(shape, bool)
-    seen = _valid(both[0 if there else 1]).astype(np.uint8)
+    seen = both[0 if there else 1].mask.astype(np.uint8)
     affine = each.strain.affine_px((shape[0], shape[1]))
     # a pixel of the state shows what the neutral picture has where the map leads back to
     back = affine if not there else _inverse(affine)
@@ -153,7 +159,7 @@ def _skin_blocks(
     middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     x, y = column - middle[0], middle[1] - row
     row, column = middle[1] - (c * y - s * x), middle[0] + (c * x + s * y)
-    grid = grid_of(shape, BLOCKS)
+    grid = grid_of(shape, BLOCKS_PER_SIDE)
     down, right = (
         np.floor((place + 0.5) * parts / side).astype(np.int64)
         for place, parts, side in zip((row, column), grid, shape, strict=True)
@@ -224,18 +230,18 @@ def fit_kernels(
         for each in strains[1:]
         if each.usable
         and each.state.name in statistics
-        and abs(each.stretch_s[0] - 1.0) >= LEAST_STRAIN
+        and abs(each.stretch_s[0] - 1.0) >= MIN_STRAIN
     ]
     fits = []
     for number, each in enumerate(todo):
         tell(number / len(todo))
-        seen = _valid(height) & _common(each, neutral, heights, there=False)
+        seen = height.mask & _common(each, neutral, heights, there=False)
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
-        if np.count_nonzero(inside) < LEAST_SAMPLES:
+        if np.count_nonzero(inside) < MIN_SAMPLES:
             continue
         target, strained = statistics[each.state.name], heights[each.state.name]
-        there = _valid(strained) & _common(each, neutral, heights, there=True)
-        every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSER
+        there = strained.mask & _common(each, neutral, heights, there=True)
+        every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSE_GRID_STEP
         fit = fit_kernel(
             turned,
             target.histogram,
@@ -244,7 +250,7 @@ def fit_kernels(
             pixel_um=pixel_um,
             valid=inside,
             stretch_across=each.stretch_t[0],
-            alphas=ALPHAS[::every],
+            alphas=ALPHA_GRID[::every],
             sigmas_um=SIGMAS_UM[::every],
             target_samples=target.effective_samples,
             target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
@@ -357,8 +363,3 @@ def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
         "p_alpha": found.p_alpha,
         "p_sigma": found.p_sigma,
     }
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from rigsim.light import olat, surface_brdf
 from rigsim.light.olat import Hits
 from rigsim.light.surface_brdf import SkinSurface
@@ -57,12 +57,12 @@ def appearance_of(
     floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
     white = "camera RGB over that of a perfect white, without hair"
     maps = {
-        "position": (subject.atlas.position_mm, UNITS["position"], "rig frame"),
-        "normals": (surface.normal, UNITS["normals"], "rig frame, with relief"),
+        "position": (subject.atlas.position_mm, MAP_UNITS["position"], "rig frame"),
+        "normals": (surface.normal, MAP_UNITS["normals"], "rig frame, with relief"),
         "r_d": (surface.r_d, "1", f"factor of the diffuse term, {white}"),
         "r_d_floor": (floor, "1", "least surface term in the unit of r_d, within 70 degrees"),
         "reflectance": (surface.reflectance, "1", f"at normal incidence, {white}"),
-        "roughness": (surface.roughness, UNITS["roughness"], "Beckmann, skin below the oil"),
+        "roughness": (surface.roughness, MAP_UNITS["roughness"], "Beckmann, skin below the oil"),
         "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
         "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
         "normals_tangent": (

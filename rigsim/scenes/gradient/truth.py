@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
@@ -133,7 +133,9 @@ def _maps(scene: GradientScene, patch: PatchSurface) -> dict[str, SkinMap]:
     return {
         "height": one(patch.relief_um, "um", "relief without bulge and fold, points"),
         "bulged_height": one(patch.relief_um + patch.bulge_um, "um", "with bulge and fold"),
-        "normals": one(patch.normals, UNITS["normals"], "rig frame, with bulge and fold, points"),
+        "normals": one(
+            patch.normals, MAP_UNITS["normals"], "rig frame, with bulge and fold, points"
+        ),
         "normals_seen": one(normals, "1", "slopes averaged as the lens and the pixels do"),
         "albedo": one(patch.albedo, "1", "diffuse reflectance in the camera's band"),
     }

@@ -14,7 +14,7 @@ from reconstruction import kernel_fit, normal_histogram
 from reconstruction.kernel_fit import neutral_relief
 from reconstruction.kernel_fit import outcome as kernel_outcome
 from reconstruction.kernel_fit import search as kernel_search
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
@@ -103,7 +103,7 @@ def search(*, toy: bool) -> StageBenchmark:
     target = normal_histogram.histogram(
         strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
-    alphas, sigmas = (ALPHAS[::50], SIGMAS_UM[::20]) if toy else (ALPHAS, SIGMAS_UM)
+    alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if toy else (ALPHA_GRID, SIGMAS_UM)
 
     def fit(
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
@@ -165,11 +165,11 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     few = SIGMAS_UM[[10, 60, 150]]
-    ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHAS, few))
+    ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHA_GRID, few))
     ours_s *= SIGMAS_UM.size / few.size
     tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
     peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
-    peer_s *= ALPHAS.size * SIGMAS_UM.size / len(tried)
+    peer_s *= ALPHA_GRID.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
         abs(
             numpy_distance(height, target, alpha, sigma)

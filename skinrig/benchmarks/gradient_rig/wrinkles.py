@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import metrics, wrinkles
 from model import texture_resampling as resampling
-from model.wrinkles import JIMENEZ2011, Layer
+from model.wrinkles import JIMENEZ2011_TABLE, Layer
 from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import storage as wrinkle_storage
 from reconstruction.wrinkles import fit as wrinkle_fit
@@ -95,7 +95,7 @@ def furrowed_face(
         sharp = 1.0 + 3.0 * rise
         return np.asarray(-(rise**0.8) * np.exp(sharp * (np.cos(phase) - 1.0)))
 
-    rows = {name: JIMENEZ2011.row(name) for name in JIMENEZ2011.rows}
+    rows = {name: JIMENEZ2011_TABLE.row(name) for name in JIMENEZ2011_TABLE.rows}
     deep = {name: furrows(row) for name, row in rows.items()}
     scale = MAX_SLOPE / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
 
@@ -307,7 +307,7 @@ def storing(*, toy: bool) -> StageBenchmark:
     fitted = wrinkle_fit.fit(
         neutral, states, zone_masks(16 if toy else 64), size=(side, side), clamp="signed"
     )
-    wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.LIMIT, wrinkles.LIMIT)
+    wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.MAX_DERIVATIVE, wrinkles.MAX_DERIVATIVE)
     masks = fitted.layer.masks
     table = fitted.layer.table
     weights = {"surprise": 1.0, "disgust": 0.6}

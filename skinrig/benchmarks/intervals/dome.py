@@ -12,7 +12,7 @@ import numpy as np
 from model import metrics, store
 from model.skin import SkinAppearance
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.dome.stages import WEIGHTS
+from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import Trial
 from skinrig.benchmarks.intervals.trials import (
@@ -57,7 +57,7 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
         )
         pipeline.reconstruct(
             done.session,
-            want=[*NORMAL_MAP_NAMES, "r_d", *WEIGHTS],
+            want=[*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES],
             out=folder / "maps",
             calibration=calibration,
         )
@@ -154,7 +154,7 @@ def lobe_strength(
     test = reflection.surface_test(found, truth)
     if test is None:
         return np.zeros(0), np.zeros(0)
-    weights = [found.maps[name] for name in WEIGHTS]
+    weights = [found.maps[name] for name in WEIGHT_NAMES]
     valid = valid_of(weights[0]).reshape(-1)[test.texels]
     shares, errors = (
         np.stack(

@@ -19,13 +19,13 @@ import numpy as np
 from model import metrics, store
 from model.skin import SkinAppearance
 from reconstruction.kernel_fit import fit_kernel
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
-from reconstruction.pipeline.gradient.strain_kernels import COARSER
+from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.intervals.trials import (
     ANY_BAND,
@@ -217,7 +217,7 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
         stretch_across=float(strained.gradient[1, 1]),
         axis="x",
         pixel_um=pixel_um,
-        alphas=ALPHAS[::COARSER],
-        sigmas_um=SIGMAS_UM[::COARSER],
+        alphas=ALPHA_GRID[::COARSE_GRID_STEP],
+        sigmas_um=SIGMAS_UM[::COARSE_GRID_STEP],
         target_samples=target.effective_samples,
     )

@@ -14,7 +14,7 @@ from model import store
 from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, truth_of
@@ -186,7 +186,7 @@ def of_coefficient(
             if fit["method"] != evaluation.RECOMMENDED_METHOD or not told:
                 continue
             value = evaluation.number(fit[f"{name}_per_mm"])
-            off.append(abs(value / true[CHANNELS.index(fit["channel"])] - 1.0))
+            off.append(abs(value / true[CHANNEL_NAMES.index(fit["channel"])] - 1.0))
             stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
     spread = np.array(stderr)
     return Trial(
@@ -235,7 +235,7 @@ def of_directions(
         "degrees",
         GAUSSIAN_95,
     )
-    ratio = np.array([true.ratio[CHANNELS.index(row["channel"])] for row in rows])
+    ratio = np.array([true.ratio[CHANNEL_NAMES.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
     spread = np.array([row["ratio_stderr"] for row in rows])
     yield Trial(

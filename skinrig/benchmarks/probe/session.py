@@ -12,7 +12,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.probe.stages import METHODS
+from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.calibrating.calibrate import calibrate
@@ -55,7 +55,7 @@ def session(*, toy: bool) -> StageBenchmark:
         timing = measure(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
     by_method = {row.method: row for row in evaluation.by_method(rows)}
     points = []
-    for method in (name for name in METHODS if name in by_method):
+    for method in (name for name in METHOD_NAMES if name in by_method):
         valid = [row for row in rows if row.method == method and row.valid]
         for channel in ("all", *sorted({row.channel for row in valid})):
             sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
@@ -119,7 +119,7 @@ def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitE
 
 
 def _limits(by_method: Mapping[str, evaluation.MethodError]) -> tuple[Limit, ...]:
-    best, dipole = by_method[METHODS[0]], by_method["dipole"]
+    best, dipole = by_method[METHOD_NAMES[0]], by_method["dipole"]
     return (
         Limit(
             "sigma_tr, median error",
@@ -151,7 +151,7 @@ def _captured(folder: Path, name: str, coefficients: tuple[float, float, float],
 
 def _best(rows: list[evaluation.FitError]) -> BandError:
     """Return the error of the usual method over the channels of one medium, %."""
-    sizes = [abs(row.relative) for row in rows if row.method == METHODS[0] and row.valid]
+    sizes = [abs(row.relative) for row in rows if row.method == METHOD_NAMES[0] and row.valid]
     return BandError(100 * float(np.median(sizes)), _interval(sizes))
 
 

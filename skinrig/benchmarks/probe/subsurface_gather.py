@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from model.dipole import direct_sum as dipole_sum
 from model.dipole.direct_sum import Media, exitance_directly
-from model.dipole.gather import TOLERANCE, SourceTree, gather
+from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
@@ -191,7 +191,7 @@ def _edge(
     return np.asarray(found.exitance / skin[0])
 
 
-def _gathered(scene: Scene, tree: SourceTree, tolerance: float = TOLERANCE) -> Float64Array:
+def _gathered(scene: Scene, tree: SourceTree, tolerance: float = GATHER_TOL) -> Float64Array:
     return gather(
         tree, scene.entered, scene.place, scene.r_d, scene.translucency_mm, tolerance=tolerance
     ).exitance

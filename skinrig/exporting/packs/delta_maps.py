@@ -21,7 +21,7 @@ import numpy as np
 from model import wrinkles
 from model.skin import SkinAppearance
 from model.texture_resampling import resampled
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES

@@ -199,7 +199,7 @@ def evaluate_folders(
     photographs = Photographs.of(session, read, calibration=calibration)
     named = str(read.parameters.get("truth", "") or "")
     beside = appearance.resolve().parent / named
-    found = store.read(beside) if named and (beside / store.DOCUMENT).is_file() else None
+    found = store.read(beside) if named and (beside / store.DOCUMENT_FILE).is_file() else None
     comparison, pictures = evaluate(
         read,
         photographs,

@@ -52,7 +52,7 @@ def kind_of(path: Path) -> Kind:
     bench`, or a folder that holds one and no maps; "pictures": a folder of a rendering or an
     analysis; "run": a folder with folders of maps or of pictures.
     """
-    if (path / store.DOCUMENT).is_file():
+    if (path / store.DOCUMENT_FILE).is_file():
         kind = store.read_document(path).parameters.get("kind")
         return "truth" if kind == "truth" else "maps"
     if path.is_file():
@@ -62,7 +62,7 @@ def kind_of(path: Path) -> Kind:
     if pictures.folder_document(path) is not None:
         return "pictures"
     if any(
-        (entry / store.DOCUMENT).is_file() or pictures.folder_document(entry) is not None
+        (entry / store.DOCUMENT_FILE).is_file() or pictures.folder_document(entry) is not None
         for entry in path.iterdir()
     ):
         return "run"

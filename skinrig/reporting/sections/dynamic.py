@@ -10,8 +10,7 @@ import numpy as np
 from model import microstructure
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
-from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.appearances.dynamic import (
     DYNAMIC_KIND,

@@ -17,7 +17,7 @@ from model.translucency_population import (
     table,
     weyrich_2005,
 )
-from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import page
 
@@ -60,7 +60,7 @@ def section(
         "skin."
     )
     rows: list[tuple[object, ...]] = []
-    for c, channel in enumerate(CHANNELS):
+    for c, channel in enumerate(CHANNEL_NAMES):
         row: list[object] = ["published (Weyrich et al. 2005, table 2)", channel]
         for s in range(len(published.sites)):
             row += [float(published.mean_per_mm[s, c]), float(published.deviation_per_mm[s, c])]

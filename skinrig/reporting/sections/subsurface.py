@@ -11,7 +11,7 @@ import numpy as np
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.stages import (
     ANISOTROPY_FILE,
-    CHANNELS,
+    CHANNEL_NAMES,
     PROFILE_FILE,
     SUBSURFACE_FILE,
 )
@@ -70,7 +70,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
     for entry in _one_of_each_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
         found = by_name.get(entry["name"])
         series = []
-        for channel in CHANNELS:
+        for channel in CHANNEL_NAMES:
             one = entry["channels"][channel]
             value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             value = np.where(np.asarray(one["valid"], bool), value, np.nan)
@@ -148,7 +148,7 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[
         for fit in entry["fits"]:
             real = float("nan")
             if true is not None:
-                real = float(true["sigma_tr_per_mm"][CHANNELS.index(fit["channel"])])
+                real = float(true["sigma_tr_per_mm"][CHANNEL_NAMES.index(fit["channel"])])
             found = number(fit["sigma_tr_per_mm"])
             low, high = numbers(fit["interval_per_mm"])
             rows.append(
@@ -245,8 +245,8 @@ def _errors(
 
 
 def _by_channel(rows: Sequence[evaluation.FitError]) -> Iterator[page.Block]:
-    labels = [f"{name}, {c}" for name in dict.fromkeys(r.name for r in rows) for c in CHANNELS]
-    if len(labels) > 4 * len(CHANNELS):
+    labels = [f"{name}, {c}" for name in dict.fromkeys(r.name for r in rows) for c in CHANNEL_NAMES]
+    if len(labels) > 4 * len(CHANNEL_NAMES):
         return
     series = {}
     for method, words in METHOD_NAMES.items():
@@ -310,7 +310,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     if found is None:
         return
     images = []
-    for c, channel in enumerate(CHANNELS):
+    for c, channel in enumerate(CHANNEL_NAMES):
         values = found.values[..., c]
         inside = values if found.valid is None else values[found.valid]
         if not inside.size:

@@ -24,7 +24,7 @@ def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tu
     name = (part.get("truth") or {}).get("neutral")
     if isinstance(name, str):
         folder = source.paths["dynamic"].resolve().parent / Path(name).name
-        if (folder / store.DOCUMENT).is_file():
+        if (folder / store.DOCUMENT_FILE).is_file():
             points: Any = store.read_document(folder).parameters.get("landmarks_px")
             if isinstance(points, dict):
                 return {key: (float(x), float(y)) for key, (x, y) in points.items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.facial_color.coarse_maps import fitting
-from model.facial_color.document import DOCUMENT, from_maps_and_document
+from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
@@ -44,7 +44,7 @@ def placed(source: SceneSource, subject: SimulatedSubject) -> FaceColor:
     from skinrig.viewer.assets.image_landmarks import picture_landmarks
 
     appearance = source.appearances["dynamic"]
-    rig = from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
+    rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
     marks = picture_landmarks(source, parts_of(appearance)[FACIAL_COLOR])
     surface = subject.surface_landmarks()
     points = {

@@ -16,7 +16,7 @@ from model import color_table, skin_reflectance, spectra
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
-from model.skin_reflectance import TRANSLUCENCY
+from model.skin_reflectance import TRANSLUCENCY_MAP
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
@@ -179,8 +179,8 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
         if appearance is None:
             continue
         r_d = _mean_albedo(appearance)
-        if TRANSLUCENCY in appearance.maps:
-            depth = appearance.maps[TRANSLUCENCY]
+        if TRANSLUCENCY_MAP in appearance.maps:
+            depth = appearance.maps[TRANSLUCENCY_MAP]
             known = _valid(depth) & np.isfinite(depth.values).all(-1) & (depth.values > 0).all(-1)
             if known.any():
                 logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)

@@ -22,7 +22,7 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.traits import TraitSpace, lobe_edits, reduced_spaces
 from model.traits import storage as trait_storage
-from model.traits.vectors import DOUBTFUL_P, TraitVector
+from model.traits.vectors import MAX_P_VALUE, TraitVector
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.assets.compact_brdf import LOBES_PER_LOOKUP
 from skinrig.viewer.assets.reflectance import PageLobes
@@ -104,7 +104,7 @@ def distinct_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
     return tuple(
         name
         for name, trait in traits.items()
-        if trait.confidence.p_value <= DOUBTFUL_P and OPPOSITE_TRAITS.get(name) not in traits
+        if trait.confidence.p_value <= MAX_P_VALUE and OPPOSITE_TRAITS.get(name) not in traits
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.texture_resampling import resampled
 from model.wrinkles import Layer, decode, encode, mask_textures
-from model.wrinkles.evaluation import FILE, WrinkleModel
+from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import as_table
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.viewer.map_filling import filled
@@ -49,8 +49,8 @@ def assets(source: SceneSource) -> Assets:
 def _model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
     """Return the wrinkles of a scene and where they come from; None and the reason without."""
     dynamic = source.appearances.get("dynamic")
-    if dynamic is not None and FILE in dynamic.files:
-        return WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[FILE])), "fitted"
+    if dynamic is not None and WRINKLE_FILE in dynamic.files:
+        return WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE])), "fitted"
     if source.subject is None:
         return None, "no wrinkle maps in the appearance; `skinrig fit wrinkles` adds them"
     found = simulated_model(source.subject, size=min(source.size, MAP_PX))

@@ -11,7 +11,7 @@ from model import merl
 @pytest.fixture(scope="module")
 def table():
     rng = np.random.default_rng(3)
-    stored = rng.exponential(size=(3, *merl.SHAPE))
+    stored = rng.exponential(size=(3, *merl.TABLE_SHAPE))
     stored[:, 89, 89, ::7] = -1.0
     return merl.MerlTable(stored)
 
@@ -56,16 +56,16 @@ def test_the_mean_of_the_channels_is_known_where_all_are(table, tmp_path):
     known = table.measured.copy()
     known[3, 4, 5] = False
     np.testing.assert_array_equal(np.isfinite(mean), known)
-    expected = np.tensordot(merl.SCALE, stored, 1)[known] / 3.0
+    expected = np.tensordot(merl.BRDF_SCALE, stored, 1)[known] / 3.0
     np.testing.assert_allclose(mean[known], expected, rtol=1e-14)
 
 
 def test_what_has_no_value_in_one_channel_is_stored_as_not_measured_in_all():
-    values = np.ones((*merl.SHAPE, 3))
+    values = np.ones((*merl.TABLE_SHAPE, 3))
     values[1, 2, 3, 2] = -0.5
     stored = merl.MerlTable.of_values(values).stored
     assert stored[:, 1, 2, 3].tolist() == [-1.0, -1.0, -1.0]
-    np.testing.assert_allclose(stored[:, 0, 0, 0], 1.0 / merl.SCALE, rtol=1e-15)
+    np.testing.assert_allclose(stored[:, 0, 0, 0], 1.0 / merl.BRDF_SCALE, rtol=1e-15)
 
 
 def test_truncated_and_foreign_files_are_named(table, tmp_path):
@@ -94,7 +94,7 @@ def test_lookups_at_bin_centers_return_each_bin(table):
     h, d, phi = merl.bin_centers()
     np.testing.assert_array_equal(
         table.lookup(h[:, None], d[None, :], phi[17]),
-        np.moveaxis(table.stored[:, :, :, 17], 0, -1) * merl.SCALE,
+        np.moveaxis(table.stored[:, :, :, 17], 0, -1) * merl.BRDF_SCALE,
     )
 
 

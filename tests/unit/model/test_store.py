@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 
 
 @pytest.fixture
@@ -14,7 +14,7 @@ def appearance(rng):
     melanin[~valid] = np.nan
     return SkinAppearance(
         maps={
-            "melanin": SkinMap(melanin, UNITS["melanin"], np.full((5, 7), 0.01), valid),
+            "melanin": SkinMap(melanin, MAP_UNITS["melanin"], np.full((5, 7), 0.01), valid),
             "diffuse": SkinMap(rng.random((5, 7, 3)), "1", description="camera RGB"),
         },
         source="simulated",
@@ -43,7 +43,7 @@ def test_a_folder_is_replaced_whole_and_nothing_stays_behind(tmp_path, appearanc
     store.write(tmp_path / "a", appearance)
     store.write(tmp_path / "a", SkinAppearance({}, "measured"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
-    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == [store.DOCUMENT]
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == [store.DOCUMENT_FILE]
 
 
 def test_a_failed_write_leaves_the_old_folder(tmp_path, appearance):
@@ -78,31 +78,31 @@ def test_one_flipped_bit_in_any_file_is_named(tmp_path, appearance, rng):
 
 def test_another_schema_version_is_refused(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
-    document = json.loads((folder / store.DOCUMENT).read_text())
+    document = json.loads((folder / store.DOCUMENT_FILE).read_text())
     document["schema"] = "skinrig.appearance/9"
-    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    (folder / store.DOCUMENT_FILE).write_text(json.dumps(document))
     with pytest.raises(store.StoreError, match=r"appearance/9.*expected"):
         store.read(folder)
 
 
 def test_a_path_trick_in_the_document_is_refused(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
-    document = json.loads((folder / store.DOCUMENT).read_text())
+    document = json.loads((folder / store.DOCUMENT_FILE).read_text())
     document["maps"]["melanin"]["values"]["file"] = "../secret.exr"
     del document["seal"]
     document["seal"] = store._seal(document)
-    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    (folder / store.DOCUMENT_FILE).write_text(json.dumps(document))
     with pytest.raises(store.StoreError, match="plain name"):
         store.read(folder)
 
 
 def test_a_path_trick_in_the_name_of_a_file_is_refused(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
-    document = json.loads((folder / store.DOCUMENT).read_text())
+    document = json.loads((folder / store.DOCUMENT_FILE).read_text())
     document["files"] = {"../secret.ply": document["files"].pop("mesh.ply")}
     del document["seal"]
     document["seal"] = store._seal(document)
-    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    (folder / store.DOCUMENT_FILE).write_text(json.dumps(document))
     with pytest.raises(store.StoreError, match="plain name"):
         store.read(folder)
 

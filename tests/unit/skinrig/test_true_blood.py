@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.evaluating.facial_color import true_blood
 
 MOVED = ("hemoglobin", "hemoglobin_at_rest")
@@ -24,7 +24,7 @@ SPREAD = ("hemoglobin_blurred", "hemoglobin_blurred_at_rest")
 )
 def test_blood_is_taken_as_light_spreads_in_all_states_or_in_none(state, names, taken):
     maps = {
-        name: SkinMap(np.full((2, 2), number, np.float32), UNITS["hemoglobin"])
+        name: SkinMap(np.full((2, 2), number, np.float32), MAP_UNITS["hemoglobin"])
         for number, name in enumerate(names)
     }
     truth = SkinAppearance(maps, "simulated", parameters={"kind": "truth", "state": state})

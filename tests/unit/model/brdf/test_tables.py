@@ -31,7 +31,7 @@ def test_the_basis_has_59_materials_on_the_grid_that_the_kernels_know(point_basi
     )
     assert np.all(point_basis.table[..., 59:] == 0.0)
     tiny = point_basis.table[(point_basis.table > 0.0)].min()
-    assert tiny >= np.float32(brdf_tables.LEAST)
+    assert tiny >= np.float32(brdf_tables.MIN_STORED_VALUE)
 
 
 def test_tables_follow_their_functions_away_from_the_horizon(point_basis, rng):

@@ -272,7 +272,7 @@ def test_a_tree_serves_several_lights():
         found = gather(tree, factor * light, points[:5], R_D, LENGTH_MM).exitance
         alone = exitance(points, area, factor * light, points[:5], R_D, LENGTH_MM)
         np.testing.assert_allclose(found, alone)
-    assert dipole_gather.TOLERANCE > 0
+    assert dipole_gather.GATHER_TOL > 0
 
 
 def _sheet():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from model.displacement_synthesis import cut_kernels
 from model.displacement_synthesis import growth as synthesis
-from model.displacement_synthesis import kernels
 from model.displacement_synthesis.sources import filled
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -230,7 +230,7 @@ def brute_force(misfit, first, last):
 def test_a_cut_is_the_cheapest_of_all(rng, first, last):
     misfit = rng.random((5, 6)).astype(np.float32)
     path = np.zeros(5, np.int16)
-    cost = kernels._cheapest_path(misfit, first, last, path)
+    cost = cut_kernels._cheapest_path(misfit, first, last, path)
     assert cost == pytest.approx(brute_force(misfit, first, last), rel=1e-6)
     assert misfit[np.arange(5), path].sum() == pytest.approx(cost, rel=1e-6)
     assert (np.abs(np.diff(path)) <= 1).all()
@@ -245,10 +245,10 @@ def test_the_cost_of_a_choice_is_that_of_its_cut(rng):
         0.1 * d[:-1, :-1] ** 2 + np.diff(d, axis=1)[:-1] ** 2 + np.diff(d, axis=0)[:, :-1] ** 2
     )
     path = np.zeros(29, np.int16)
-    cost = kernels._cheapest_path(misfit, -1, -1, path)
-    found = kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), np.inf)
+    cost = cut_kernels._cheapest_path(misfit, -1, -1, path)
+    found = cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), np.inf)
     assert found == pytest.approx(cost, rel=1e-5)
-    assert kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), 1.0) == 1.0
+    assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), 1.0) == 1.0
 
 
 def test_windows_are_no_smoother_than_the_patches_they_are_chosen_from(foreheads):

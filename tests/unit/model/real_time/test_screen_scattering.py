@@ -94,7 +94,7 @@ def test_a_measured_albedo_is_blurred_twice_by_all_but_post_scatter_texturing():
     albedo = np.repeat((0.4 + 0.1 * np.sin(0.6 * x))[None, :, None], 3, axis=2).repeat(5, axis=0)
     depth = np.full((5, 81), DEPTH_MM)
     contrast = {}
-    for name, (before, behind) in screen_scattering.POWERS.items():
+    for name, (before, behind) in screen_scattering.ALBEDO_POWERS.items():
         spread = scatter(
             albedo**before, depth, variances_mm2=VARIANCES, weights=WEIGHTS, focal_px=DEPTH_MM
         )

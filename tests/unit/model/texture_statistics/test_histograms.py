@@ -3,7 +3,7 @@ import pytest
 
 from model.texture_statistics import histogram_kernels
 from model.texture_statistics.histograms import (
-    BINS,
+    HISTOGRAM_BINS,
     Bins,
     HistogramError,
     cumulated,
@@ -14,15 +14,17 @@ from model.texture_statistics.histograms import (
 
 
 def uneven(rng, low=-3.0, high=5.0):
-    return np.sort(np.concatenate([[low, high], rng.uniform(low, high, BINS - 1)]))
+    return np.sort(np.concatenate([[low, high], rng.uniform(low, high, HISTOGRAM_BINS - 1)]))
 
 
 def test_counts_are_those_of_a_plain_histogram(rng):
     edges = uneven(rng)
     values = np.concatenate([rng.standard_normal(3000), edges[5:9], edges[[0, -1]]])
     found = Bins.over(edges).count(values)
-    place = np.clip(np.searchsorted(edges, values, "right") - 1, 0, BINS - 1)
-    np.testing.assert_array_equal(found.shares, np.bincount(place, minlength=BINS) / values.size)
+    place = np.clip(np.searchsorted(edges, values, "right") - 1, 0, HISTOGRAM_BINS - 1)
+    np.testing.assert_array_equal(
+        found.shares, np.bincount(place, minlength=HISTOGRAM_BINS) / values.size
+    )
     assert (found.least, found.most) == (values.min(), values.max())
     assert found.effective == pytest.approx(values.size)
 
@@ -43,7 +45,7 @@ def test_bins_as_narrow_as_wanted_are_told_apart(gap, rng):
     values = np.concatenate([rng.uniform(-1, 9, 2000), gap * rng.uniform(1.0, 2.0, 2000)])
     place = np.searchsorted(edges, values, "right") - 1
     np.testing.assert_allclose(
-        Bins.over(edges).count(values).shares, np.bincount(place, minlength=BINS) / 4000
+        Bins.over(edges).count(values).shares, np.bincount(place, minlength=HISTOGRAM_BINS) / 4000
     )
 
 
@@ -62,7 +64,7 @@ def test_a_map_of_ranks_is_the_target_quantile_of_the_source_rank(dtype, rng):
     values = rng.standard_normal((40, 50)).astype(dtype)
     source = bins.count(values)
     wanted = bins.count(rng.laplace(1.0, 0.5, 100_000)).shares
-    wanted = 0.999 * wanted + 0.001 / BINS  # no empty bin: the inverse is a function
+    wanted = 0.999 * wanted + 0.001 / HISTOGRAM_BINS  # no empty bin: the inverse is a function
     got = bins.match(values, source, wanted)
     expected = np.interp(
         np.interp(values, edges, cumulated(source.shares)), cumulated(wanted), edges
@@ -97,7 +99,7 @@ def test_values_with_the_target_histogram_stay_where_they_are(noise, rng):
     bins = Bins.over(uneven(rng))
     values = np.concatenate([rng.normal(-2, 0.1, 300), rng.normal(3, 0.2, 300), bins.edges[40:50]])
     source = bins.count(values)
-    wanted = np.maximum(source.shares + noise * rng.standard_normal(BINS), 0.0)
+    wanted = np.maximum(source.shares + noise * rng.standard_normal(HISTOGRAM_BINS), 0.0)
     np.testing.assert_allclose(bins.match(values, source, wanted), values, atol=1e-12)
 
 
@@ -120,7 +122,7 @@ def test_values_all_beyond_the_edges_are_brought_to_the_target(rng):
 def test_nothing_lands_in_bins_that_the_target_leaves_empty(rng):
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = rng.uniform(0.0, 1.0, 20_000)
-    wanted = np.zeros(BINS)
+    wanted = np.zeros(HISTOGRAM_BINS)
     wanted[[3, 100, 250]] = 0.2, 0.5, 0.3
     again = bins.count(bins.match(values, bins.count(values), wanted)).shares
     np.testing.assert_allclose(again, wanted, atol=1e-3)
@@ -130,7 +132,7 @@ def test_nothing_lands_in_bins_that_the_target_leaves_empty(rng):
 def test_a_single_value_goes_into_the_target_and_stays_single():
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = np.full(9, 0.7)
-    wanted = np.zeros(BINS)
+    wanted = np.zeros(HISTOGRAM_BINS)
     wanted[10] = 1.0
     got = bins.match(values, bins.count(values), wanted)
     assert np.unique(got).size == 1
@@ -139,10 +141,10 @@ def test_a_single_value_goes_into_the_target_and_stays_single():
 
 def test_a_table_of_cells_never_excludes_a_bin(rng):
     edges = uneven(rng)
-    scale = histogram_kernels.CELLS / (edges[-1] - edges[0])
-    least = np.empty(histogram_kernels.CELLS, np.int16)
+    scale = histogram_kernels.TABLE_CELLS / (edges[-1] - edges[0])
+    least = np.empty(histogram_kernels.TABLE_CELLS, np.int16)
     most = np.empty_like(least)
-    histogram_kernels.bound_bins(edges, BINS, scale, least, most)
+    histogram_kernels.bound_bins(edges, HISTOGRAM_BINS, scale, least, most)
     for x in (*edges[:-1], *np.nextafter(edges[1:], -9.0), *rng.uniform(-3, 5, 300)):
         expected = np.searchsorted(edges, x, "right") - 1
         assert histogram_kernels.find(x, edges, scale, least, most) == expected
@@ -150,28 +152,30 @@ def test_a_table_of_cells_never_excludes_a_bin(rng):
 
 def test_moving_a_histogram_by_half_the_bins_is_a_distance_of_one():
     edges = np.linspace(0.0, 1.0, 257)
-    a = np.eye(BINS)[10]
-    b = np.eye(BINS)[10 + 128]
+    a = np.eye(HISTOGRAM_BINS)[10]
+    b = np.eye(HISTOGRAM_BINS)[10 + 128]
     assert distance(a, b, edges) == pytest.approx(1.0)
     assert distance(a, a, edges) == 0.0
     assert distance(np.stack([a, b]), b, edges).shape == (2,)
 
 
 def test_the_nearest_histogram_is_nearer_than_any_other(rng):
-    edited = rng.normal(1 / BINS, 0.02, (3, 2 * BINS))
+    edited = rng.normal(1 / HISTOGRAM_BINS, 0.02, (3, 2 * HISTOGRAM_BINS))
     found = project_to_histograms(edited)
     assert found.min() >= 0.0
-    np.testing.assert_allclose(found.reshape(-1, BINS).sum(axis=1), 1.0, atol=1e-12)
-    own = np.linalg.norm((found - edited).reshape(-1, BINS), axis=1)
+    np.testing.assert_allclose(found.reshape(-1, HISTOGRAM_BINS).sum(axis=1), 1.0, atol=1e-12)
+    own = np.linalg.norm((found - edited).reshape(-1, HISTOGRAM_BINS), axis=1)
     # optimality: no direction towards another valid histogram comes nearer
     for _ in range(50):
-        other = rng.dirichlet(np.full(BINS, 0.1), 6)
-        step = found.reshape(-1, BINS) + 1e-3 * (other - found.reshape(-1, BINS))
-        assert (np.linalg.norm(step - edited.reshape(-1, BINS), axis=1) >= own).all()
+        other = rng.dirichlet(np.full(HISTOGRAM_BINS, 0.1), 6)
+        step = found.reshape(-1, HISTOGRAM_BINS) + 1e-3 * (
+            other - found.reshape(-1, HISTOGRAM_BINS)
+        )
+        assert (np.linalg.norm(step - edited.reshape(-1, HISTOGRAM_BINS), axis=1) >= own).all()
 
 
 def test_a_valid_vector_is_its_own_nearest(rng):
-    valid = rng.dirichlet(np.full(BINS, 0.05), 4).reshape(-1)
+    valid = rng.dirichlet(np.full(HISTOGRAM_BINS, 0.05), 4).reshape(-1)
     np.testing.assert_allclose(project_to_histograms(valid), valid, atol=1e-15)
 
 

@@ -149,7 +149,7 @@ def test_the_packaged_traits_are_simulated_and_say_how_near_the_truth_they_come(
     assert worn <= set(told["surface"])
     assert told["surface"]["lotion"] > 0.95
     assert min(told["albedo"][name] for name in ("tan", "beard", "hot", "cold", "makeup")) > 0.9
-    size = len(resources.files("model").joinpath("data", trait_storage.PACKAGED).read_bytes())
+    size = len(resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE).read_bytes())
     assert size <= 1_500_000
     for space in library.spaces.values():
         assert max(space.storage_error.values()) < 0.03

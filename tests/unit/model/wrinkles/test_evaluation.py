@@ -8,14 +8,14 @@ import pytest
 
 from model import store, wrinkles
 from model.skin import SkinAppearance
-from model.wrinkles.evaluation import FILE, WrinkleModel
-from model.wrinkles.expressions import JIMENEZ2011, ExpressionTable, WrinkleError
+from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
+from model.wrinkles.expressions import JIMENEZ2011_TABLE, ExpressionTable, WrinkleError
 from model.wrinkles.partial_derivatives import Layer
 
 
 @pytest.fixture
 def face(rng):
-    rows = dict.fromkeys(JIMENEZ2011.rows, (0.0,)) | {"lemon": (0.5,)}
+    rows = dict.fromkeys(JIMENEZ2011_TABLE.rows, (0.0,)) | {"lemon": (0.5,)}
     lemon = Layer(
         rng.uniform(-0.3, 0.3, (4, 4, 2)).astype(np.float32),
         np.ones((1, 2, 2), np.float32),
@@ -24,7 +24,7 @@ def face(rng):
     first = Layer(
         rng.uniform(-0.3, 0.3, (8, 8, 2)).astype(np.float32),
         rng.random((8, 4, 4), np.float32),
-        {**JIMENEZ2011.rows, "lemon": (0.0,) * 8},
+        {**JIMENEZ2011_TABLE.rows, "lemon": (0.0,) * 8},
         np.full((8, 8, 2), 0.01, np.float32),
         rng.random((8, 8)) > 0.1,
     )
@@ -41,9 +41,9 @@ def face(rng):
 
 def test_a_model_comes_back_from_its_folder(face, tmp_path):
     maps, document = face.to_maps()
-    store.write(tmp_path / "a", SkinAppearance(maps, "simulated", files={FILE: document}))
+    store.write(tmp_path / "a", SkinAppearance(maps, "simulated", files={WRINKLE_FILE: document}))
     appearance = store.read(tmp_path / "a")
-    again = WrinkleModel.from_maps(appearance.maps, appearance.files[FILE])
+    again = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     weights = {"joy": 0.8, "anger": 0.5, "lemon": 1.0}
     np.testing.assert_array_equal(again.evaluate(weights).normals, face.evaluate(weights).normals)
     assert again.clamp == "signed"

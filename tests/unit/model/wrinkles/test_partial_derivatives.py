@@ -5,7 +5,7 @@ import pytest
 
 from model import texture_resampling, wrinkles
 from model.wrinkles.expressions import (
-    JIMENEZ2011,
+    JIMENEZ2011_TABLE,
     ROW_OF_STATE,
     ExpressionTable,
     WrinkleError,
@@ -155,8 +155,8 @@ def test_texture_values_hold_minus_one_to_one_in_zero_to_one():
 
 
 def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
-    assert tuple(JIMENEZ2011.rows) == ("joy", "surprise", "fear", "anger", "disgust", "sad")
-    assert JIMENEZ2011.zones == (
+    assert tuple(JIMENEZ2011_TABLE.rows) == ("joy", "surprise", "fear", "anger", "disgust", "sad")
+    assert JIMENEZ2011_TABLE.zones == (
         "red",
         "green",
         "blue",
@@ -166,7 +166,7 @@ def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
         "orange",
         "gray",
     )
-    sums = {name: round(sum(row), 9) for name, row in JIMENEZ2011.rows.items()}
+    sums = {name: round(sum(row), 9) for name, row in JIMENEZ2011_TABLE.rows.items()}
     assert sums == {
         "joy": 2.4,
         "surprise": 3.2,
@@ -175,7 +175,7 @@ def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
         "disgust": 3.3,
         "sad": 3.0,
     }
-    assert {row for row in ROW_OF_STATE.values() if row} == set(JIMENEZ2011.rows)
+    assert {row for row in ROW_OF_STATE.values() if row} == set(JIMENEZ2011_TABLE.rows)
 
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
@@ -298,12 +298,14 @@ def test_a_layer_finer_than_the_base_is_averaged_and_does_not_alias():
 def test_several_wrinkle_maps_add_up_and_a_lemon_pose_stretches_what_neutral_has(rng):
     base = rng.uniform(-0.4, 0.4, (8, 8, 2))
     first = wrinkles.Layer(rng.uniform(-0.4, 0.4, (4, 4, 2)), rng.random((8, 2, 2)))
-    rows = dict.fromkeys(JIMENEZ2011.rows, (0.0,)) | {"lemon": (1.0,)}
+    rows = dict.fromkeys(JIMENEZ2011_TABLE.rows, (0.0,)) | {"lemon": (1.0,)}
     lemon = wrinkles.Layer(-base, np.ones((1, 1, 1)), ExpressionTable(("all",), rows))
     both = {"lemon": 1.0, "joy": 0.5}
     with pytest.raises(WrinkleError, match="'lemon'"):
         wrinkles.combine_layers(base, [first, lemon], both)
-    first = wrinkles.Layer(first.wrinkle, first.masks, {**JIMENEZ2011.rows, "lemon": (0.0,) * 8})
+    first = wrinkles.Layer(
+        first.wrinkle, first.masks, {**JIMENEZ2011_TABLE.rows, "lemon": (0.0,) * 8}
+    )
     flat = wrinkles.combine_layers(base, [first, lemon], {"lemon": 1.0})
     np.testing.assert_allclose(flat, np.broadcast_to([0, 0, 1.0], flat.shape), atol=1e-15)
     got = wrinkles.combine_layers(base, [first, lemon], both)

@@ -11,11 +11,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model.metrics import angular_error_rad
-from reconstruction.gradient_normals import kernels
+from reconstruction.gradient_normals import moment_kernels
 from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
-from reconstruction.gradient_normals.lobe_response import SphereLights, SphereLightsError
 from reconstruction.gradient_normals.noise import SensorNoise
 from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, design
+from reconstruction.gradient_normals.sphere_lights import SphereLights, SphereLightsError
 
 VIEW = np.array([0.0, 0.0, 1.0])
 NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
@@ -219,10 +219,12 @@ def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
         y, v = rng.standard_normal(8), np.exp(rng.standard_normal(8))
         names = [name for name, here in zip(NAMES, there, strict=True) if here]
         A = design(names, dark=dark)
-        out = np.empty((kernels.MOMENT_ROWS, 1))
-        kernels.moments(np.where(there, y, np.nan)[:, None], v[:, None], 0.0, 1.0, 1, dark, out)
+        out = np.empty((moment_kernels.MOMENT_ROWS, 1))
+        moment_kernels.moments(
+            np.where(there, y, np.nan)[:, None], v[:, None], 0.0, 1.0, 1, dark, out
+        )
         if len(names) == 0 or np.linalg.matrix_rank(A) < A.shape[1]:
-            assert np.isnan(out[kernels.C_0, 0])
+            assert np.isnan(out[moment_kernels.C_0, 0])
             continue
         checked += 1
         W = np.diag(1.0 / v[there])
@@ -240,8 +242,8 @@ def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
         ):
             np.testing.assert_allclose(out[row, 0], cov[i, j], rtol=1e-8, atol=1e-9)
         r = y[there] - A @ fit
-        np.testing.assert_allclose(out[kernels.CHI, 0], r @ W @ r, rtol=1e-7, atol=1e-9)
-        assert out[kernels.FREE, 0] == len(names) - A.shape[1]
+        np.testing.assert_allclose(out[moment_kernels.CHI, 0], r @ W @ r, rtol=1e-7, atol=1e-9)
+        assert out[moment_kernels.FREE, 0] == len(names) - A.shape[1]
     assert checked > 10
 
 

@@ -96,7 +96,7 @@ def test_bounds_are_the_sums_of_plain_numpy(rng):
         np.testing.assert_allclose(found, np.stack([sampled, np.max(lows, axis=0)], 1), rtol=1e-12)
 
 
-def paired(height, strained, blocks=normal_blocks.BLOCKS):
+def paired(height, strained, blocks=normal_blocks.BLOCKS_PER_SIDE):
     """Return counts of a strained map in the blocks of the neutral one, pixel by pixel."""
     rows, columns = normal_blocks.grid_of(height.shape, blocks)
     group, groups = normal_blocks.block_of(np.arange(height.size), height.shape, blocks)

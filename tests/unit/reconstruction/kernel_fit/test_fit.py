@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from model.microstructure.kernel_table import gaussian_weights
 from reconstruction import normal_histogram as nh
 from reconstruction.kernel_fit import search as ks
-from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM, convolved_histogram, fit_kernel
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, convolved_histogram, fit_kernel
 from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolved, relief_of
 from reconstruction.kernel_fit.two_axes import fit_two_axes
 from reconstruction.normal_histogram import kernels
@@ -57,7 +57,7 @@ def test_a_known_kernel_comes_back_to_the_grid_point(rng, alpha, sigma_um, stret
         height, alpha, sigma_um, stretch=stretch, axis=1 if axis in ("x", 1) else 0
     )
     near = {
-        "alphas": ALPHAS[(np.abs(ALPHAS - alpha) < 0.25)],
+        "alphas": ALPHA_GRID[(np.abs(ALPHA_GRID - alpha) < 0.25)],
         "sigmas_um": SIGMAS_UM[np.abs(SIGMAS_UM - sigma_um) < 10],
     }
     fit = fit_kernel(height, target, stretch=stretch, axis=axis, pixel_um=PIXEL_UM, **near)
@@ -93,7 +93,7 @@ def compared(rng, side, first_sample, **grid):
     relief = relief_of(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
     flat = (target.T if axis == "y" else target).reshape(-1)
     buckets = ks.Buckets(np.append(flat, 0.0), 64, 1.0)
-    alphas, sigmas = grid.get("alphas", ALPHAS), grid.get("sigmas_um", SIGMAS_UM)
+    alphas, sigmas = grid.get("alphas", ALPHA_GRID), grid.get("sigmas_um", SIGMAS_UM)
     full = ks.exhaustive(relief, buckets, alphas, sigmas)
     part = ks.hierarchical(relief, buckets, alphas, sigmas, first_sample=first_sample, rng=rng)
     return full, part
@@ -120,7 +120,7 @@ def test_ten_random_cases_agree_with_the_exhaustive_search():
     rng = np.random.default_rng(7)
     for case in range(11):
         i, j, step = (*rng.integers(4, size=2), 4) if case else (0, 0, 1)
-        grid = {"alphas": ALPHAS[i::step], "sigmas_um": SIGMAS_UM[j::step]}
+        grid = {"alphas": ALPHA_GRID[i::step], "sigmas_um": SIGMAS_UM[j::step]}
         full, part = compared(rng, 200, 4096, **grid)
         assert part.best == full.best
         assert not part.exact.all()
@@ -282,7 +282,7 @@ def test_tiny_maps_are_fitted_but_called_aliased(rng):
 def test_a_finer_minimum_than_the_grid_is_refined(rng):
     height = skin(128, rng)
     target = scipy_target(height, -0.843, 18.2, stretch=0.9, axis=1)
-    near = {"alphas": ALPHAS[100:140], "sigmas_um": SIGMAS_UM[28:42]}
+    near = {"alphas": ALPHA_GRID[100:140], "sigmas_um": SIGMAS_UM[28:42]}
     fit = fit_kernel(height, target, stretch=0.9, axis="x", pixel_um=PIXEL_UM, **near)
     assert fit.distance_refined < fit.distance
     assert abs(fit.alpha_refined + 0.843) <= 0.006

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from reconstruction.normal_histogram.block_errors import LEAST_BLOCKS, stderr_of_mean
+from reconstruction.normal_histogram.block_errors import MIN_BLOCKS, stderr_of_mean
 
 SIDE = 8
 PLACES = np.stack(np.divmod(np.arange(SIDE * SIDE), SIDE), axis=1).astype(np.float64)
@@ -51,6 +51,6 @@ def test_a_block_counts_by_its_samples(rng):
 
 
 def test_too_few_blocks_tell_nothing_and_equal_ones_no_error():
-    few = np.arange(LEAST_BLOCKS - 1.0)
+    few = np.arange(MIN_BLOCKS - 1.0)
     assert stderr_of_mean(few, np.ones(few.size), PLACES[: few.size]) == (np.inf, 1.0)
     assert stderr_of_mean(np.full(9, 0.5), np.ones(9), PLACES[:9]) == (0.0, 1.0)

@@ -82,7 +82,7 @@ def test_a_greedy_choice_is_nearly_the_best_of_all():
 
     def loss(lights):
         now = selection.predict(found, lights, least=least)
-        return float(np.mean(np.where(now.valid, now.tilt_rad, selection.UNKNOWN_RAD) ** 2))
+        return float(np.mean(np.where(now.valid, now.tilt_rad, selection.UNKNOWN_ERROR_RAD) ** 2))
 
     every = sorted(loss(lights) for lights in itertools.combinations(range(11), 6))
     assert loss(greedy.lights) <= 1.25 * every[0]

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from model import texture_resampling as resampling
 from model import wrinkles
-from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
+from model.wrinkles.expressions import JIMENEZ2011_TABLE, WrinkleError
 from model.wrinkles.partial_derivatives import Layer
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.wrinkles import fit as wrinkle_fit
@@ -290,23 +290,28 @@ def test_a_map_without_any_wrinkle_determines_nothing(face):
 @pytest.fixture(scope="module")
 def fitted(face):
     base, layer = face
-    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
+    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011_TABLE.rows}
     fit = wrinkle_fit.fit(wrinkles.decode(base), states, layer.masks, size=(32, 32), clamp="signed")
     return states, fit
 
 
 def test_with_known_weights_the_map_comes_back(face):
     base, layer = face
-    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
+    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011_TABLE.rows}
     got = wrinkle_fit.fit(
-        wrinkles.decode(base), states, layer.masks, size=(32, 32), table=JIMENEZ2011, clamp="signed"
+        wrinkles.decode(base),
+        states,
+        layer.masks,
+        size=(32, 32),
+        table=JIMENEZ2011_TABLE,
+        clamp="signed",
     )
     seen = got.layer.valid
     assert seen.mean() > 0.95
     np.testing.assert_allclose(got.layer.wrinkle[seen], layer.wrinkle[seen], atol=2e-5)
     assert got.explained > 1 - 1e-8
     for name, one in got.expressions.items():
-        np.testing.assert_allclose(one.weights, JIMENEZ2011.row(name), atol=1e-4)
+        np.testing.assert_allclose(one.weights, JIMENEZ2011_TABLE.row(name), atol=1e-4)
 
 
 def test_map_and_weights_together_show_every_expression(face, fitted):
@@ -322,8 +327,8 @@ def test_map_and_weights_together_show_every_expression(face, fitted):
 
 def test_weights_come_back_up_to_a_scale_of_each_zone(fitted):
     _, fit = fitted
-    got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011.rows])
-    true = np.array(list(JIMENEZ2011.rows.values()))
+    got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011_TABLE.rows])
+    true = np.array(list(JIMENEZ2011_TABLE.rows.values()))
     for z in range(8):
         scale = (got[:, z] @ true[:, z]) / (true[:, z] @ true[:, z])
         assert scale > 0.5
@@ -347,7 +352,7 @@ def test_names_sizes_and_tables_that_do_not_fit_are_refused(face):
     with pytest.raises(WrinkleError, match="expected that of neutral"):
         wrinkle_fit.fit(n, {"joy": n[:64]}, layer.masks, size=(8, 8))
     with pytest.raises(WrinkleError, match="8 zones, expected 5"):
-        wrinkle_fit.fit(n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011)
+        wrinkle_fit.fit(n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011_TABLE)
     with pytest.raises(WrinkleError, match="got 1 names"):
         wrinkle_fit.fit(n, {"joy": n}, layer.masks, size=(8, 8), zones=("a",))
     with pytest.raises(WrinkleError, match="clamp"):

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model import wrinkles
-from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
+from model.wrinkles.expressions import JIMENEZ2011_TABLE, WrinkleError
 from model.wrinkles.partial_derivatives import Layer
 from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
@@ -28,7 +28,7 @@ def face():
     layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), masks)
     states = {
         name: wrinkles.combine_layers(base, [layer], {name: 1.0}, clamp="signed")
-        for name in JIMENEZ2011.rows
+        for name in JIMENEZ2011_TABLE.rows
     }
     return wrinkles.decode(base), states, masks, hard
 
@@ -41,7 +41,7 @@ def test_the_true_model_has_rank_one_texels_with_the_table_s_amplitudes(face):
     assert inner.any()
     assert found.rank_one_share[inner & found.valid].min() > 0.99
     zone = masks.argmax(axis=0)
-    rows = np.array([JIMENEZ2011.rows[name] for name in found.names])
+    rows = np.array([JIMENEZ2011_TABLE.rows[name] for name in found.names])
     expected = rows[:, zone] / np.abs(rows[:, zone]).max(axis=0)
     error = np.abs(found.values - expected)[:, inner & found.valid]
     assert error.mean() < 0.02

@@ -50,12 +50,12 @@ def test_simulated_data_in_any_part_makes_the_whole_simulated(tmp_path):
 def test_a_folder_of_other_maps_is_left_untouched(tmp_path):
     out = tmp_path / "maps"
     store.write(out, SkinAppearance({}, "measured", parameters={"kind": "appearance"}))
-    before = hashlib.sha256((out / store.DOCUMENT).read_bytes()).hexdigest()
+    before = hashlib.sha256((out / store.DOCUMENT_FILE).read_bytes()).hexdigest()
     with pytest.raises(DynamicAppearanceError, match="nothing was touched"):
         dynamic.add(out, FACIAL_COLOR, part(1.0))
     with pytest.raises(DynamicAppearanceError, match="nothing was touched"):
         dynamic.check_target(out)
-    assert hashlib.sha256((out / store.DOCUMENT).read_bytes()).hexdigest() == before
+    assert hashlib.sha256((out / store.DOCUMENT_FILE).read_bytes()).hexdigest() == before
 
 
 def test_two_parts_cannot_share_a_map(tmp_path):

@@ -7,8 +7,8 @@ from model import store
 from model.facial_color import document as facial_color_document
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import FacialColorError
-from model.skin import UNITS, SkinAppearance, SkinMap
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.partial_derivatives import Layer
 from skinrig.appearances import dynamic
@@ -34,12 +34,12 @@ def face(tmp_path):
         neutral, {"smile": 1.5 * neutral, "anger": neutral + 0.01}, radius_px=6.0
     )
     maps, document = facial_color_document.to_maps(rig)
-    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), MAP_UNITS["melanin"])
     out = tmp_path / "moving"
     dynamic.add(
         out,
         dynamic.FACIAL_COLOR,
-        dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, {}, {}, "simulated"),
+        dynamic.Part(maps, {facial_color_document.RIG_DOCUMENT: document}, {}, {}, "simulated"),
     )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
@@ -101,7 +101,7 @@ def test_weights_that_do_not_sum_to_one_write_nothing(face, tmp_path):
         apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}), out=out)
     assert not out.exists()
     apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}, normalize=True), out=out)
-    assert (out / store.DOCUMENT).is_file()
+    assert (out / store.DOCUMENT_FILE).is_file()
 
 
 def test_a_state_that_wrinkles_do_not_know_is_refused(face, tmp_path):
@@ -127,7 +127,7 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
     rng = np.random.default_rng(8)
     other = (0.04 + 0.002 * rng.standard_normal((60, 40))).astype(np.float32)
     onto = OtherFace(
-        SkinAppearance({"hemoglobin": SkinMap(other, UNITS["hemoglobin"])}, "measured")
+        SkinAppearance({"hemoglobin": SkinMap(other, MAP_UNITS["hemoglobin"])}, "measured")
     )
     done = apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
     found = done.maps["hemoglobin"]
@@ -142,14 +142,14 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
 
 def test_what_a_result_is_made_of_is_never_replaced(face, tmp_path):
     folder, _ = face
-    before = (folder / store.DOCUMENT).read_bytes()
+    before = (folder / store.DOCUMENT_FILE).read_bytes()
     with pytest.raises(ApplyError, match="the fitted folder itself"):
         apply_expression(folder, Expression({"smile": 1.0}), out=folder)
     other = tmp_path / "truth"
     store.write(other, SkinAppearance({}, "simulated", parameters={"kind": "truth"}))
     with pytest.raises(ApplyError, match="nothing was touched"):
         apply_expression(folder, Expression({"smile": 1.0}), out=other)
-    assert (folder / store.DOCUMENT).read_bytes() == before
+    assert (folder / store.DOCUMENT_FILE).read_bytes() == before
     assert store.read(other).parameters["kind"] == "truth"
     # an older result is
     for _ in range(2):
@@ -172,8 +172,8 @@ def test_weights_are_normalized_for_wrinkles_as_for_blood(face, tmp_path):
 
 def test_a_simulated_face_makes_the_result_simulated_and_sizes_must_fit(face, tmp_path):
     folder, _ = face
-    blood = SkinMap(np.full((60, 40), 0.03, np.float32), UNITS["hemoglobin"])
-    melanin = SkinMap(np.full((30, 40), 0.03, np.float32), UNITS["melanin"])
+    blood = SkinMap(np.full((60, 40), 0.03, np.float32), MAP_UNITS["hemoglobin"])
+    melanin = SkinMap(np.full((30, 40), 0.03, np.float32), MAP_UNITS["melanin"])
     onto = OtherFace(SkinAppearance({"hemoglobin": blood}, "measured"), hashes={"onto": "abc"})
     apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
     written = store.read(tmp_path / "out")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.inversion import identifiability
@@ -44,7 +44,7 @@ def scene(table, melanin, stderr):
     shape = (4, 5)
     color = np.broadcast_to(0.7 * table.lookup(melanin, 0.05), (*shape, 3))
     diffuse = SkinMap(color, "1", 0.005 * color)
-    estimate = SkinMap(np.full(shape, melanin), UNITS["melanin"], np.full(shape, stderr))
+    estimate = SkinMap(np.full(shape, melanin), MAP_UNITS["melanin"], np.full(shape, stderr))
     truths = {
         "melanin": melanin,
         "melanin_blurred": melanin,
@@ -52,7 +52,7 @@ def scene(table, melanin, stderr):
         "hemoglobin_blurred": 0.05,
     }
     truth = SkinAppearance(
-        {k: SkinMap(np.full(shape, v), UNITS[k.split("_")[0]]) for k, v in truths.items()},
+        {k: SkinMap(np.full(shape, v), MAP_UNITS[k.split("_")[0]]) for k, v in truths.items()},
         "simulated",
     )
     found = SkinAppearance(

@@ -6,7 +6,9 @@ import pytest
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.dome.stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
+from model.skin_reflectance import BASIS_FILE
+from reconstruction.pipeline.dome.lobes import BASIS_RANK, _basis_bytes
+from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
 from skinrig.evaluating import reflection as evaluation
 from skinrig.evaluating import reflection_truth
 
@@ -46,12 +48,14 @@ def truth(rng):
 
 def estimate(scale=1.0, **changes):
     materials = brdf_tables.default()
-    mix = np.full((RANK, materials.size), 1 / materials.size)
-    weights = {name: SkinMap(np.zeros((SIDE, SIDE)), "1") for name in WEIGHTS}
+    mix = np.full((BASIS_RANK, materials.size), 1 / materials.size)
+    weights = {name: SkinMap(np.zeros((SIDE, SIDE)), "1") for name in WEIGHT_NAMES}
     found = maps() | weights | changes
     found["r_d"] = SkinMap(scale * found["r_d"].values, "1", valid=found["r_d"].valid)
     return SkinAppearance(
-        found, "simulated", files={BASIS_FILE: _basis_bytes(materials, RANK, {RANK: (mix, 0.0)})}
+        found,
+        "simulated",
+        files={BASIS_FILE: _basis_bytes(materials, BASIS_RANK, {BASIS_RANK: (mix, 0.0)})},
     )
 
 

@@ -9,7 +9,8 @@ from model import store
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
+from model.skin_reflectance import BASIS_FILE
+from reconstruction.pipeline.dome.lobes import _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.exporting.materials import obj

@@ -9,7 +9,7 @@ import pytest
 from capture.session import ConsentError
 from model import store
 from model.facial_color.document import to_maps
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.errors import UsageError
 from skinrig.exporting.appearances import APPEARANCE_FORMATS, export_appearance, export_brdfs
@@ -45,7 +45,7 @@ def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_pa
 def test_a_photographs_maps_are_told_that_they_are_no_surface(tmp_path, to):
     """Not to reconstruct a position, which no session of the flash rig has."""
     values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
-    flat = SkinMap(values, UNITS["melanin"], valid=valid)
+    flat = SkinMap(values, MAP_UNITS["melanin"], valid=valid)
     maps = store.write(tmp_path / "flash", SkinAppearance({"melanin": flat}, "simulated"))
     with pytest.raises(ExportError, match="holds melanin; expected maps, spectral, metahuman"):
         export_appearance(maps, tmp_path / "out", to=to)

@@ -9,7 +9,8 @@ from model import fresnel, merl, store
 from model.brdf import rgl
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
+from model.skin_reflectance import BASIS_FILE
+from reconstruction.pipeline.dome.lobes import _basis_bytes
 from skinrig.cli import main
 from skinrig.exporting.appearances import export_brdfs
 from skinrig.exporting.brdfs import BrdfExportError, Place, write_brdfs

@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.exporting import maps
 from skinrig.exporting.materials.tangents import FramedMesh, from_tangent
 from skinrig.exporting.options import Delivery
@@ -33,8 +33,8 @@ def picture(rng):
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     return SkinAppearance(
         {
-            "melanin": SkinMap(melanin, UNITS["melanin"], 0.1 * melanin, valid),
-            "hemoglobin": SkinMap(blood, UNITS["hemoglobin"], valid=valid),
+            "melanin": SkinMap(melanin, MAP_UNITS["melanin"], 0.1 * melanin, valid),
+            "hemoglobin": SkinMap(blood, MAP_UNITS["hemoglobin"], valid=valid),
             "normals": SkinMap(normals, "1", description="towards the camera"),
             "picture": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
             "diffuse": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),

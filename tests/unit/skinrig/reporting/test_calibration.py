@@ -10,7 +10,7 @@ import pytest
 from capture.calibration import store as calibrations
 from capture.calibration.record import Calibration, Quantity
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import report
 
 
@@ -43,7 +43,7 @@ def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), wo
     store.write(
         folder / "maps",
         SkinAppearance(
-            {"melanin": SkinMap(np.full((4, 4), 0.1), UNITS["melanin"])},
+            {"melanin": SkinMap(np.full((4, 4), 0.1), MAP_UNITS["melanin"])},
             "simulated",
             parameters={"session": "session"},
             inputs={"calibration geometry": digest},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import folders, map_images, verdict
@@ -25,7 +25,7 @@ def maps(tmp_path):
         store.write(
             tmp_path / name,
             SkinAppearance(
-                {"melanin": SkinMap(melanin, UNITS["melanin"], np.full(melanin.shape, 0.001))},
+                {"melanin": SkinMap(melanin, MAP_UNITS["melanin"], np.full(melanin.shape, 0.001))},
                 "measured",
             ),
         )

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import report
 from skinrig.drawing import figures, png, svg
 from skinrig.reporting import map_images, page, verdict
@@ -66,10 +66,10 @@ def html(tmp_path_factory):
     melanin = 0.03 + 0.05 * rng.random((30, 40))
     stderr = np.full(melanin.shape, 0.004)
     truth = {
-        name: SkinMap(melanin, UNITS["melanin"] if name == "melanin" else "1")
+        name: SkinMap(melanin, MAP_UNITS["melanin"] if name == "melanin" else "1")
         for name in ("melanin", "melanin_blurred")
     }
-    found = SkinMap(melanin + rng.normal(0, 0.004, melanin.shape), UNITS["melanin"], stderr)
+    found = SkinMap(melanin + rng.normal(0, 0.004, melanin.shape), MAP_UNITS["melanin"], stderr)
     store.write(
         tmp_path / "maps",
         SkinAppearance(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig import report
 from skinrig.benchmarks.document import to_document
@@ -23,7 +23,7 @@ def folder(tmp_path, rng):
     store.write(
         tmp_path / "appearance",
         SkinAppearance(
-            {"melanin": SkinMap(truth + noise, UNITS["melanin"], stderr)},
+            {"melanin": SkinMap(truth + noise, MAP_UNITS["melanin"], stderr)},
             "simulated",
             parameters={"truth": "truth-flash", "assumed": ["<b>flat</b> light"]},
             inputs={"session": "0123456789abcdef0123"},
@@ -31,7 +31,7 @@ def folder(tmp_path, rng):
         ),
     )
     maps = {
-        n: SkinMap(truth, UNITS["melanin"] if n == "melanin" else "1")
+        n: SkinMap(truth, MAP_UNITS["melanin"] if n == "melanin" else "1")
         for n in ("melanin", "melanin_blurred")
     }
     store.write(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.reporting import page, unjudged
 
 
@@ -11,7 +11,7 @@ def maps(**extra):
     melanin[:, 15:] = 0.15
     stderr = np.where(melanin > 0.1, 0.03, 0.0005)
     return SkinAppearance(
-        {"melanin": SkinMap(melanin, UNITS["melanin"], stderr), **extra}, "measured"
+        {"melanin": SkinMap(melanin, MAP_UNITS["melanin"], stderr), **extra}, "measured"
     )
 
 

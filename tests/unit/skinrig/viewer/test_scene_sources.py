@@ -9,7 +9,7 @@ from scipy.interpolate import griddata
 from model import store
 from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
-from model.skin import UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinMap
 from rigsim.subject.landmarks import find
 from rigsim.subject.person import make_subject
 from skinrig.appearances import dynamic as dynamic_appearance
@@ -66,7 +66,7 @@ def folder(subject, tmp_path_factory):
     )
     maps, document = to_maps(rig)
     melanin = picture(subject.melanin)
-    maps["melanin"] = SkinMap(np.where(valid, melanin, 0), UNITS["melanin"], None, valid)
+    maps["melanin"] = SkinMap(np.where(valid, melanin, 0), MAP_UNITS["melanin"], None, valid)
     root = tmp_path_factory.mktemp("face")
     dynamic_appearance.add(
         root / "appearance",

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from capture.plan.gradient import state_name
 from model.skin import SkinMap
-from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, block_of, grid_of
-from reconstruction.pipeline.gradient.images import SkinState, state_name
+from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, block_of, grid_of
+from reconstruction.pipeline.gradient.images import SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
-    HIDDEN,
+    HIDDEN_VARIANCE_RATIO,
     _along_x,
     _skin_blocks,
     count_normals,
@@ -113,9 +114,9 @@ def test_errors_of_variances_hold_what_pictures_hide(fitted):
             ("s", one.variance_x, one.stderr_x),
             ("t", one.variance_y, one.stderr_y),
         ):
-            assert row[f"variance_{axis}_stderr"] > HIDDEN * value
+            assert row[f"variance_{axis}_stderr"] > HIDDEN_VARIANCE_RATIO * value
             assert row[f"variance_{axis}_stderr"] ** 2 == pytest.approx(
-                scatter**2 + (HIDDEN * value) ** 2
+                scatter**2 + (HIDDEN_VARIANCE_RATIO * value) ** 2
             )
 
 
@@ -139,9 +140,9 @@ def test_a_state_is_counted_in_the_blocks_that_show_its_skin(relief, angle_deg):
         each, as_map(whole[top : top + SIDE, left : left + SIDE]), pixel_um=PIXEL_UM, there=there
     )
     turned, inside = _along_x(middle(whole).astype(np.float32), there, each.state.angle_rad)
-    group, groups = block_of(np.arange(SIDE**2), (SIDE, SIDE), BLOCKS)
+    group, groups = block_of(np.arange(SIDE**2), (SIDE, SIDE), BLOCKS_PER_SIDE)
     expected = block_counts(turned, group.reshape(SIDE, SIDE), groups, pixel=PIXEL_UM, valid=inside)
-    assert found.shape == (*grid_of((SIDE, SIDE), BLOCKS), 64, 64)
+    assert found.shape == (*grid_of((SIDE, SIDE), BLOCKS_PER_SIDE), 64, 64)
 
     def shares(counts):
         coarse = counts.reshape(-1, 16, 4, 16, 4).sum(axis=(2, 4)).reshape(len(counts), -1)

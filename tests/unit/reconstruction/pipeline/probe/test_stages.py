@@ -10,6 +10,7 @@ from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
 from model import photon_table
+from reconstruction.pipeline.probe import profile_fits
 from reconstruction.pipeline.probe import stages as probe_stages
 from reconstruction.pipeline.probe.images import Measurement, measurement_name
 
@@ -32,7 +33,7 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
     if rng is not None:
         value = value * (1 + noise * rng.standard_normal(value.shape))
     slope = common * (RADIUS - RADIUS.mean())[:, None] * np.ones(3)
-    return probe_stages.Profile(
+    return profile_fits.Profile(
         Measurement(Placement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
         FiberReflectance(
             tuple(fibre.name for fibre in PROBE.fibres),
@@ -158,10 +159,13 @@ def test_fibres_that_are_off_each_by_itself_make_no_layers():
     torn = [profile(noise=1e-3, repeat=k) for k in range(20)]
     for one in torn:
         one.reflectance.reflectance_per_mm2[:] *= np.exp(0.05 * rng.standard_normal((28, 3)))
-    fits = probe_stages.fit_profiles(torn, PROBE)
+    fits = profile_fits.fit_profiles(torn, PROBE)
     layered = np.array([fit.fit.scale != 1.0 for fit in fits])
     off = np.array([np.log(fit.fit.sigma_tr_per_mm / SIGMA_TR) / fit.log_stderr for fit in fits])
-    assert np.array([fit.fit.model_error > probe_stages.UNLIKE for fit in fits]).mean() > 0.9
+    assert (
+        np.array([fit.fit.model_error > profile_fits.MAX_HOMOGENEOUS_MISFIT for fit in fits]).mean()
+        > 0.9
+    )
     assert layered.mean() <= 0.05
     assert 0.5 < np.sqrt(np.mean(off[~layered] ** 2)) < 1.4
 
@@ -170,7 +174,7 @@ def test_a_turn_of_the_head_is_fitted_as_one_tissue_layered_where_all_directions
     """What dims in some directions and brightens in others is no layer: none gets a factor."""
 
     def factors(scales):
-        fits = probe_stages.fit_profiles(
+        fits = profile_fits.fit_profiles(
             [profile(angle=45.0 * k, scale=scale) for k, scale in enumerate(scales)], PROBE
         )
         return np.array([fit.fit.scale for fit in fits])

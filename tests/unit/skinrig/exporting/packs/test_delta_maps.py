@@ -10,9 +10,9 @@ import pytest
 from model import store, wrinkles
 from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.texture_resampling import resampled
-from model.wrinkles.evaluation import FILE, WrinkleModel
+from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.applying import expression
 from skinrig.exporting.options import Delivery
@@ -37,7 +37,7 @@ def color_parts(rng):
     states = {s: neutral * (1.1 + 0.15 * k) for k, s in enumerate(STATES)}
     rig = HemoglobinRig.from_maps(neutral, states, radius_px=8.0, stored_size=None)
     maps, document = to_maps(rig)
-    melanin = SkinMap(np.full((SIDE, SIDE), 0.04), UNITS["melanin"])
+    melanin = SkinMap(np.full((SIDE, SIDE), 0.04), MAP_UNITS["melanin"])
     return {**maps, "melanin": melanin}, {"facial_color.json": document}
 
 
@@ -49,7 +49,7 @@ def wrinkle_parts(rng):
     table = ExpressionTable(("upper", "lower"), {"smile": (1.0, 0.0), "anger": (0.5, 1.0)}, "test")
     model = WrinkleModel(base, (wrinkles.Layer(wrinkle, masks, table),))
     maps, document = model.to_maps()
-    return model, maps, {FILE: document}
+    return model, maps, {WRINKLE_FILE: document}
 
 
 @pytest.fixture(autouse=True)
@@ -116,7 +116,7 @@ def test_normals_plus_a_wrinkle_delta_are_the_normals_of_the_expression(
     codes = cv2.imread(str(tmp_path / "png/normal.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert codes.shape == (128, 128, 3)
     base = codes / 32767.5 - 1.0
-    model = WrinkleModel.from_maps(moving.maps, moving.files[FILE])
+    model = WrinkleModel.from_maps(moving.maps, moving.files[WRINKLE_FILE])
     for name, row in told["maps"].items():
         delta = read(tmp_path / f"exr/{name}_delta.exr")
         slopes = base[..., :2] / base[..., 2:] + delta[..., :2]

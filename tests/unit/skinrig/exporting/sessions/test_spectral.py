@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 
 from model import color_table, spectra
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN, two_layer_reflectance
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
@@ -24,8 +24,8 @@ def flash(rng):
     valid[0, 0] = False
     return SkinAppearance(
         {
-            "melanin": SkinMap(rng.uniform(0.01, 0.4, shape), UNITS["melanin"], valid=valid),
-            "hemoglobin": SkinMap(rng.uniform(0.005, 0.2, shape), UNITS["hemoglobin"]),
+            "melanin": SkinMap(rng.uniform(0.01, 0.4, shape), MAP_UNITS["melanin"], valid=valid),
+            "hemoglobin": SkinMap(rng.uniform(0.005, 0.2, shape), MAP_UNITS["hemoglobin"]),
             "diffuse": SkinMap(rng.uniform(0.2, 0.8, (*shape, 3)), "1"),
             "specular": SkinMap(rng.uniform(0.0, 0.3, (*shape, 3)), "1", valid=valid),
         },

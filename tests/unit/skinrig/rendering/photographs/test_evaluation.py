@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.evaluating.flash import compare
 
 
 def appearance(melanin, stderr=None, valid=None):
     return SkinAppearance(
-        {"melanin": SkinMap(melanin, UNITS["melanin"], stderr, valid)}, "simulated"
+        {"melanin": SkinMap(melanin, MAP_UNITS["melanin"], stderr, valid)}, "simulated"
     )
 
 

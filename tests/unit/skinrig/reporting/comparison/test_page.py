@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import report
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
@@ -128,7 +128,7 @@ def write_maps(folder, rng, *, shift=0.0, **parameters):
     store.write(
         folder,
         SkinAppearance(
-            {"melanin": SkinMap(noisy, UNITS["melanin"], np.full(melanin.shape, 0.001))},
+            {"melanin": SkinMap(noisy, MAP_UNITS["melanin"], np.full(melanin.shape, 0.001))},
             "simulated",
             parameters={"truth": "truth", **parameters},
             inputs={"session": f"sha256:{folder.name}"},
@@ -139,7 +139,7 @@ def write_maps(folder, rng, *, shift=0.0, **parameters):
 
 def write_truth(folder):
     maps = {
-        name: SkinMap(np.full((40, 50), 0.05), UNITS["melanin"] if name == "melanin" else "1")
+        name: SkinMap(np.full((40, 50), 0.05), MAP_UNITS["melanin"] if name == "melanin" else "1")
         for name in ("melanin", "melanin_blurred")
     }
     store.write(folder, SkinAppearance(maps, "simulated", parameters={"kind": "truth"}))

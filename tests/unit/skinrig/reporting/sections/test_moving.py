@@ -8,8 +8,8 @@ import numpy as np
 from model import store
 from model.facial_color import document as facial_color_document
 from model.facial_color.rig import HemoglobinRig
-from model.skin import UNITS, SkinAppearance, SkinMap
-from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.partial_derivatives import Layer
 from skinrig import report
@@ -24,9 +24,9 @@ def moving(folder, truths):
     rig = HemoglobinRig.from_maps(neutral, {"smile": 1.5 * neutral}, radius_px=6.0)
     maps, document = facial_color_document.to_maps(rig)
     stderr = np.full((SIDE, SIDE), 1e-3, np.float32)
-    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
-    maps["hemoglobin_smile"] = SkinMap(1.5 * neutral, UNITS["hemoglobin"], stderr)
-    maps["change_smile"] = SkinMap(0.5 * neutral, UNITS["hemoglobin"], stderr)
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), MAP_UNITS["melanin"])
+    maps["hemoglobin_smile"] = SkinMap(1.5 * neutral, MAP_UNITS["hemoglobin"], stderr)
+    maps["change_smile"] = SkinMap(0.5 * neutral, MAP_UNITS["hemoglobin"], stderr)
     parameters = {
         "alignment": [{"state": "smile", "median_error_px": 0.3, "by": "landmarks"}],
         "storage_error": {"smile": [0.0, 0.0]},
@@ -36,7 +36,9 @@ def moving(folder, truths):
     dynamic.add(
         folder,
         dynamic.FACIAL_COLOR,
-        dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, parameters, {}, "simulated"),
+        dynamic.Part(
+            maps, {facial_color_document.RIG_DOCUMENT: document}, parameters, {}, "simulated"
+        ),
     )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
@@ -55,7 +57,7 @@ def moving(folder, truths):
 
 
 def write_truth(folder, state, name, values):
-    maps = {name: SkinMap(np.asarray(values, np.float32), UNITS["hemoglobin"])}
+    maps = {name: SkinMap(np.asarray(values, np.float32), MAP_UNITS["hemoglobin"])}
     store.write(
         folder,
         SkinAppearance(maps, "simulated", parameters={"kind": "truth", "state": state}, seed=0),

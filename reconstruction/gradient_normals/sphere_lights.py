@@ -1,0 +1,200 @@
+"""Lights of a gradient sphere, and the disc that normals are looked up on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reconstruction.arrays import Float64Array
+
+
+class SphereLightsError(ValueError):
+    """Lights that no gradient sphere has."""
+
+
+def _none() -> Float64Array:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, slots=True)
+class SphereLights:
+    """The lights of a gradient sphere and their films, as they were measured.
+
+    Attributes
+    ----------
+    directions : ndarray, shape (L, 3)
+        Unit vectors from the middle of the patch to the lights, rig frame, at least four.
+    intensities : ndarray, shape (L,)
+        What each light gives at the patch, relative, >= 0; any scale. Default: all 1.
+    leakage : ndarray, shape (L,)
+        Of the specular reflection into the camera what passes crossed, over what passes parallel,
+        >= 0; below 1 for most lights. Default: 0.
+    polarizers : ndarray, shape (L, 3)
+        Unit vectors of the electric field that each light sends to the patch. Default (0, 3): such
+        that what a facet reflects into the view is polarized along the analyser.
+    analyser : tuple of float
+        Passing axis of the analyser in its parallel state.
+    programmed : ndarray, shape (L, 3)
+        The vectors whose coordinates the patterns were made of; default: `directions`.
+    distance_mm : float
+        Of the lights from the middle of the patch; inf: a point's place does not count.
+    intensity_stderr : ndarray, shape (L,)
+        Standard error of `intensities`. Default: 0.
+    leakage_stderr : ndarray, shape (L,)
+        Standard error of `leakage`. Default: 0.
+
+    Examples
+    --------
+    >>> axes = np.concatenate([np.eye(3), -np.eye(3)])
+    >>> SphereLights(axes).intensities.tolist()
+    [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+
+    directions: Float64Array
+    intensities: Float64Array = field(default_factory=_none)
+    leakage: Float64Array = field(default_factory=_none)
+    polarizers: Float64Array = field(default_factory=_none)
+    analyser: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    programmed: Float64Array = field(default_factory=_none)
+    distance_mm: float = np.inf
+    intensity_stderr: Float64Array = field(default_factory=_none)
+    leakage_stderr: Float64Array = field(default_factory=_none)
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges, and keep copies that cannot be written to."""
+        ways = require_unit_vectors("directions", self.directions)
+        count = len(ways)
+        if count < 4:
+            raise SphereLightsError(f"directions: got {count} light(s), expected at least 4")
+        axis = require_unit_vectors("analyser", np.asarray(self.analyser, np.float64)[None])[0]
+        # not given: stay empty, so that a later replace() of directions does not meet old ones
+        for name, default in (
+            ("intensities", 1.0),
+            ("leakage", 0.0),
+            ("intensity_stderr", 0.0),
+            ("leakage_stderr", 0.0),
+        ):
+            given = np.asarray(getattr(self, name), np.float64)
+            values = np.full(count, default) if given.size == 0 else given.copy()
+            if values.shape != (count,) or not np.isfinite(values).all() or (values < 0).any():
+                raise SphereLightsError(
+                    f"{name}: got shape {values.shape}, expected finite numbers >= 0, ({count},)"
+                )
+            _keep(self, name, values)
+        if not self.intensities.any():
+            raise SphereLightsError("intensities: got 0 for every light, expected some light")
+        # a few may exceed 1, by a film mounted across or where the surface hardly reflects the
+        # parallel state: what they give parallel less crossed is negative, and counts as such
+        middle = float(np.median(self.leakage[self.intensities > 0]))
+        if middle >= 1.0:
+            raise SphereLightsError(
+                f"leakage: got {middle:g} in the middle of the lights, expected crossed over"
+                " parallel below 1; are the two states exchanged?"
+            )
+        for name in ("polarizers", "programmed"):
+            given = np.asarray(getattr(self, name), np.float64)
+            vectors = np.zeros((0, 3)) if given.size == 0 else require_unit_vectors(name, given)
+            if len(vectors) not in (0, count):
+                raise SphereLightsError(f"{name}: got {len(vectors)} vectors, expected {count}")
+            _keep(self, name, vectors)
+        if len(self.polarizers):
+            along = np.abs(np.sum(self.polarizers * ways, axis=1))
+            if along.max() > 0.05:
+                raise SphereLightsError(
+                    f"polarizers[{along.argmax()}]: got a field along its own ray, expected one"
+                    " across it"
+                )
+        if not self.distance_mm > 0:
+            raise SphereLightsError(f"distance_mm: got {self.distance_mm}, expected more than 0")
+        _keep(self, "directions", ways)
+        object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
+
+
+def _keep(lights: SphereLights, name: str, values: Float64Array) -> None:
+    values.flags.writeable = False
+    object.__setattr__(lights, name, values)
+
+
+def require_unit_vectors(name: str, vectors: ArrayLike) -> Float64Array:
+    """Return vectors as unit vectors (L, 3); refuse lengths more than 1 % off."""
+    array = np.array(vectors, np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise SphereLightsError(f"{name}: got shape {array.shape}, expected (L, 3)")
+    length = np.linalg.norm(array, axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
+    if wrong.size:
+        raise SphereLightsError(
+            f"{name}[{wrong[0]}]: got {array[wrong[0]].tolist()}, expected a unit vector"
+        )
+    return np.asarray(array / length[:, None])
+
+
+def require_finite(name: str, values: Float64Array) -> None:
+    """Refuse NaN and infinity."""
+    wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
+    if wrong:
+        raise SphereLightsError(
+            f"{name}: got {wrong} of {np.size(values)} numbers that are NaN or infinite, expected "
+            "finite ones: leave out what is masked"
+        )
+
+
+def frame_of(view: ArrayLike) -> Float64Array:
+    """Return the orthonormal frame about a view, rows right, up, view; identity for +z.
+
+    Parameters
+    ----------
+    view : array_like, shape (3,)
+        Of any length above 0.
+
+    Raises
+    ------
+    SphereLightsError
+        For a view that points nowhere.
+    """
+    v = np.asarray(view, np.float64)
+    most = float(np.abs(v).max()) if v.shape == (3,) else np.nan
+    if not 0.0 < most < np.inf:
+        raise SphereLightsError(f"view: got {v.tolist()}, expected a finite vector of 3, not 0")
+    v = v / most
+    v /= np.linalg.norm(v)
+    up = np.array([0.0, 1.0, 0.0]) if abs(v[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
+    right = np.cross(up, v)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(v, right), v])
+
+
+def normal_at(place: Float64Array) -> Float64Array:
+    """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
+
+    The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
+
+    Raises
+    ------
+    SphereLightsError
+        For places that are not finite.
+
+    Examples
+    --------
+    >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
+    [0.866, 0.0, 0.5]
+    """
+    require_finite("place", place)
+    length = np.hypot(place[..., :1], place[..., 1:])
+    seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
+    square = np.minimum(length, np.sqrt(2.0)) ** 2
+    return np.concatenate([seen * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
+
+
+def place_of(normal: Float64Array) -> Float64Array:
+    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
+
+    Raises
+    ------
+    SphereLightsError
+        For normals that are not finite.
+    """
+    require_finite("normal", normal)
+    return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))

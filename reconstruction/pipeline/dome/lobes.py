@@ -1,0 +1,229 @@
+"""Basis BRDFs of a dome session, and normals refined by them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
+from model.skin import SkinMap
+from model.skin_reflectance import BASIS_FILE
+from reconstruction import brdf_basis
+from reconstruction.arrays import Float64Array
+from reconstruction.lumitexels import Lumitexels
+from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.pipeline.dome.calibrated import Dome
+from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.scan.mesh import RefinedScan
+from reconstruction.surface import errors as surface_errors
+from reconstruction.surface import estimates
+from reconstruction.surface.estimates import PointValues
+from reconstruction.surface.texture import SurfaceTexture
+
+BASIS_RANK: Final = 4
+"""Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
+
+MAX_RELATIVE_STRENGTH: Final = 6.0
+"""Times the usual strength from which on a point's mixture is not used to find the common ones."""
+
+RECORDED_RANKS: Final = (1, 2, BASIS_RANK, 2 * BASIS_RANK, 24)
+"""Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
+
+BASIS_POINTS: Final = 5_000
+"""Points, drawn at random, that the mixtures are found on."""
+
+
+def weight_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
+    """Return the names of the maps of shares of so many lobes.
+
+    Examples
+    --------
+    >>> weight_names(2)
+    ('basis_weight_0', 'basis_weight_1')
+    """
+    return tuple(f"basis_weight_{k}" for k in range(rank))
+
+
+N_REFINEMENTS = 2
+"""Turns of fitting normals by the lobes, and the lobes at the normals."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Lumitexels of the surface, and the folder that holds them where they are many."""
+
+    store: LumitexelStore
+    folder: Any
+    lights: int
+    """Lights of the dome: where exposures stay apart, several captures are of one."""
+
+    def collect(
+        self,
+        estimate: Callable[[slice, Lumitexels], PointValues],
+        progress: Callable[[float], None] | None = None,
+    ) -> PointValues:
+        """Estimate at all points; see `estimates.collect`."""
+
+        def by_light(part: slice, samples: Lumitexels) -> PointValues:
+            return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
+
+        return estimates.collect(self.store, by_light, progress=progress)
+
+
+def fit_lobes(
+    evidence: Evidence, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
+) -> Mapping[str, Any]:
+    """Fit basis BRDFs to all points, reduce them, and return basis, weights and file."""
+    folder = evidence.basis
+    materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
+    store = lumitexels.store
+    rank = evidence.rank or BASIS_RANK
+    good = np.flatnonzero(point_r_d.valid)
+    if len(good) < rank:
+        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
+    drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
+    fitted = []
+    for part, samples in store.chunks(estimates.chunk_points(store)):
+        rows = drawn[(drawn >= part.start) & (drawn < part.stop)] - part.start
+        if not len(rows):
+            continue
+        fitted.append(
+            brdf_basis.fit_weights(
+                estimates.surface_samples(
+                    estimates.rows_of(samples, rows),
+                    estimates.part_of(point_normals, part.start + rows),
+                    estimates.part_of(point_r_d, part.start + rows),
+                ),
+                materials,
+            ).weights
+        )
+    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * BASIS_RANK))
+    most = min(shares.shape)
+    if rank > most:
+        raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
+    mixes = {
+        k: brdf_basis.reduce(shares, k, basis=materials)[1:]
+        for k in sorted({*RECORDED_RANKS, rank})
+        if k <= most
+    }
+    basis = materials.mixed(mixes[rank][0])
+    found = lumitexels.collect(
+        lambda part, samples: estimates.lobe_weights(
+            samples,
+            estimates.part_of(point_normals, part),
+            estimates.part_of(point_r_d, part),
+            basis,
+        ),
+        progress=partial(evidence.tell, "lobes"),
+    )
+    return {
+        "basis": basis,
+        "weights": found.values[:, :rank],
+        "basis_file": _basis_bytes(materials, rank, mixes),
+    }
+
+
+def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Float64Array:
+    """Return mixtures scaled to reflect equally much, without those that no sample holds down.
+
+    A lobe so narrow that no pair of light and view met it can have any share.
+    """
+    total = shares @ materials.strength()
+    some = total[total > 0]
+    usual = float(np.median(some)) if len(some) else 0.0
+    kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
+    if np.count_nonzero(kept) < least:
+        raise EvidenceError(
+            f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
+            f"reflects, expected at least {least}; more lights or views would show it"
+        )
+    return shares[kept] / total[kept, None]
+
+
+def _basis_bytes(
+    materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[Float64Array, float]]
+) -> bytes:
+    """Keep the lobes, and of every rank the mixtures of materials that they would be."""
+    mix = mixes[rank][0]
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        materials=np.array(materials.names),
+        mix=mix,
+        table=materials.mixed(mix).table[..., :rank],
+        light_radius_rad=materials.light_radius_rad,
+        ranks=np.array(list(mixes)),
+        error_by_rank=np.array([error for _, error in mixes.values()]),
+        mix_by_rank=np.concatenate([mix for mix, _ in mixes.values()]),
+    )
+    return stream.getvalue()
+
+
+def refine_normals(
+    dome: Dome,
+    surface: RefinedScan,
+    lumitexels: Samples,
+    point_normals: PointValues,
+    point_r_d: PointValues,
+    basis: BrdfBasis,
+    weights: Float64Array,
+    basis_file: bytes,
+    texture: SurfaceTexture,
+) -> Mapping[str, SkinMap | bytes]:
+    """Refine normals and lobe weights in turn, and return them as maps with the basis's file."""
+    started = lumitexels.collect(
+        lambda part, samples: estimates.normals_from_remainder(
+            samples,
+            estimates.part_of(point_normals, part),
+            estimates.part_of(point_r_d, part),
+            weights[part],
+            basis,
+        ),
+        progress=partial(dome.tell, "normals by what lobes leave"),
+    )
+    known = point_normals.valid & point_r_d.valid
+    inside = PointValues(
+        np.where(started.valid[:, None], started.values, point_normals.values),
+        np.where(started.valid[:, None], started.stderr, point_normals.stderr),
+        known,
+    )
+    found, rank = inside, weights.shape[1]
+    for turn in range(N_REFINEMENTS):
+        normals, shares = found, weights
+        found = lumitexels.collect(
+            lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
+                samples,
+                estimates.part_of(inside, part),
+                estimates.part_of(point_r_d, part),
+                w[part],
+                basis,
+                now=n.values[part],
+            ),
+            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {N_REFINEMENTS}"),
+        )
+        fitted = lumitexels.collect(
+            lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
+                samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis
+            ),
+            progress=partial(dome.tell, f"lobes, {turn + 1} of {N_REFINEMENTS}"),
+        )
+        weights = fitted.values[:, :rank]
+    maps = {
+        name: texture.map(
+            fitted.values[:, k], fitted.stderr[:, k], fitted.valid, "1", "share of a common mixture"
+        )
+        for k, name in enumerate(weight_names(rank))
+    }
+    maps["lobe_residual"] = texture.map(
+        fitted.values[:, rank], None, fitted.valid, "1/sr", "weighted RMS of samples - model"
+    )
+    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
+    refined = texture.normals(found, "by the whole model, world frame")
+    return {BASIS_FILE: basis_file, "normals_refined": refined, **maps}

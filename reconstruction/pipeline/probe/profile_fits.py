@@ -1,0 +1,204 @@
+"""Optical coefficients of the profiles of a fiber probe, per site."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capture.calibration.fiber.probe_calibration import FiberReflectance
+from capture.rig import Probe
+from reconstruction import subsurface
+from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
+from reconstruction.arrays import BoolArray, Float64Array, Int64Array
+from reconstruction.pipeline.probe.images import Measurement
+from reconstruction.subsurface import SubsurfaceFit
+from reconstruction.subsurface import nearest as nearest_medium
+
+METHOD_NAMES = ("photon_table", "diffusion", "dipole")
+"""The first is the recommended one; the others stand beside it."""
+
+MAX_HOMOGENEOUS_MISFIT = 0.03
+"""Relative misfit from which a bent profile is that of no homogeneous medium, but of layered
+tissue. What each fibre has off by itself, as by dirt on it, bends none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """What the fibres took at one placement."""
+
+    measurement: Measurement
+    reflectance: FiberReflectance
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileFit:
+    """Coefficients that one method finds for one profile, in every channel.
+
+    Attributes
+    ----------
+    profile : Profile
+    fit : SubsurfaceFit
+        Leading axis the channels.
+    log_stderr : ndarray, shape (C,)
+        Standard error of log sigma_tr by the readings, the single fibres and the model.
+    log_common : ndarray, shape (T, C)
+        Change of log sigma_tr for one standard uncertainty of each cause that all fibres and all
+        measurements share: what the phantom's certificate leaves uncertain.
+    log_coefficients : ndarray, shape (2, C)
+        Root sum square of such changes of log sigma_a and log sigma_s'.
+    """
+
+    profile: Profile
+    fit: SubsurfaceFit
+    log_stderr: Float64Array
+    log_common: Float64Array
+    log_coefficients: Float64Array
+
+    @property
+    def log_total(self) -> Float64Array:
+        """Standard error of log sigma_tr by all causes, shape (C,)."""
+        return np.asarray(np.sqrt(self.log_stderr**2 + (self.log_common**2).sum(axis=0)))
+
+
+@dataclass(frozen=True, slots=True)
+class SiteValue:
+    """sigma_tr of a site over its placements, by the recommended method.
+
+    Attributes
+    ----------
+    site : str
+    measurements : ndarray of int, shape (C,)
+        Fits it rests on.
+    sigma_tr_per_mm, stderr_per_mm : ndarray, shape (C,)
+        Mean of the logarithms; NaN and infinite where no fit is valid.
+    """
+
+    site: str
+    measurements: Int64Array
+    sigma_tr_per_mm: Float64Array
+    stderr_per_mm: Float64Array
+
+
+def fit_profiles(
+    profiles: Sequence[Profile], probe: Probe, method: Any = METHOD_NAMES[0]
+) -> list[ProfileFit]:
+    """Fit all profiles and channels, also with each common error at its uncertainty."""
+    first = profiles[0].reflectance
+    causes = len(first.common_per_mm2)
+    # (1 + T, M, C, F): as measured, then with one standard uncertainty of each cause
+    value = np.stack([p.reflectance.reflectance_per_mm2.T for p in profiles])
+    common = np.stack([p.reflectance.common_per_mm2.transpose(0, 2, 1) for p in profiles], axis=1)
+    every = np.concatenate([value[None], value[None] + common])
+
+    told: dict[str, Any] = {
+        "variance": np.stack([p.reflectance.variance.T for p in profiles]),
+        "valid": np.stack([p.reflectance.valid.T for p in profiles]),
+        "collection": "fibre",
+        "core_mm": probe.fibres[0].core_mm,
+        "source_core_mm": probe.source_core_mm,
+    }
+    fit = subsurface.invert(first.radius_mm, every, method=method, **told)
+    if np.any(unlike := fit.bent[0] & (fit.model_error[0] > MAX_HOMOGENEOUS_MISFIT)):
+        if method == METHOD_NAMES[0]:
+            other = subsurface.nearest_medium(first.radius_mm, every, **told)
+        else:
+            other = subsurface.invert(
+                first.radius_mm,
+                every,
+                method=method,
+                common_error=nearest_medium.LOG_FACTOR_SIGMA,
+                **told,
+            )
+        unlike = _layered(profiles, unlike, other.scale[0])
+        fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
+
+    def change_of(coefficient: Float64Array) -> Float64Array:
+        logs = np.log(coefficient)
+        return np.asarray(np.nan_to_num(logs[1:] - logs[0]))
+
+    change = change_of(fit.sigma_tr_per_mm)
+    pair = [change_of(fit.sigma_a_per_mm), change_of(fit.sigma_s_prime_per_mm)]
+    shared = np.sqrt(np.square(pair).sum(axis=1))  # (2, M, C)
+    log_stderr = fit.sigma_tr_stderr[0] / fit.sigma_tr_per_mm[0]
+    return [
+        ProfileFit(
+            profile,
+            _one(fit, (0, number)),
+            log_stderr[number],
+            change[:, number].reshape(causes, -1),
+            shared[:, number],
+        )
+        for number, profile in enumerate(profiles)
+    ]
+
+
+def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Array) -> BoolArray:
+    """Return which profiles are fitted as those of layers, (M, C); a turn is of one tissue.
+
+    A layer on top dims in all directions. Tissue that scatters by direction is unlike any medium,
+    too, but the factors that it asks for lie on both sides of 1; fitted by some of its directions
+    with a factor and by others without, its sigma_tr would jump between them.
+    """
+    found = np.array(unlike)
+    for group in profile_groups(profiles).values():
+        if len({profiles[k].measurement.placement.angle_deg for k in group}) >= MIN_DIRECTIONS:
+            dims = (factor[group] < 1.0).all(axis=0)
+            found[group] = dims & (2 * unlike[group].sum(axis=0) > len(group))
+    return found
+
+
+def profile_groups(profiles: Sequence[Profile]) -> dict[tuple[str, int], list[int]]:
+    """Return the numbers of profiles of each site and repeat, in all directions of the head."""
+    groups: dict[tuple[str, int], list[int]] = {}
+    for number, profile in enumerate(profiles):
+        placement = profile.measurement.placement
+        groups.setdefault((placement.site, placement.repeat), []).append(number)
+    return groups
+
+
+def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> SubsurfaceFit:
+    """Return one batch's fits, but another's where told to."""
+    merged = {}
+    for name in (field.name for field in dataclasses.fields(fit) if field.name != "method"):
+        own = getattr(fit, name)
+        mask = there.reshape(there.shape + (1,) * (own.ndim - there.ndim))
+        merged[name] = np.where(mask, getattr(other, name), own)
+    return dataclasses.replace(fit, **merged)
+
+
+def _one(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
+    """Return some of a batch's fits."""
+    names = [field.name for field in dataclasses.fields(fit) if field.name != "method"]
+    return dataclasses.replace(fit, **{name: getattr(fit, name)[index] for name in names})
+
+
+def site_values(fits: Sequence[ProfileFit]) -> list[SiteValue]:
+    """Average the placements of each site; what they share is not averaged away.
+
+    Placements differ by more than their fits know of, as contact does: where their scatter is
+    larger than their standard errors, it is what counts.
+    """
+    found = []
+    for site in dict.fromkeys(fit.profile.measurement.placement.site for fit in fits):
+        own = [fit for fit in fits if fit.profile.measurement.placement.site == site]
+        valid = np.stack([fit.fit.valid for fit in own])  # (M, C)
+        log_tr = np.stack([np.log(fit.fit.sigma_tr_per_mm) for fit in own])
+        spread = np.stack([fit.log_stderr for fit in own])
+        weight = np.where(valid, 1.0 / np.where(valid, spread, 1.0) ** 2, 0.0)
+        total, count = weight.sum(axis=0), valid.sum(axis=0)
+        known = count > 0
+        mean = (weight * np.where(valid, log_tr, 0.0)).sum(axis=0) / np.where(known, total, 1.0)
+        scatter = (weight * np.where(valid, log_tr - mean, 0.0) ** 2).sum(axis=0)
+        inflation = np.maximum(scatter / np.maximum(count - 1, 1), 1.0)
+        shared = np.mean([fit.log_common for fit in own], axis=0)
+        with np.errstate(divide="ignore"):
+            variance = inflation / total + (shared**2).sum(axis=0)
+        sigma_tr = np.where(known, np.exp(mean), np.nan)
+        found.append(
+            SiteValue(site, count, sigma_tr, np.where(known, sigma_tr * np.sqrt(variance), np.inf))
+        )
+    return found
