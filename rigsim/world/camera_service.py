@@ -111,7 +111,8 @@ class CameraService:
         with self._lock:
             holder = self._holders.get(name)
             if request.get("version") != camera_wire.CAMERA_WIRE_VERSION:
-                fault = f"version: got {request.get('version')!r}, expected {camera_wire.VERSION}"
+                version = camera_wire.CAMERA_WIRE_VERSION
+                fault = f"version: got {request.get('version')!r}, expected {version}"
             elif name not in self.addresses:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"
             elif current is not None or (holder is not None and not _hung_up(holder)):

@@ -173,7 +173,7 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim.fiber.probe_tissue import PHANTOM_SITE as BLOCK
+    from rigsim.fiber.probe_tissue import PHANTOM as BLOCK
     from rigsim.fiber.probe_tissue import TissueError
     from rigsim.population import files as subject_file
     from rigsim.scenes.probe.scene import ProbeScene
