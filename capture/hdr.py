@@ -32,7 +32,7 @@ _MAX_EXACT_INTEGER: Final = 2.0**53
 _N_LEVELS: Final = 256
 _N_GROUPS: Final = 8
 
-Merged = tuple[Float32Array, Float32Array, BoolArray]
+_Merged = tuple[Float32Array, Float32Array, BoolArray]
 
 
 class BracketError(InputError):
@@ -162,7 +162,7 @@ def merge(
     read_noise: float,
     black: float,
     white: float,
-) -> Merged:
+) -> _Merged:
     """Merge raw frames of one scene at several exposure times with noise-optimal weights.
 
     Parameters
@@ -260,7 +260,7 @@ def merge_reference(
     read_noise: float,
     black: float,
     white: float,
-) -> Merged:
+) -> _Merged:
     """Return what `merge` does, written plainly in float64 for whole numbers of any kind."""
     times = np.asarray(exposures_s, np.float64)
     floor = (read_noise / gain) ** 2 + 1.0 / 12.0  # DN^2, with the rounding to whole DN

@@ -30,7 +30,7 @@ MAX_ROW_TIME_DEVIATION = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class ClockOffset:
+class _ClockOffset:
     """A camera's clock against the box's."""
 
     offset_s: float
@@ -41,16 +41,16 @@ class ClockOffset:
     """Box time of the comparison, s."""
 
 
-def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> ClockOffset:
+def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> _ClockOffset:
     """Return a camera's clock against the box's: the best of a few comparisons."""
-    best = ClockOffset(0.0, float("inf"), 0.0)
+    best = _ClockOffset(0.0, float("inf"), 0.0)
     for _ in range(N_CLOCK_READINGS):
         before = camera.clock_s()
         box_s = box_clock_s()
         after = camera.clock_s()
         half = 0.5 * (after - before)
         if half < best.uncertainty_s:
-            best = ClockOffset(0.5 * (before + after) - box_s, half, box_s)
+            best = _ClockOffset(0.5 * (before + after) - box_s, half, box_s)
         if best.uncertainty_s < 2e-3:
             break
     return best
@@ -98,7 +98,7 @@ class FrameStream:
         *,
         row_times_s: Mapping[int, float],
         dwell_s: float,
-        clock: ClockOffset,
+        clock: _ClockOffset,
         want: Exposure,
         lag_s: float,
         timeout_s: float,

@@ -76,7 +76,7 @@ class Operator:
             raise Interrupted
 
 
-class Darkened(Protocol):
+class _Darkened(Protocol):
     """The part of a driver that ends every capture."""
 
     def dark(self) -> None:
@@ -105,7 +105,7 @@ def given_up(what: str, why: str, session: Session) -> AcquisitionError:
     )
 
 
-def tear_down(box: Darkened, cameras: Mapping[str, Camera]) -> None:
+def tear_down(box: _Darkened, cameras: Mapping[str, Camera]) -> None:
     """Put the light out and let the cameras go; nothing here hides the error that led here."""
     try:
         box.dark()

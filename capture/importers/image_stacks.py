@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
-import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -20,6 +18,7 @@ from capture.documents import Fault
 from capture.importers import light_lists
 from capture.importers.images import Photo, PhotoError, read_photo
 from capture.importers.light_lists import LightList, LightListError
+from capture.importers.new_folder import new_folder, require_new
 from capture.plan import Plan, Step, Value
 from capture.rig import Light, Rig, View
 from capture.session import Session, Subject
@@ -121,16 +120,8 @@ def import_light_list(
     rig = _rig(found, first.frame, near=near)
     steps = _steps(found)
     target = Path(out)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise PhotoError(
-            "cannot write here",
-            where=str(target),
-            faults=[Fault("out", "something that exists", "a new or empty folder")],
-            advice="Choose a new folder.",
-        )
-    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+    require_new(target)
+    with new_folder(target) as part:
         session = Session.create(
             part,
             plan=Plan(rig.name, steps),
@@ -160,12 +151,6 @@ def import_light_list(
             for step, file in zip(steps, found.pictures, strict=True):
                 _commit(session, step, file, clock, as_linear=as_linear)
             session.close()
-        if target.exists():
-            target.rmdir()
-        part.rename(target)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
     return ImportedStack(
         str(target),
         len(steps),
@@ -176,18 +161,18 @@ def import_light_list(
     )
 
 
-def pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
+def _pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
     """Return rows and columns of an imported picture: a 2 x 2 cell is one pixel, unless MONO."""
     height, width = frame.cfa.shape
     return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
 
 
-def encode_srgb(linear: FloatArray) -> FloatArray:
+def _encode_srgb(linear: FloatArray) -> FloatArray:
     """Return display values of linear light in [0, 1], IEC 61966-2-1.
 
     Examples
     --------
-    >>> encode_srgb(np.array([0.0, 0.214041, 1.0])).round(5).tolist()
+    >>> _encode_srgb(np.array([0.0, 0.214041, 1.0])).round(5).tolist()
     [0.0, 0.5, 1.0]
     """
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -206,7 +191,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
         photo = read_photo(file)
         frame = photo.frame
         notes.update(dict.fromkeys(photo.notes))
-        shape = pixels_of(frame)
+        shape = _pixels_of(frame)
         if first is None:
             first = photo
             inside = np.ones(shape, bool) if mask is None else light_lists.read_mask(mask, shape)
@@ -215,7 +200,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
         same = (first.encoding, first.frame.pattern, first.frame.cfa.shape, first.frame.white)
         if (photo.encoding, frame.pattern, frame.cfa.shape, frame.white) != same:
             got = f"{photo.encoding} {shape[1]} x {shape[0]} {frame.pattern}"
-            wanted = pixels_of(first.frame)
+            wanted = _pixels_of(first.frame)
             expected = f"{first.encoding} {wanted[1]} x {wanted[0]} {first.frame.pattern}"
             faults.append(Fault(file.name, got, expected))
             continue
@@ -234,7 +219,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
 def _adds_up_as_codes(samples: Float64Array, found: LightList) -> bool:
     """Return whether the files' values obey the shading better than the light they should code."""
     decoded = np.clip(samples, 0.0, 1.0)
-    codes = np.asarray(encode_srgb(decoded))
+    codes = np.asarray(_encode_srgb(decoded))
     return _misfit(codes, found.directions) < LINEAR_MISFIT_RATIO * _misfit(
         decoded, found.directions
     )
@@ -328,7 +313,7 @@ def _steps(found: LightList) -> tuple[Step, ...]:
 def _mask_png(path: Path, frame: raw.RawFrame) -> bytes:
     import cv2
 
-    inside = light_lists.read_mask(path, pixels_of(frame))
+    inside = light_lists.read_mask(path, _pixels_of(frame))
     _, data = cv2.imencode(".png", inside.astype(np.uint8) * 255)
     return bytes(data)
 
@@ -339,7 +324,7 @@ def _commit(
     frame = read_photo(file).frame
     if as_linear:
         share = np.arange(frame.white + 1) / frame.white
-        undone = np.rint(frame.white * encode_srgb(share)).astype(np.uint16)
+        undone = np.rint(frame.white * _encode_srgb(share)).astype(np.uint16)
         frame = replace(frame, cfa=undone[np.minimum(frame.cfa, frame.white)])
     settings: dict[str, Value] = dict(step.settings)
     if frame.exposure_s is not None:

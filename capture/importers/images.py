@@ -86,23 +86,23 @@ def read_photo(path: str | Path) -> Photo:
     return _raw(file, where)
 
 
-def decode_srgb(values: FloatArray) -> FloatArray:
+def _decode_srgb(values: FloatArray) -> FloatArray:
     """Return linear light of display values in [0, 1], IEC 61966-2-1.
 
     Examples
     --------
-    >>> decode_srgb(np.array([0.0, 0.5, 1.0])).round(6).tolist()
+    >>> _decode_srgb(np.array([0.0, 0.5, 1.0])).round(6).tolist()
     [0.0, 0.214041, 1.0]
     """
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def cells_of(rgb: UInt16Array) -> UInt16Array:
+def _cells_of(rgb: UInt16Array) -> UInt16Array:
     """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB picture.
 
     Examples
     --------
-    >>> cells_of(np.array([[[1, 2, 3]]], np.uint16)).tolist()
+    >>> _cells_of(np.array([[[1, 2, 3]]], np.uint16)).tolist()
     [[1, 2], [2, 3]]
     """
     height, width, _ = rgb.shape
@@ -189,7 +189,7 @@ def _raw(file: Path, where: str) -> Photo:
 def _frame(values: UInt16Array, black: int) -> raw.RawFrame:
     color = values.ndim == 3
     return raw.RawFrame(
-        cfa=cells_of(values) if color else np.ascontiguousarray(values),
+        cfa=_cells_of(values) if color else np.ascontiguousarray(values),
         pattern="RGGB" if color else "MONO",
         black=(float(black),) * (4 if color else 1),
         white=WHITE_DN,
@@ -217,7 +217,7 @@ def _from_display(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise _error("is of no known depth", where, "samples", str(pixels.dtype), "8 or 16 bit")
     codes = 256 if pixels.dtype == np.uint8 else 65_536
-    table = np.rint(WHITE_DN * decode_srgb(np.arange(codes) / (codes - 1))).astype(np.uint16)
+    table = np.rint(WHITE_DN * _decode_srgb(np.arange(codes) / (codes - 1))).astype(np.uint16)
     if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
         pixels = pixels[..., 0]
         notes = [*notes, "the picture is gray, so that it holds no color to estimate from"]

@@ -101,14 +101,14 @@ def find(directory: Path, *, lights: Path | None = None) -> LightList:
     if not source.exists():
         raise LightListError("there is no such light list", where=str(source))
     if source.is_dir():
-        pictures = pictures_in(directory)
+        pictures = _images_in(directory)
         return LightList(pictures, _from_ball(source, len(pictures)), "chrome ball", source.name)
     if source.suffix.lower() == ".lp":
         return _from_lp(source, directory)
     return _from_text(source, directory)
 
 
-def pictures_in(directory: Path) -> tuple[Path, ...]:
+def _images_in(directory: Path) -> tuple[Path, ...]:
     """Return the pictures of a folder in natural order, without its masks.
 
     A ``filenames.txt`` names them in its own order.
@@ -125,19 +125,19 @@ def pictures_in(directory: Path) -> tuple[Path, ...]:
                 if file.is_file()
                 and file.suffix.lower() in IMAGE_SUFFIXES
                 and not file.name.startswith(".")
-                and not is_mask(file)
+                and not _is_mask(file)
             ),
             key=lambda file: natural(file.name),
         )
     )
 
 
-def is_mask(file: Path) -> bool:
+def _is_mask(file: Path) -> bool:
     """Return whether a picture's name says that it is a mask.
 
     Examples
     --------
-    >>> is_mask(Path("buddha.mask.png")), is_mask(Path("damask.png"))
+    >>> _is_mask(Path("buddha.mask.png")), _is_mask(Path("damask.png"))
     (True, False)
     """
     return "mask" in re.split(r"[^a-z]+", file.stem.lower())
@@ -145,7 +145,7 @@ def is_mask(file: Path) -> bool:
 
 def mask_of(directory: Path) -> Path | None:
     """Return the mask of a folder of pictures, None where it has none or several."""
-    found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and is_mask(f)]
+    found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and _is_mask(f)]
     return found[0] if len(found) == 1 else None
 
 
@@ -181,12 +181,12 @@ def gray(frame: RawFrame) -> Float32Array:
 
 def _folder(directory: Path) -> Path:
     """Return the folder of the pictures: this one, or the only one below that is no ball's."""
-    if pictures_in(directory):
+    if _images_in(directory):
         return directory
     below = [
         folder
         for folder in sorted(directory.iterdir())
-        if folder.is_dir() and not _is_ball(folder) and pictures_in(folder)
+        if folder.is_dir() and not _is_ball(folder) and _images_in(folder)
     ]
     if len(below) != 1:
         got = ", ".join(folder.name for folder in below) or "no pictures"
@@ -218,7 +218,7 @@ def _source(directory: Path) -> Path:
                 return candidate
     for folder in (directory, directory.parent):
         for ball in sorted(f for f in folder.iterdir() if f.is_dir() and _is_ball(f)):
-            if ball != directory and pictures_in(ball):
+            if ball != directory and _images_in(ball):
                 return ball
     raise LightListError(
         "has no light list",
@@ -308,7 +308,7 @@ def _from_text(path: Path, directory: Path) -> LightList:
             faults=[Fault("lines", str(len(rows)), f"{count}, as its first line says")],
         )
     vectors = np.array([_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
-    pictures = pictures_in(directory)
+    pictures = _images_in(directory)
     if len(pictures) != len(rows):
         raise LightListError(
             "does not fit the pictures",
@@ -335,7 +335,7 @@ def _from_text(path: Path, directory: Path) -> LightList:
 def _from_ball(folder: Path, count: int) -> Float64Array:
     from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 
-    pictures, mask = pictures_in(folder), mask_of(folder)
+    pictures, mask = _images_in(folder), mask_of(folder)
     if len(pictures) != count or mask is None:
         got = f"{len(pictures)} pictures, {'a' if mask else 'no'} mask"
         raise LightListError(

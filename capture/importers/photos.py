@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-import shutil
-import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
+from capture.importers.new_folder import new_folder, require_new
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Light, Rig, View
 from capture.session import Session, SessionDiskError, Subject
@@ -133,49 +132,35 @@ def import_photos(
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
     target = Path(out)
-    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise PhotoError(
-            "cannot write here",
-            where=str(target),
-            faults=[Fault("out", "something that exists", "a new or empty folder")],
-            advice="Choose a new folder.",
-        )
+    require_new(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        session = Session.create(
-            part,
-            plan=Plan(used.name, tuple(step for step, _ in steps)),
-            rig=used,
-            devices={},
-            subject=subject or Subject("unnamed"),
-            source="measured",
-            extra={
-                "assumed": assumed,
-                "photographs": [
-                    {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
-                    for step, entry in steps
-                ],
-            },
-            now=clock,
-        )
-        with session:
-            for step, entry in steps:
-                _commit(session, step, entry, clock)
-            session.close()
-        if target.exists():
-            target.rmdir()
-        part.rename(target)
+        with new_folder(target) as part:
+            session = Session.create(
+                part,
+                plan=Plan(used.name, tuple(step for step, _ in steps)),
+                rig=used,
+                devices={},
+                subject=subject or Subject("unnamed"),
+                source="measured",
+                extra={
+                    "assumed": assumed,
+                    "photographs": [
+                        {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
+                        for step, entry in steps
+                    ],
+                },
+                now=clock,
+            )
+            with session:
+                for step, entry in steps:
+                    _commit(session, step, entry, clock)
+                session.close()
     except SessionDiskError as exc:
-        shutil.rmtree(part, ignore_errors=True)
         raise SessionDiskError(
             exc.what,
             where=str(target),
             advice="Free space or name another folder, then import again; nothing was kept.",
         ) from exc
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.pattern != "MONO"}
     return Imported(

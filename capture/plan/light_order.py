@@ -42,13 +42,13 @@ def nearest(rig: Rig) -> list[int]:
     return _path(_directions(rig), list(range(len(rig.lights))), int(np.argmin(eye_light(rig))))
 
 
-def rise_and_fall(rig: Rig) -> list[int]:
+def _rise_and_fall(rig: Rig) -> list[int]:
     """Return the lights sorted by what the eyes see: every other one rising, the rest falling."""
     rising = np.argsort(eye_light(rig), kind="stable")
     return [int(k) for k in (*rising[::2], *rising[1::2][::-1])]
 
 
-def rise_and_fall_nearby(rig: Rig) -> list[int]:
+def _rise_and_fall_nearby(rig: Rig) -> list[int]:
     """Return the lights in bands of what the eyes see, rising and falling, each a short path."""
     place, light = _directions(rig), eye_light(rig)
     rising = np.argsort(light, kind="stable")
@@ -69,8 +69,8 @@ LIGHT_ORDERS: Mapping[str, Callable[[Rig], list[int]]] = MappingProxyType(
         "name": by_name,
         "spiral": spiral,
         "nearest": nearest,
-        "rise and fall": rise_and_fall,
-        "rise and fall, nearby": rise_and_fall_nearby,
+        "rise and fall": _rise_and_fall,
+        "rise and fall, nearby": _rise_and_fall_nearby,
     }
 )
 

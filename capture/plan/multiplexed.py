@@ -24,6 +24,8 @@ from capture.rig import Rig
 
 RELEASE_DELAY_S = 0.04
 """Time from an image at hand to the release of the next one, s: arming camera and box."""
+SEQUENCE_EXPOSURE_S = 0.008
+SEQUENCE_ISO = 100
 REPEATED_PHASE_FRACTION = Fraction(1, 10)
 """Part of the phases that are met again by default, to see whether they repeat."""
 
@@ -69,8 +71,6 @@ def multiplexed_plan(
     lead_cycles: int = 1,
     darks: int = 4,
     power: float = 1.0,
-    exposure_s: float = 0.008,
-    iso: int = 100,
 ) -> Plan:
     """Plan crossed flash images of a subject who changes between two states by a sound.
 
@@ -93,7 +93,7 @@ def multiplexed_plan(
         Cycles of prompts before the first shot, so that the subject is in the rhythm, >= 0.
     darks : int
         Frames with no light at the beginning, >= 0.
-    power, exposure_s, iso
+    power
         See `capture.plan.flash_plan`.
 
     Returns
@@ -127,20 +127,15 @@ def multiplexed_plan(
     require(captures is None or captures >= 1, "captures", captures, ">= 1")
     require(cycles is None or cycles >= 1, "cycles", cycles, ">= 1")
     require(lead_cycles >= 0, "lead_cycles", lead_cycles, ">= 0")
-    shortest = image_s(rig, exposure_s) if read_out_s is None else exact(read_out_s)
+    shortest = image_s(rig, SEQUENCE_EXPOSURE_S) if read_out_s is None else exact(read_out_s)
     if grid.shot_period_s < shortest:
         raise _too_slow(grid, shortest)
     _check_flash(rig, grid.shot_period_s, power)
     if cycles is not None:
         captures = math.ceil(cycles * grid.cycle_s / grid.shot_period_s)
     count = captures or grid.distinct + math.ceil(grid.distinct * REPEATED_PHASE_FRACTION)
-    begun = _darks(rig, darks, exposure_s=exposure_s, iso=iso)
-    common: dict[str, Value] = {
-        "polarizer": "crossed",
-        "power": power,
-        "exposure_s": exposure_s,
-        "iso": iso,
-    }
+    begun = flash_plan(rig, darks=darks, exposure_s=SEQUENCE_EXPOSURE_S, iso=SEQUENCE_ISO)
+    common = _settings(power)
     shots = []
     for number in range(count):
         start = number * grid.shot_period_s
@@ -175,8 +170,6 @@ def course_plan(
     read_out_s: Seconds | None = None,
     darks: int = 4,
     power: float = 1.0,
-    exposure_s: float = 0.008,
-    iso: int = 100,
 ) -> Plan:
     """Plan crossed flash images at times after an event that changes the blood once.
 
@@ -196,7 +189,7 @@ def course_plan(
         Shots of ``rest`` before the event, >= 1.
     rest : str
         The state before.
-    read_out_s, darks, power, exposure_s, iso
+    read_out_s, darks, power
         See :func:`multiplexed_plan`.
 
     Returns
@@ -216,7 +209,7 @@ def course_plan(
     require(period > 0, "shot_period_s", shot_period_s, "seconds > 0")
     require(duration >= period, "duration_s", duration_s, f">= {float(period):g} s")
     require(before >= 1, "before", before, ">= 1")
-    shortest = image_s(rig, exposure_s) if read_out_s is None else exact(read_out_s)
+    shortest = image_s(rig, SEQUENCE_EXPOSURE_S) if read_out_s is None else exact(read_out_s)
     if period < shortest:
         raise ReadOutError(
             "the camera is too slow",
@@ -224,13 +217,8 @@ def course_plan(
             advice=f"Take an image every {float(shortest):g} s or slower.",
         )
     _check_flash(rig, period, power)
-    begun = _darks(rig, darks, exposure_s=exposure_s, iso=iso)
-    common: dict[str, Value] = {
-        "polarizer": "crossed",
-        "power": power,
-        "exposure_s": exposure_s,
-        "iso": iso,
-    }
+    begun = flash_plan(rig, darks=darks, exposure_s=SEQUENCE_EXPOSURE_S, iso=SEQUENCE_ISO)
+    common = _settings(power)
     steps = [s for s in begun.steps if s.kind == "dark"]
     for number in range(before + math.floor(duration / period) + 1):
         after = number - before
@@ -272,8 +260,13 @@ def _check_flash(rig: Rig, period: Fraction, power: float) -> None:
     )
 
 
-def _darks(rig: Rig, count: int, *, exposure_s: float, iso: int) -> Plan:
-    return flash_plan(rig, darks=count, exposure_s=exposure_s, iso=iso)
+def _settings(power: float) -> dict[str, Value]:
+    return {
+        "polarizer": "crossed",
+        "power": power,
+        "exposure_s": SEQUENCE_EXPOSURE_S,
+        "iso": SEQUENCE_ISO,
+    }
 
 
 def _shot(

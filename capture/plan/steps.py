@@ -125,7 +125,7 @@ class Step:
                 good = isinstance(value, types) and (types[-1] is bool or value is not True)
                 good = good and not (isinstance(value, float) and not math.isfinite(value))
                 checks.that(f"{table}.{key}", value, good, "a text or a finite number")
-        for fault in check_settings(self.settings):
+        for fault in _check_settings(self.settings):
             checks.note(fault)
         differ = len(set(self.cameras)) == len(self.cameras) > 0
         checks.that("cameras", self.cameras, differ, "at least one, none twice")
@@ -151,7 +151,7 @@ class Step:
         }
 
 
-def check_settings(settings: Mapping[str, Value]) -> list[Fault]:
+def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
     """Return the faults of known settings, and of names that are a near miss of a known one."""
     faults = []
     for key, value in settings.items():

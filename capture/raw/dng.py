@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import xxhash
 
-from capture.arrays import FloatArray, UInt16Array
+from capture.arrays import UInt16Array
 from capture.documents import Fault, canonical_json, read_json
 from capture.raw.frame import ILLUMINANT_CODES, MAX_PIXELS, RawError, RawFrame
 from capture.raw.tiff import (
@@ -64,20 +64,7 @@ def encode_dng(
     pattern: str,
     black: float | Sequence[float],
     white: int,
-    exposure_s: float | None = None,
-    iso: int | None = None,
-    camera_model: str = "",
-    camera_serial: str = "",
-    color_matrix: FloatArray | None = None,
-    color_illuminant: str = "D65",
-    neutral: tuple[float, float, float] | None = None,
-    noise_profile: tuple[float, float] | None = None,
-    f_number: float | None = None,
-    focal_mm: float | None = None,
-    captured_at: datetime | None = None,
-    step_id: str = "",
-    session_id: str = "",
-    light: Mapping[str, Any] | None = None,
+    **description: Any,
 ) -> bytes:
     """Return the bytes of a DNG that holds ``cfa`` unchanged; equal arguments give equal bytes.
 
@@ -123,25 +110,15 @@ def encode_dng(
     """
     cells = 1 if pattern == "MONO" else 4
     levels = (float(black),) * cells if isinstance(black, int | float) else tuple(black)
+    matrix = description.pop("color_matrix", None)
     frame = RawFrame(
         cfa=cfa,
         pattern=pattern,
         black=tuple(float(level) for level in levels),
         white=int(white),
-        exposure_s=exposure_s,
-        iso=iso,
-        camera_model=camera_model,
-        camera_serial=camera_serial,
-        color_matrix=None if color_matrix is None else np.asarray(color_matrix, np.float64),
-        color_illuminant=color_illuminant,
-        neutral=neutral,
-        noise_profile=noise_profile,
-        f_number=f_number,
-        focal_mm=focal_mm,
-        captured_at=captured_at,
-        step_id=step_id,
-        session_id=session_id,
-        light=dict(light or {}),
+        color_matrix=None if matrix is None else np.asarray(matrix, np.float64),
+        light=dict(description.pop("light", None) or {}),
+        **description,
     )
     pixels = np.ascontiguousarray(cfa, dtype="<u2").tobytes()
     exif = _exif_entries(frame)

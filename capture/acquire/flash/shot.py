@@ -103,7 +103,7 @@ def expose(
     power = power_of(step)
     chosen = {name: cameras[name] for name in step.cameras}
     lit_by_box = power > 0
-    triggers = {name: trigger_of(name, camera, lit_by_box) for name, camera in chosen.items()}
+    triggers = {name: _parse_trigger(name, camera, lit_by_box) for name, camera in chosen.items()}
     asked: dict[str, Exposure] = {}
     not_before: dict[str, float] = {}
     for name, camera in chosen.items():
@@ -145,7 +145,7 @@ def expose(
     return report, frames, stale
 
 
-def trigger_of(name: str, camera: Camera, lit: bool) -> Trigger:
+def _parse_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
     """Return what releases a camera for a step: the box where there is light to meet."""
     known = camera.info.triggers
     if not lit:

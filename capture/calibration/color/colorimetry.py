@@ -10,12 +10,10 @@ from capture.arrays import Float64Array
 
 __all__ = [
     "WHITE_XYZ",
-    "adapt",
     "chart_reference",
     "delta_e_2000",
     "lab_from_xyz",
     "lab_jacobian",
-    "patch_names",
     "white_point",
     "xyz_from_lab",
     "xyz_to_linear_srgb",
@@ -97,7 +95,7 @@ def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
     return np.asarray(delta_E(np.asarray(lab_a), np.asarray(lab_b), method="CIE 2000"))
 
 
-def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float64Array:
+def _adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float64Array:
     """Return XYZ seen under another white, by the Bradford transform, shape (..., 3)."""
     source = _BRADFORD_CONES @ np.asarray(source_white, dtype=np.float64)
     target = _BRADFORD_CONES @ np.asarray(target_white, dtype=np.float64)
@@ -116,7 +114,7 @@ def xyz_to_linear_srgb(xyz: ArrayLike, *, illuminant: str = "D65") -> Float64Arr
     white = white_point("D65")
     primaries = np.array([[x / y, 1.0, (1 - x - y) / y] for x, y in _SRGB_XY]).T
     to_xyz = primaries * np.linalg.solve(primaries, white)
-    return adapt(xyz, white_point(illuminant), white) @ np.linalg.inv(to_xyz).T
+    return _adapt(xyz, white_point(illuminant), white) @ np.linalg.inv(to_xyz).T
 
 
 def _chart_rows() -> list[dict[str, str]]:
@@ -125,7 +123,7 @@ def _chart_rows() -> list[dict[str, str]]:
     return list(csv.DictReader(lines))
 
 
-def patch_names() -> tuple[str, ...]:
+def _patch_names() -> tuple[str, ...]:
     """Return the names of the 24 patches, row-major from dark skin."""
     return tuple(row["name"] for row in _chart_rows())
 
@@ -139,4 +137,4 @@ def chart_reference(illuminant: str = "D50") -> Float64Array:
     """
     lab = np.array([[float(row[k]) for k in "Lab"] for row in _chart_rows()])
     d50 = white_point("D50")
-    return adapt(xyz_from_lab(lab, d50), d50, white_point(illuminant))
+    return _adapt(xyz_from_lab(lab, d50), d50, white_point(illuminant))

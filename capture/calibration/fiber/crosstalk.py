@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.arrays import Float64Array
 from capture.calibration.fiber.readings import FiberReadings
+from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import CalibrationError
 
 __all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
@@ -72,7 +73,7 @@ class CrossTalk:
             ("offset_stderr", (count, colors)),
             ("offset_common", (count, colors)),
         ):
-            _freeze(self, name, shape)
+            freeze_array(self, name, shape)
         if not (np.diagonal(self.matrix) == 1.0).all():
             raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
         away = np.abs(self.matrix).sum(axis=0) - 1.0
@@ -260,7 +261,7 @@ def _stray(
     own, common = np.zeros((count, colors)), np.zeros((count, colors))
     for c in range(colors):
         if good[:, c].any():
-            stray[:, c], own[:, c], common[:, c] = shrunk(
+            stray[:, c], own[:, c], common[:, c] = shrink_to_mean(
                 rest[:, c], np.where(good[:, c], 1.0 / np.maximum(doubt[:, c], 1e-300), 0.0), 0.0
             )
     return leak, float(np.sqrt(leak_variance)), stray, own, common
@@ -279,7 +280,9 @@ def _pooled(
     for number in range(int(group.max(initial=-1)) + 1):
         here = (group == number) & ~overlap
         if (information[here] > 0).any():
-            matrix[here], alone, common = shrunk(own[here], information[here], MIN_PAIR_SCATTER)
+            matrix[here], alone, common = shrink_to_mean(
+                own[here], information[here], MIN_PAIR_SCATTER
+            )
             variance[here] = alone**2 + common**2
             last = float(np.median(np.abs(matrix[here])))
         else:
@@ -288,7 +291,7 @@ def _pooled(
     return matrix, variance
 
 
-def shrunk(
+def shrink_to_mean(
     value: Float64Array, information: Float64Array, least_scatter: float
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return values drawn to their mean as far as their own scatter tells, and standard errors.
@@ -305,7 +308,7 @@ def shrunk(
 
     Examples
     --------
-    >>> value, _, _ = shrunk(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
+    >>> value, _, _ = shrink_to_mean(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
     >>> value.round(2).tolist()
     [1.0, 3.0, 2.0]
     """
@@ -325,14 +328,3 @@ def shrunk(
         np.sqrt((1.0 - share) * between),
         (1.0 - share) * np.sqrt(error),
     )
-
-
-def _freeze(row: Any, name: str, shape: tuple[int, ...]) -> None:
-    array = np.array(getattr(row, name), np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(
-            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-            f" shape {shape}"
-        )
-    array.setflags(write=False)
-    object.__setattr__(row, name, array)

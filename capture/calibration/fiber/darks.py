@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
+from capture.calibration.robust import SIGMA_PER_MAD, mad_sigma
 from capture.calibration.sensor import SensorCalibration
 from capture.documents import Checks
 from capture.rig import CFA_PATTERNS, View
@@ -284,7 +285,7 @@ def _middle(frame: NDArray[np.integer]) -> float:
     """Return the mean of a frame without its outliers."""
     values = frame.astype(np.float64)
     center = float(np.median(values))
-    scale = max(1.4826 * float(np.median(np.abs(values - center))), 0.5)
+    scale = max(mad_sigma(values - center), 0.5)
     return float(values[np.abs(values - center) <= 5.0 * scale].mean())
 
 
@@ -304,4 +305,5 @@ def _line(times: Float64Array, level: Float64Array, variance: float) -> tuple[fl
 def _outliers(values: Float64Array, least: float) -> BoolArray:
     center = float(np.median(values))
     away = np.abs(values - center)
-    return np.asarray(away > np.maximum(HOT_FIT_SIGMAS * 1.4826 * float(np.median(away)), least))
+    limit = HOT_FIT_SIGMAS * SIGMA_PER_MAD * float(np.median(away))
+    return np.asarray(away > np.maximum(limit, least))

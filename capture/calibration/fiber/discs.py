@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
@@ -160,16 +160,21 @@ def fit_disc(
     at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
     if at_bound or amplitude.max() <= 0:
         return None
-    normal = done.jac.T @ done.jac
-    chi2 = 2.0 * done.cost / max(len(data) - 4 - 5 * len(colors), 1)
+    error = _standard_errors(done, len(data) - 4 - 5 * len(colors))
+    if error is None or error[:2].max() > MAX_CENTER_STDERR_PITCH * pitch:
+        return None
+    return done.x, error, start_radius
+
+
+def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
+    """Return the standard errors of a least-squares fit; None where it does not determine them."""
+    chi2 = 2.0 * done.cost / max(freedom, 1)
     try:
-        covariance = np.linalg.inv(normal) * max(chi2, 1.0)
+        covariance = np.linalg.inv(done.jac.T @ done.jac) * max(chi2, 1.0)
     except np.linalg.LinAlgError:
         return None
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not np.isfinite(error).all() or error[:2].max() > MAX_CENTER_STDERR_PITCH * pitch:
-        return None
-    return done.x, error, start_radius
+    return error if np.isfinite(error).all() else None
 
 
 def distinct(fits: list[DiscFit], apart: float) -> list[DiscFit]:

@@ -14,6 +14,7 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.crosstalk import CrossTalk
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
+from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
@@ -125,7 +126,7 @@ class FiberCalibration:
             ("valid", (count, colors), np.bool_),
             ("dead", (count,), np.bool_),
         ):
-            _freeze(self, name, shape, kind)
+            freeze_array(self, name, shape, kind)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
                 f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"
@@ -389,14 +390,3 @@ def fill_invalid(readings: FiberReadings) -> tuple[Float64Array, Float64Array, B
 
 def _one(value: float | Float64Array, stderr: float | Float64Array | None = None) -> Quantity:
     return Quantity(np.array(value), None if stderr is None else np.array(stderr))
-
-
-def _freeze(row: Any, name: str, shape: tuple[int, ...], kind: Any) -> None:
-    array = np.array(getattr(row, name), dtype=kind)
-    if array.shape != shape or (kind is np.float64 and not np.isfinite(array).all()):
-        raise ValueError(
-            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-            f" shape {shape}"
-        )
-    array.setflags(write=False)
-    object.__setattr__(row, name, array)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
 from capture.calibration.fiber.merge import MergedSeries
+from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import CalibrationError
 
 __all__ = ["FiberSpots", "SpotError", "find_fiber_spots"]
@@ -71,10 +72,10 @@ class FiberSpots:
         """Convert and check the arrays against each other."""
         count = len(self.names)
         for name in ("center_px", "center_stderr_px"):
-            _freeze(self, name, (count, 2), np.float64)
+            freeze_array(self, name, (count, 2))
         for name in ("radius_px", "radius_stderr_px", "edge_px"):
-            _freeze(self, name, (count,), np.float64)
-        _freeze(self, "found", (count,), np.bool_)
+            freeze_array(self, name, (count,))
+        freeze_array(self, "found", (count,), np.bool_)
         if not (self.aperture_px > 0 and (self.radius_px > 0).all()):
             raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
 
@@ -368,14 +369,3 @@ def _within(shape: tuple[int, ...], center: Float64Array, radius: float) -> Bool
         y - center[1]
     ) ** 2 <= radius**2
     return mask
-
-
-def _freeze(row: Any, name: str, shape: tuple[int, ...], kind: Any) -> None:
-    array = np.array(getattr(row, name), dtype=kind)
-    if array.shape != shape or (kind is np.float64 and not np.isfinite(array).all()):
-        raise ValueError(
-            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-            f" shape {shape}"
-        )
-    array.setflags(write=False)
-    object.__setattr__(row, name, array)

@@ -27,7 +27,6 @@ __all__ = [
     "calibrate_intrinsics",
     "find_board",
     "find_markers",
-    "gray8",
 ]
 
 logger = logging.getLogger(__name__)
@@ -183,7 +182,7 @@ class Intrinsics:
     missing: tuple[str, ...]
 
 
-def gray8(image: NDArray) -> UInt8Array:
+def _gray8(image: NDArray) -> UInt8Array:
     """Return an image as 8-bit gray, stretched between its 1 % and 99.5 % quantiles.
 
     Parameters
@@ -212,7 +211,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
     Parameters
     ----------
     image : ndarray
-        See `gray8`.
+        See `_gray8`.
     board : Board
         What to look for.
 
@@ -221,7 +220,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
     Sighting or None
         At least 6 corners (all of a chessboard's), or None where there is no such board.
     """
-    gray = gray8(image)
+    gray = _gray8(image)
     if board.kind == "chessboard":
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=flags)
@@ -254,7 +253,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
     Parameters
     ----------
     image : ndarray
-        See `gray8`.
+        See `_gray8`.
     dictionary : str
         As of `Board`.
     ids : iterable of int
@@ -271,7 +270,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
         cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")),
         cv2.aruco.DetectorParameters(),
     )
-    gray = gray8(image)
+    gray = _gray8(image)
     corners, found, _ = detector.detectMarkers(gray)
     smooth = gray.astype(np.float64)
     rows: list[tuple[int, Float64Array]] = []

@@ -20,6 +20,7 @@ from capture.calibration.geometry.board import MIN_BOARD_CORNERS, Sighting
 from capture.calibration.geometry.board_pose import BoardPose, Target
 from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
+from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
 
 __all__ = ["Bundle", "BundleError", "Gauge", "LensPrior", "Sightings"]
 
@@ -31,9 +32,6 @@ Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
 
 
 N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
-
-
-HUBER_SIGMAS = 2.5  # robust sigmas beyond which a corner counts less
 
 
 MAX_BUNDLE_STEPS = 100
@@ -263,8 +261,7 @@ class BundleProblem:
     @staticmethod
     def _sigma(residuals: Mapping[tuple[str, int], Float64Array]) -> float:
         """Return the noise by the median of the absolute residuals."""
-        every = np.abs(np.concatenate(list(residuals.values()))).ravel()
-        return max(1.4826 * float(np.median(every)), MIN_SIGMA_PX)
+        return max(mad_sigma(np.concatenate(list(residuals.values())).ravel()), MIN_SIGMA_PX)
 
     def _cost(
         self,
@@ -420,5 +417,4 @@ def _lens(camera: CameraPose) -> Float64Array:
 
 
 def _huber(residual: Float64Array, sigma: float) -> Float64Array:
-    z = np.linalg.norm(residual, axis=1) / sigma
-    return np.asarray(np.where(z > HUBER_SIGMAS, HUBER_SIGMAS / np.maximum(z, HUBER_SIGMAS), 1.0))
+    return huber_weights(np.linalg.norm(residual, axis=1) / sigma)

@@ -20,6 +20,7 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.led_sphere.mirrored_lights import DERIVATIVE_STEP_MM, mirror_lights
 from capture.calibration.lights.reflection import reflect, reflection_pixels
 from capture.calibration.record import CalibrationError
+from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
 __all__ = [
     "Ball",
@@ -41,7 +42,6 @@ VOTE_CELL_MM = 0.06
 SPOT_GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm apart or more
 MIN_SPOTS = 12
 MIN_LIGHT_FRACTION = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
-HUBER_SIGMAS = 2.5
 N_BALL_STEPS = 12
 MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
 
@@ -153,7 +153,7 @@ def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -
     smooth = gaussian_filter(np.asarray(image, np.float32), max(SPOT_BLUR_MM / pixel_mm, 0.5))
     usual = float(np.median(smooth))
     if noise is None:
-        sigma = 1.4826 * float(np.median(np.abs(smooth - usual)))
+        sigma = mad_sigma(smooth - usual)
     else:
         sigma = noise / (2 * np.sqrt(np.pi) * max(SPOT_BLUR_MM / pixel_mm, 0.5))
     apart = 2 * round(MIN_SPOT_SEPARATION_MM / pixel_mm / 2) + 1

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array
+from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationMismatch,
@@ -59,9 +60,12 @@ class SphereLightTable:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         n = len(self.names)
-        _freeze(self, n, ("directions", "directions_stderr"), (n, 3), np.float64)
-        _freeze(self, n, ("intensities", "intensities_stderr"), (n,), np.float64)
-        _freeze(self, n, ("seen", "valid", "dead"), (n,), np.bool_)
+        for name in ("directions", "directions_stderr"):
+            freeze_array(self, name, (n, 3), of=f" for {n} lights")
+        for name in ("intensities", "intensities_stderr"):
+            freeze_array(self, name, (n,), of=f" for {n} lights")
+        for name in ("seen", "valid", "dead"):
+            freeze_array(self, name, (n,), np.bool_, of=f" for {n} lights")
         length = np.linalg.norm(self.directions, axis=1)
         if (np.abs(length - 1) > 1e-6).any():
             raise ValueError("SphereLightTable.directions: expected unit vectors")
@@ -194,8 +198,9 @@ class SphereFilms:
         """Convert and check the arrays against each other."""
         n = len(self.names)
         arrays = (*_LEAKAGE_FIELDS, *(f"{name}_stderr" for name in _LEAKAGE_FIELDS[:2]))
-        _freeze(self, n, (*arrays, "axis_error_stderr_rad"), (n,), np.float64)
-        _freeze(self, n, ("valid",), (n,), np.bool_)
+        for name in (*arrays, "axis_error_stderr_rad"):
+            freeze_array(self, name, (n,), of=f" for {n} lights")
+        freeze_array(self, "valid", (n,), np.bool_, of=f" for {n} lights")
         if (self.leakage < 0).any() or not self.eta > 1:
             raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
 
@@ -367,17 +372,3 @@ def _one(value: float, stderr: float) -> Quantity:
 
 def _pair(quantity: Quantity) -> tuple[float, float]:
     return float(quantity.value), 0.0 if quantity.stderr is None else float(quantity.stderr)
-
-
-def _freeze(
-    row: Any, count: int, names: tuple[str, ...], shape: tuple[int, ...], kind: Any
-) -> None:
-    for name in names:
-        array = np.array(getattr(row, name), dtype=kind)
-        if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(
-                f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-                f" shape {shape} for {count} lights"
-            )
-        array.setflags(write=False)
-        object.__setattr__(row, name, array)

@@ -171,7 +171,9 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64
     for column in range(4):
         for sign in (2.0, -2.0):
             turn, zero, light, analyser = (at + sign * root[:, :, column]).T
-            both = reflection.through([0.0, np.pi / 2], turn, zero, np.exp(light), np.exp(analyser))
+            both = reflection.transmit_through_analyzer(
+                [0.0, np.pi / 2], turn, zero, np.exp(light), np.exp(analyser)
+            )
             values.append(both[1] / both[0])
     table = np.array(values)
     return table.mean(axis=0), table.std(axis=0, ddof=1)
@@ -187,7 +189,7 @@ def _starts(
     zeros = np.radians(np.arange(-MAX_ZERO_DEG, MAX_ZERO_DEG + 1.0, 1.0))
     cost = []
     for zero in zeros:
-        u = reflection.through(readings, 0.0, zero, TYPICAL_LEAK, TYPICAL_LEAK)
+        u = reflection.transmit_through_analyzer(readings, 0.0, zero, TYPICAL_LEAK, TYPICAL_LEAK)
         power = np.sum(soft * u**2, axis=0)
         strength = np.sum(soft * u * values, axis=0) / np.where(power > 0, power, 1.0)
         cost.append(float(np.sum(soft * (values - strength * u) ** 2)))
@@ -224,7 +226,9 @@ class _Films:
 
     def _through(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
         zero, light, analyser = shared
-        return self.reflection.through(self.readings, turn, zero, np.exp(light), np.exp(analyser))
+        return self.reflection.transmit_through_analyzer(
+            self.readings, turn, zero, np.exp(light), np.exp(analyser)
+        )
 
     def _objective(self, strength: Float64Array, turn: Float64Array, shared: Float64Array) -> float:
         miss = self.values - strength * self._through(turn, shared)

@@ -32,7 +32,7 @@ from capture.calibration.led_sphere.strengths import (
     add_geometry_errors,
     film_table,
     has_two_readings,
-    intensities,
+    measure_intensities,
     measure_rates,
 )
 from capture.calibration.polarization.polarized_reflection import Reflection
@@ -144,7 +144,7 @@ def survey_sphere(
     angle_rad = np.linalg.norm(seen.stderr, axis=1) / np.sqrt(2)
     films = add_geometry_errors(films, glass, what.eta_stderr, angle_rad)
     fluxed = has_two_readings(readings, good)
-    strength = intensities(rig, camera, fit.ball, films, shown, direction)
+    strength = measure_intensities(rig, camera, fit.ball, films, shown, direction)
     lights = _light_table(rig, seen, fluxed, *strength)
     toward = np.tile(camera.center_mm / np.linalg.norm(camera.center_mm), (len(place), 1))
     skin = _reflection(rig, camera, view, eta, direction, toward, direction)

@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 
-__all__ = ["ChromeBallError", "directions_from_chrome_ball", "highlight_center"]
+__all__ = ["ChromeBallError", "directions_from_chrome_ball"]
 
 
 HIGHLIGHT_LEVEL = 0.9  # of the brightest pixel: what belongs to a highlight
@@ -77,7 +77,7 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
             raise ChromeBallError(
                 f"image {number}: got shape {gray.shape}, expected {inside.shape} as the mask"
             )
-        spot = highlight_center(gray, inside)
+        spot = _highlight_center(gray, inside)
         if spot is None:
             raise ChromeBallError(
                 f"image {number}: shows no highlight on the ball, expected one that stands out;"
@@ -92,7 +92,7 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     return np.array(directions).reshape(-1, 3)
 
 
-def highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:
+def _highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:
     """Return column and row of the middle of the brightest spot, or None where none stands out.
 
     Parameters

@@ -20,6 +20,7 @@ from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition, contour
 from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
+from capture.calibration.robust import huber_weights, mad_sigma
 
 __all__ = ["Highlights", "LightPositions", "SphereWindow", "find_highlights", "locate_lights"]
 
@@ -28,8 +29,8 @@ MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are left alone
 HIGHLIGHT_NOISE_SIGMAS = 8.0  # above the median in the sphere
 # of the brightest pixel in the sphere: fainter spots are reflections of spots
 MIN_HIGHLIGHT_PEAK = 0.02
-LIGHT_GATE_MM = 60.0  # how far a light may be from a reflected ray to be the one that made it
-HUBER_SIGMAS = 2.5
+# how far a light may be from a reflected ray to be the one that made it
+LIGHT_GATE_MM = 60.0
 MIN_HIGHLIGHT_CAMERAS = 2
 MIN_HIGHLIGHTS = 3
 # of a highlight's middle, whatever its size: noise, the surface's polish
@@ -164,7 +165,7 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array,
     usual = float(np.median(values))
     # the median deviation of a few levels of the converter may be 0
     quiet = values[np.abs(values - usual) <= np.quantile(np.abs(values - usual), 0.98)]
-    sigma = max(1.4826 * float(np.median(np.abs(values - usual))), float(quiet.std()))
+    sigma = max(mad_sigma(values - usual), float(quiet.std()))
     above = np.where(window.inside, part - usual, 0.0)
     limit = max(HIGHLIGHT_NOISE_SIGMAS * sigma, MIN_HIGHLIGHT_PEAK * float(above.max()), 1e-12)
     spots, count = label(above > limit, structure=np.ones((3, 3)))
@@ -263,7 +264,7 @@ def locate_lights(
     )
 
 
-Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
+_Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
 
 
 def _match(
@@ -273,9 +274,9 @@ def _match(
     names: tuple[str, ...],
     start: Float64Array,
     gate_mm: float,
-) -> tuple[list[Matched], dict[str, str], tuple[str, ...]]:
+) -> tuple[list[_Matched], dict[str, str], tuple[str, ...]]:
     """Say which light made which spot; lights that answer for others; lights never seen."""
-    matched: list[Matched] = []
+    matched: list[_Matched] = []
     expected: Counter[int] = Counter()
     found: Counter[int] = Counter()
     instead: Counter[tuple[int, int]] = Counter()
@@ -347,7 +348,7 @@ def _miss_mm(
 
 
 def _adjust(
-    matched: Sequence[Matched],
+    matched: Sequence[_Matched],
     cameras: Mapping[str, CameraPose],
     spheres: Mapping[int, SpherePosition],
     start: Float64Array,
@@ -379,9 +380,9 @@ def _adjust(
         width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
         usual = np.sqrt(MIN_HIGHLIGHT_STDERR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
         z = r / usual
-        sigma = max(1.4826 * float(np.median(np.abs(z))), 1e-6)
+        sigma = max(mad_sigma(z), 1e-6)
         size = np.linalg.norm(z, axis=1) / sigma
-        robust = np.where(size > HUBER_SIGMAS, HUBER_SIGMAS / np.maximum(size, HUBER_SIGMAS), 1.0)
+        robust = huber_weights(size)
         count = 2 * robust.sum() - total
         scale = np.sqrt((robust[:, None] * z**2).sum() / max(float(count), 1.0))
         w = robust[:, None] / (scale * usual) ** 2

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
+from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
 __all__ = ["SphereError", "SpherePosition", "contour", "find_outline", "locate_sphere"]
 
@@ -31,7 +32,6 @@ FINE_SEARCH_PX = 1.5
 FINE_WINDOW_PX = 9.0
 PIXEL_BLUR_PX = 0.5  # a pixel's square and the interpolation between pixels, as a Gaussian
 MIN_OUTLINE_EDGES = 30
-HUBER_SIGMAS = 2.5
 # root of the brightest over the usual background along a line across the edge
 MAX_GLARE_RATIO = 1.15
 VOTE_CELL_PX = 2.0  # cells of the search for the sphere
@@ -363,7 +363,7 @@ def _fit(
     sigma, H = 1.0, np.eye(len(sphere))
     for _ in range(30):
         r = residuals(sphere)
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+        sigma = max(mad_sigma(r), 1e-6)
         w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
         J = np.empty((len(r), len(sphere)))
         for k in range(len(sphere)):

@@ -177,7 +177,7 @@ class Reflection:
             out.append(across + (rp * np.sum(field * p_in, axis=-1))[:, None] * p_out)
         return self._in_image(np.stack(out, axis=1), self._image_axes())
 
-    def through(
+    def transmit_through_analyzer(
         self,
         readings_rad: ArrayLike,
         turn_rad: ArrayLike = 0.0,

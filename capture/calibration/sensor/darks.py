@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array, UInt16Array
+from capture.calibration.robust import mad_sigma
 from capture.calibration.sensor.transfer_curve import plane
 
 __all__ = ["Darks", "pool", "reduce_darks"]
@@ -76,7 +77,7 @@ def reduce_darks(
         means += level / len(positions)
         residual = stack - level[:, None, None]
         average = residual.mean(axis=0)
-        scale = 1.4826 * float(np.median(np.abs(average - np.median(average))))
+        scale = mad_sigma(average - np.median(average))
         ok = np.abs(average - np.median(average)) <= max(HOT_PIXEL_SIGMAS * scale, 1.0)
         black.append(float(stack[:, ok].mean()))
         good.append(ok)

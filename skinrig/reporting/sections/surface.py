@@ -229,7 +229,8 @@ def _errors(
         yield page.note(
             f"A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
             f"limit of {evaluation.MAX_NORMAL_ERROR_DEG:g}° is promised for "
-            f"{evaluation.MAX_EVALUATED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
+            f"{evaluation.MAX_EVALUATED_PIXEL_MM:g} mm and finer, so normals are shown but not "
+            "judged."
         )
     yield page.records(
         found,

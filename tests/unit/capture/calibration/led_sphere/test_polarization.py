@@ -42,11 +42,15 @@ def spots(
     readings = np.radians([r for r, _ in series])
     amount = np.array([a for _, a in series])[:, None]
     zero = np.radians(zero_deg)
-    electrons = strength * amount * GLASS.through(readings, turn, zero, light_leak, analyser_leak)
+    electrons = (
+        strength
+        * amount
+        * GLASS.transmit_through_analyzer(readings, turn, zero, light_leak, analyser_leak)
+    )
     variance = electrons + 1000 * 13.0**2
     counted = electrons + np.sqrt(variance) * rng.standard_normal(electrons.shape)
     good = electrons < 9e5
-    leaked = SKIN.through([0.0, np.pi / 2], turn, zero, light_leak, analyser_leak)
+    leaked = SKIN.transmit_through_analyzer([0.0, np.pi / 2], turn, zero, light_leak, analyser_leak)
     truth = {"turn": turn, "zero": zero, "strength": strength, "leak": leaked[1] / leaked[0]}
     return readings, counted / amount, variance / amount**2, good, truth
 
@@ -71,7 +75,9 @@ def test_analyser_films_and_axes_are_found_within_their_errors(rng, zero_deg):
     assert np.sqrt(np.mean((own / fit.turn_stderr_rad) ** 2)) < 1.5
     # it could have failed: lights as drawn leave a hundred times the noise
     readings, rates, variance, good, _ = (*data, truth)
-    drawn = truth["strength"] * GLASS.through(readings, 0.0, truth["zero"], 1 / 2000, 1 / 3000)
+    drawn = truth["strength"] * GLASS.transmit_through_analyzer(
+        readings, 0.0, truth["zero"], 1 / 2000, 1 / 3000
+    )
     assert np.sum(((rates - drawn) ** 2 / variance)[good]) > 100 * good.sum()
 
 
@@ -83,7 +89,9 @@ def test_what_skin_leaks_follows_from_what_glass_leaks(rng, zero_deg):
     assert np.mean(np.abs(pull) < 2) > 0.85
     assert np.median(error / truth["leak"]) < 0.05
     # glass's own ratio is no substitute
-    glass = GLASS.through([0.0, np.pi / 2], truth["turn"], truth["zero"], 1 / 2000, 1 / 3000)
+    glass = GLASS.transmit_through_analyzer(
+        [0.0, np.pi / 2], truth["turn"], truth["zero"], 1 / 2000, 1 / 3000
+    )
     assert np.median(np.abs(glass[1] / glass[0] - truth["leak"])) > 5 * np.median(error)
 
 
@@ -114,7 +122,9 @@ def test_one_light_far_off_does_not_turn_the_analyser(rng):
     readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.0)
     turn = np.zeros(len(PLACE))
     turn[7] = np.radians(8.0)
-    off = truth["strength"] * GLASS.through(readings, turn, truth["zero"], 1 / 2000, 1 / 3000)
+    off = truth["strength"] * GLASS.transmit_through_analyzer(
+        readings, turn, truth["zero"], 1 / 2000, 1 / 3000
+    )
     rates[:, 7] = off[:, 7]
     fit = fit_films(readings, rates, variance, good, GLASS)
     assert abs(np.degrees(fit.zero_rad) - 0.5) < 0.02

@@ -51,9 +51,9 @@ def test_amplitudes_are_those_of_the_textbook_at_normal_brewsters_and_grazing_in
 
 
 def test_the_rig_extinguishes_what_skin_mirrors_but_not_what_glass_does():
-    parallel, crossed = by_skin().through([0.0, np.pi / 2])
+    parallel, crossed = by_skin().transmit_through_analyzer([0.0, np.pi / 2])
     assert (crossed / parallel).max() < 1e-5  # axes in the file are rounded to 0.01 degrees
-    parallel, crossed = by_ball().through([0.0, np.pi / 2])
+    parallel, crossed = by_ball().transmit_through_analyzer([0.0, np.pi / 2])
     assert np.median(crossed / parallel) > 1e-5
     assert (crossed / parallel).max() > 0.1
 
@@ -61,7 +61,9 @@ def test_the_rig_extinguishes_what_skin_mirrors_but_not_what_glass_does():
 def test_what_the_analyser_passes_parallel_and_crossed_is_the_reflectance():
     reflection = by_ball()
     leak, turn = 1e-3, np.radians(np.linspace(-3, 3, len(PLACE)))
-    both = reflection.through([0.4, 0.4 + np.pi / 2], turn, 0.1, 0.0, leak).sum(axis=0)
+    both = reflection.transmit_through_analyzer([0.4, 0.4 + np.pi / 2], turn, 0.1, 0.0, leak).sum(
+        axis=0
+    )
     whole = (reflection.fields(turn)[:, 0] ** 2).sum(axis=-1)
     # rays meet the camera up to 1.2 degrees off its axis, where a film's axes are not quite at
     # right angles any more: by the square of that angle
@@ -71,14 +73,18 @@ def test_what_the_analyser_passes_parallel_and_crossed_is_the_reflectance():
 def test_a_reading_and_the_analysers_zero_add():
     reflection = by_ball()
     np.testing.assert_allclose(
-        reflection.through([0.5], 0.0, 0.2), reflection.through([0.7], 0.0, 0.0), rtol=1e-12
+        reflection.transmit_through_analyzer([0.5], 0.0, 0.2),
+        reflection.transmit_through_analyzer([0.7], 0.0, 0.0),
+        rtol=1e-12,
     )
 
 
 def test_the_simulators_own_reflection_agrees():
     reflection = by_ball()
     alpha, readings = 0.5, np.array([0.0, 80.0, 90.0, 100.0])
-    ours = reflection.through(np.radians(readings), 0.0, np.radians(0.7), 1 / 2000, 1 / 3000)
+    ours = reflection.transmit_through_analyzer(
+        np.radians(readings), 0.0, np.radians(0.7), 1 / 2000, 1 / 3000
+    )
     theirs = np.empty_like(ours)
     for k, light in enumerate(RIG.lights):
         facet = reflection.normal[k]
