@@ -161,7 +161,8 @@ def derivatives(
         group = index.reshape(-1, 1)
         sigma_a, sigma_s = sigma_a.ravel(), sigma_s.ravel()
     starts, log_distance, weight = distance_rules(unique, core_mm, source_core_mm)
-    scatters = sigma_s > 0.0
+    # the reciprocal of a subnormal coefficient overflows; it scatters as little as none
+    scatters = sigma_s >= np.finfo(np.float64).tiny
     out = np.empty((3, sigma_a.size, group.shape[1]))
     kernels.evaluate(
         np.ascontiguousarray(sigma_a),
