@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit code; no traceback reaches the user."""
     if os.environ.get("SKINRIG_TRACEBACK"):
         app(args=argv, standalone_mode=False)
-        return errors.DONE
+        return errors.EXIT_DONE
     given = sys.argv[1:] if argv is None else argv
     try:
         result = app(args=argv, standalone_mode=False)
@@ -132,14 +132,14 @@ def main(argv: list[str] | None = None) -> int:
         code = getattr(stop, "exit_code", None)
         return int(code if code is not None else getattr(stop, "code", 0) or 0)
     except (typer.Abort, KeyboardInterrupt):
-        return _failed(KeyboardInterrupt(), errors.INTERRUPTED, given)
+        return _failed(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
     except Exception as error:
         if hasattr(error, "exit_code") and hasattr(error, "show"):  # a usage error of Typer's
             error.show()
-            return _failed(error, errors.USAGE, given, say=False)
+            return _failed(error, errors.EXIT_USAGE, given, say=False)
         return _failed(error, errors.exit_code(error), given)
-    if result == errors.INTERRUPTED:  # Typer turns Ctrl-C into this code, without a word
-        return _failed(KeyboardInterrupt(), errors.INTERRUPTED, given)
+    if result == errors.EXIT_INTERRUPTED:  # Typer turns Ctrl-C into this code, without a word
+        return _failed(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
     return int(result or 0)
 
 

@@ -337,7 +337,7 @@ def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
             0.0,
         ]
         for row in states
-        if row.way in (facial_color.METHODS[1], facial_color.METHODS[3])
+        if row.way in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3])
     ]
 
 

@@ -21,7 +21,7 @@ class Finding:
     """What to type when it is not fine; empty when nothing needs doing."""
 
 
-_REQUIRED = {
+_REQUIRED_PACKAGES = {
     "numpy": "numpy",
     "scipy": "scipy",
     "numba": "numba",
@@ -38,7 +38,7 @@ _REQUIRED = {
     "mitsuba": "mitsuba",
     "matplotlib": "matplotlib",
 }
-_EXTRAS = {
+_EXTRA_PACKAGES = {
     "distributed": "cluster",
     "pxr": "usd",
     "gphoto2": "gphoto",
@@ -65,11 +65,11 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
             "" if sys.version_info >= (3, 11) else "install Python 3.11 or newer",
         )
     ]
-    for module, name in _REQUIRED.items():
+    for module, name in _REQUIRED_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = importlib.metadata.version(name) if present else "missing"
         findings.append(Finding(name, state, present, "" if present else f"pip install {name}"))
-    for module, extra in _EXTRAS.items():
+    for module, extra in _EXTRA_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         findings.append(
             Finding(

@@ -21,20 +21,20 @@ from __future__ import annotations
 import errno
 from collections.abc import Sequence
 
-DONE = 0
+EXIT_DONE = 0
 LIMIT_MISSED = 1
-USAGE = 2
+EXIT_USAGE = 2
 BAD_INPUT = 3
 DEVICE_FAILED = 4
 EXTRA_MISSING = 5
-BUG = 70
-INTERRUPTED = 130
+EXIT_BUG = 70
+EXIT_INTERRUPTED = 130
 EXIT_CODE_HELP = (
-    f"{DONE} done; {LIMIT_MISSED} a limit was missed; {USAGE} the command line cannot be read (an "
-    f"argument missing, not of its form, or at odds with another); {BAD_INPUT} what it names is "
+    f"{EXIT_DONE} done; {LIMIT_MISSED} a limit was missed; {EXIT_USAGE} the command line cannot be "
+    f"read (an argument missing, not of its form, or at odds with another); {BAD_INPUT} what it names is "
     f"not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a capture failed; "
-    f"{EXTRA_MISSING} an optional part is missing; {BUG} a fault of skinrig's own; {INTERRUPTED} "
-    "interrupted."
+    f"{EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a fault of skinrig's own; "
+    f"{EXIT_INTERRUPTED} interrupted."
 )
 """What commands end with, as the help tells it; the module's text says it at length."""
 
@@ -63,14 +63,14 @@ def exit_code(error: BaseException) -> int:
     module need not import the drivers.
     """
     if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED
-    if isinstance(error, ImportError) and (error.name or "").split(".")[0] in _OWN:
-        return BUG
+        return EXIT_INTERRUPTED
+    if isinstance(error, ImportError) and (error.name or "").split(".")[0] in _OWN_PACKAGES:
+        return EXIT_BUG
     if isinstance(error, ImportError):
         return EXTRA_MISSING
     if isinstance(error, UsageError):
-        return USAGE
-    own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN]
+        return EXIT_USAGE
+    own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN_PACKAGES]
     names = {kind.__name__ for kind in own}
     if any(kind.__module__.startswith("capture.devices") for kind in own) or (
         names & {"DeviceError", "AcquisitionError"}
@@ -78,10 +78,10 @@ def exit_code(error: BaseException) -> int:
         return DEVICE_FAILED
     if own or isinstance(error, (ValueError, OSError)):
         return BAD_INPUT
-    return BUG
+    return EXIT_BUG
 
 
-_ADVICE = {
+_ADVICE_BY_ERROR = {
     errno.ENOENT: "check the name, and the folder that the command runs in",
     errno.EEXIST: "something of that name is there already; name another",
     errno.ENOTDIR: "a part of this path is a file, expected a folder; name another",
@@ -93,7 +93,7 @@ _ADVICE = {
     errno.EDQUOT: "free space, or name another disk, then run the same command again",
 }
 """What to do, by the number of the system's error."""
-_OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
+_OWN_PACKAGES = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 
 
 RESUMABLE_COMMANDS = ("capture", "serve", "simulate")
@@ -130,9 +130,9 @@ def sentence(error: BaseException) -> str:
     """Return what to print for ``error``, without a traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
-    if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE:
+    if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE_BY_ERROR:
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror}; {_ADVICE[error.errno]}"
+        return f"{where}{error.strerror}; {_ADVICE_BY_ERROR[error.errno]}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, UnicodeDecodeError):
@@ -141,7 +141,7 @@ def sentence(error: BaseException) -> str:
             f"{error.object[error.start]:#04x}); is another file meant?"
         )
     text = str(error).strip() or type(error).__name__
-    if exit_code(error) == BUG:
+    if exit_code(error) == EXIT_BUG:
         return (
             f"this is a fault of skinrig, not yours ({type(error).__name__}: {text}); "
             "run again with SKINRIG_TRACEBACK=1 and report what it prints"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 DEGREE_SIGN: Final = "°"
-_SIGNS: Final = {"deg": DEGREE_SIGN, "1": ""}
+_SIGN_BY_UNIT: Final = {"deg": DEGREE_SIGN, "1": ""}
 
 
 def unit_sign(unit: str) -> str:
@@ -21,7 +21,7 @@ def unit_sign(unit: str) -> str:
     >>> unit_sign("deg"), unit_sign("1"), unit_sign("1/mm")
     ('°', '', '1/mm')
     """
-    return _SIGNS.get(unit, unit)
+    return _SIGN_BY_UNIT.get(unit, unit)
 
 
 def written(number: str, unit: str) -> str:

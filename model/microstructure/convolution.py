@@ -56,8 +56,8 @@ Border = Literal["mirror", "open"]
 MAX_SIGMA_PX = 1000.0
 """A Gaussian wider than this is a mistake in units."""
 
-_INTERPOLATIONS = {"linear": kernels.LINEAR, "cubic": kernels.CUBIC}
-_BORDERS = {"mirror": kernels.MIRROR, "open": kernels.OPEN}
+_INTERPOLATION_CODES = {"linear": kernels.LINEAR, "cubic": kernels.CUBIC}
+_BORDER_CODES = {"mirror": kernels.MIRROR, "open": kernels.OPEN}
 _ERROR_TEXTS = {
     kernels.NOT_FINITE: "got NaN or infinity",
     kernels.ALPHA: "got a strength beyond [-2, 1]",
@@ -139,13 +139,13 @@ def reach_of(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "c
         row = int(np.flatnonzero(code)[0])
         raise ConvolutionError(f"alpha, sigma, axis: {_ERROR_TEXTS[int(code[row])]}, row {row}")
     radius = int(kernels.TRUNCATE_SIGMAS * float(largest.max(initial=0.0)) + 0.5)
-    return radius + _INTERPOLATIONS[sampling] if radius else 0
+    return radius + _INTERPOLATION_CODES[sampling] if radius else 0
 
 
 def _settings(sampling: str, border: str) -> None:
-    if sampling not in _INTERPOLATIONS:
+    if sampling not in _INTERPOLATION_CODES:
         raise ConvolutionError(f'sampling: got {sampling!r}, expected "cubic" or "linear"')
-    if border not in _BORDERS:
+    if border not in _BORDER_CODES:
         raise ConvolutionError(f'border: got {border!r}, expected "mirror" or "open"')
 
 
@@ -188,8 +188,8 @@ def _pass(
         lines.alpha,
         lines.sigma_px,
         np.array([window.top, window.left]),
-        _INTERPOLATIONS[sampling],
-        _BORDERS[border],
+        _INTERPOLATION_CODES[sampling],
+        _BORDER_CODES[border],
         out,
     )
     return out

@@ -30,7 +30,7 @@ MIN_FACE_PIXELS: Final = 200
 LOG_MELANIN_STEP: Final = 0.02
 """From place to place in log melanin."""
 N_BLOOD_NODES: Final = 96
-_SUMMED: Final = 3
+_N_BLOOD_NODES_SUMMED: Final = 3
 MIN_COLOR_ERROR: Final = 0.003
 """Relative error of colors below which places stand too far apart; smaller ones are taken for this
 much, which of light skin is 3 % of melanin, where a face scatters by 10 to 20 %."""
@@ -125,7 +125,7 @@ def fit_face_distribution(
     ) -> FaceDistribution:
         from reconstruction.chromophores import face_kernels as kernels  # compiled when imported
 
-        shape = (len(colors), rows, N_BLOOD_NODES // _SUMMED)
+        shape = (len(colors), rows, N_BLOOD_NODES // _N_BLOOD_NODES_SUMMED)
         probability = np.zeros(shape, dtype=np.float32)
         kernels.plane_probability(
             np.log(colors) + color,
@@ -135,13 +135,13 @@ def fit_face_distribution(
             -2.0 * np.log(prior.density),
             prior.low + light,
             prior.step,
-            _SUMMED,
+            _N_BLOOD_NODES_SUMMED,
             probability,
         )
         return fit(
             probability,
             log_melanin,
-            blood.reshape(-1, _SUMMED).mean(axis=1),
+            blood.reshape(-1, _N_BLOOD_NODES_SUMMED).mean(axis=1),
             melanin_ends=melanin_ends,
             blood_ends=(MIN_AXIS_FRACTION, 1.0),
             begin=begin,

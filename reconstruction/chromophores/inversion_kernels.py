@@ -53,7 +53,7 @@ MAX_FINITE = 1e30
 
 # Contraction only: NaN and infinity must keep their meaning.
 _FAST_MATH = {"contract"}
-_LOW = np.float32(MIN_AXIS_FRACTION)
+_MIN_AXIS_FRACTION = np.float32(MIN_AXIS_FRACTION)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
 _THREE = np.float32(3.0)
@@ -152,23 +152,23 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     w00 = _ONE - x - w01
     a = w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0]
     b = w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1]
-    return min(max(a, _LOW), _ONE), min(max(b, _LOW), _ONE)
+    return min(max(a, _MIN_AXIS_FRACTION), _ONE), min(max(b, _MIN_AXIS_FRACTION), _ONE)
 
 
 @njit(inline="always", fastmath=_FAST_MATH)
 def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
     """Stop a step at the table's edge, where the other chromophore is fitted alone."""
-    if a + step_a < _LOW or a + step_a > _ONE:
-        step_a = (_LOW if a + step_a < _LOW else _ONE) - a
+    if a + step_a < _MIN_AXIS_FRACTION or a + step_a > _ONE:
+        step_a = (_MIN_AXIS_FRACTION if a + step_a < _MIN_AXIS_FRACTION else _ONE) - a
         step_b = (rb - ab * step_a) / bb
-        if b + step_b < _LOW or b + step_b > _ONE:
-            step_b = (_LOW if b + step_b < _LOW else _ONE) - b
+        if b + step_b < _MIN_AXIS_FRACTION or b + step_b > _ONE:
+            step_b = (_MIN_AXIS_FRACTION if b + step_b < _MIN_AXIS_FRACTION else _ONE) - b
             step_a = (ra - ab * step_b) / aa
-    elif b + step_b < _LOW or b + step_b > _ONE:
-        step_b = (_LOW if b + step_b < _LOW else _ONE) - b
+    elif b + step_b < _MIN_AXIS_FRACTION or b + step_b > _ONE:
+        step_b = (_MIN_AXIS_FRACTION if b + step_b < _MIN_AXIS_FRACTION else _ONE) - b
         step_a = (ra - ab * step_b) / aa
-    step_a = min(max(step_a, _LOW - a), _ONE - a)
-    step_b = min(max(step_b, _LOW - b), _ONE - b)
+    step_a = min(max(step_a, _MIN_AXIS_FRACTION - a), _ONE - a)
+    step_b = min(max(step_b, _MIN_AXIS_FRACTION - b), _ONE - b)
     longest = max(abs(step_a), abs(step_b))
     if longest > MAX_AXIS_STEP:
         shorter = np.float32(MAX_AXIS_STEP) / np.float32(longest)
@@ -422,8 +422,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 shift *= common_variance * np.float32(total)
                 s = np.float32(math.exp(shift))
             e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
-            a = min(max(a, _LOW), _ONE)
-            b = min(max(b, _LOW), _ONE)
+            a = min(max(a, _MIN_AXIS_FRACTION), _ONE)
+            b = min(max(b, _MIN_AXIS_FRACTION), _ONE)
             wide = float64(aa) * bb
             det = max(wide - float64(ab) * ab, 1e-12 * wide) + 1e-300
             inverse = np.float32(1.0 / det)

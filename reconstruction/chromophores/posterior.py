@@ -183,7 +183,7 @@ def _of_face(face: FaceDistribution | None, table: ColorTable) -> tuple[Float64A
     )
 
 
-_UPPER = np.triu_indices(3)
+_UPPER_TRIANGLE = np.triu_indices(3)
 
 
 def _covariances(
@@ -197,7 +197,7 @@ def _covariances(
     if each.ndim < 3:
         usual = model_covariance(model_error, default_noise)
         covariances = without_brightness(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
-        return model_error, covariances[(..., *_UPPER)]
+        return model_error, covariances[(..., *_UPPER_TRIANGLE)]
     if each.shape != (*shape, 3, 3):
         raise ChromophoreError(
             f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {each.shape}"
@@ -211,7 +211,7 @@ def _covariances(
         if not (np.isfinite(band).all() and (diagonal >= 0.0).all()):
             raise ChromophoreError("model_error: expected finite covariances without negatives")
         brightness = diagonal.mean(axis=1) + floor + 1e-6
-        part = band[(slice(None), *_UPPER)] + brightness[:, None]
+        part = band[(slice(None), *_UPPER_TRIANGLE)] + brightness[:, None]
         part[:, [0, 3, 5]] += floor
         triangles[start : start + _BAND_PIXELS] = part
     return each.mean(axis=0) if len(each) else None, triangles

@@ -70,10 +70,10 @@ POSTERIOR_MAPS = (
     "residual",
 )
 
-_LOW = float(MIN_AXIS_FRACTION)
-_STEP_A = (1.0 - _LOW) / (N_LINES - 1)
-_STEP_B = (1.0 - _LOW) / (N_LINE_NODES - 1)
-_ROOM = (N_LINES - 1) * MIN_NODES + N_FINE
+_MIN_AXIS_FRACTION = float(MIN_AXIS_FRACTION)
+_STEP_A = (1.0 - _MIN_AXIS_FRACTION) / (N_LINES - 1)
+_STEP_B = (1.0 - _MIN_AXIS_FRACTION) / (N_LINE_NODES - 1)
+_MAX_NODES = (N_LINES - 1) * MIN_NODES + N_FINE
 _FAST_MATH = {"contract"}
 
 
@@ -140,7 +140,7 @@ def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
 @njit(fastmath=_FAST_MATH)
 def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     """Return the log color and its derivative by blood on line k, the node and the way past it."""
-    y = (b - _LOW) / _STEP_B
+    y = (b - _MIN_AXIS_FRACTION) / _STEP_B
     j = min(int(y), N_LINE_NODES - 2)
     x = y - j
     f0, g0 = _hermite(
@@ -201,7 +201,10 @@ def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-
         pushed = _form(w, g0, g1, g2, e0, e1, e2)
         _, force, stiff = _blood_cost(of_face, b)
         step = (pushed + force) / (by_color + stiff)
-        moved = min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), _LOW), 1.0) - b
+        moved = (
+            min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), _MIN_AXIS_FRACTION), 1.0)
+            - b
+        )
         if turn == N_NEWTON_STEPS or moved * moved * (by_color + stiff) < STEP_TOL * STEP_TOL:
             break
         b += moved
@@ -217,11 +220,11 @@ def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     Also whether it is held: a place at an end of the axis that would go on stays there.
     """
     b, step, by_color, _, pushed, e0, e1, e2, g0, g1, g2 = found[:11]
-    held = (b <= _LOW and step < 0.0) or (b >= 1.0 and step > 0.0)
+    held = (b <= _MIN_AXIS_FRACTION and step < 0.0) or (b >= 1.0 and step > 0.0)
     square = _form(w, e0, e1, e2, e0, e1, e2)
     after = b
     if not held:
-        after = min(max(b + step, _LOW), 1.0)
+        after = min(max(b + step, _MIN_AXIS_FRACTION), 1.0)
         square += step * (step * by_color - 2.0 * pushed)
     more, _, _ = _blood_cost(of_face, after)
     shade = s[0] * e0 + s[1] * e1 + s[2] * e2
@@ -232,7 +235,7 @@ def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
 @njit(fastmath=_FAST_MATH)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
-    a = _LOW + (k + x) * _STEP_A
+    a = _MIN_AXIS_FRACTION + (k + x) * _STEP_A
     return end * a * a * a
 
 
@@ -311,7 +314,7 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
     blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
     spread, pull = ridge.spread, ridge.pull
     prior, prior_low, prior_step = light
-    first = min(max(int((begin[0] - _LOW) / _STEP_A + 0.5), 0), N_LINES - 1)
+    first = min(max(int((begin[0] - _MIN_AXIS_FRACTION) / _STEP_A + 0.5), 0), N_LINES - 1)
     for side in range(2):
         b = float64(begin[1])
         if side == 1:
@@ -390,7 +393,7 @@ def _look_across(  # type: ignore[no-untyped-def]
     l0, l1, l2 = seen
     s0, s1, s2 = s
     prior, prior_low, prior_step = light
-    b_low, b_high = 1.0, _LOW
+    b_low, b_high = 1.0, _MIN_AXIS_FRACTION
     for k in range(N_LINES):
         beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
         if not beside < lowest + NEGLIGIBLE_COST:
@@ -399,28 +402,28 @@ def _look_across(  # type: ignore[no-untyped-def]
         reach = 2.6 * spread[k]
         if pull[k] != 0.0:
             reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
-        low = max(min(b, second[k]) - reach, _LOW)
+        low = max(min(b, second[k]) - reach, _MIN_AXIS_FRACTION)
         high = min(max(b, second[k]) + reach, 1.0)
         wide[k] = high - low > SHAPE_EXTENT
         if wide[k]:
             # The curvature says little of the far ends: look where probability ends.
-            width = (1.0 - _LOW) / N_COARSE
+            width = (1.0 - _MIN_AXIS_FRACTION) / N_COARSE
             least = np.inf
             for i in range(N_COARSE):
-                f0, f1, f2 = _color(log_rgb, by_b, k, _LOW + (i + 0.5) * width)[:3]
+                f0, f1, f2 = _color(log_rgb, by_b, k, _MIN_AXIS_FRACTION + (i + 0.5) * width)[:3]
                 e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                 t = s0 * e0 + s1 * e1 + s2 * e2
                 value = _form(w, e0, e1, e2, e0, e1, e2)
                 value += _prior_cost(prior, prior_low, prior_step, t)
-                more, _, _ = _blood_cost(blood_of_face, _LOW + (i + 0.5) * width)
+                more, _, _ = _blood_cost(blood_of_face, _MIN_AXIS_FRACTION + (i + 0.5) * width)
                 value += more
                 coarse[i] = value
                 least = min(least, value)
-            low, high = 1.0, _LOW
+            low, high = 1.0, _MIN_AXIS_FRACTION
             for i in range(N_COARSE):
                 if coarse[i] < least + TAIL_COST:
-                    low = min(low, _LOW + max(i - 0.5, 0.0) * width)
-                    high = max(high, _LOW + min(i + 1.5, N_COARSE + 0.0) * width)
+                    low = min(low, _MIN_AXIS_FRACTION + max(i - 0.5, 0.0) * width)
+                    high = max(high, _MIN_AXIS_FRACTION + min(i + 1.5, N_COARSE + 0.0) * width)
         width = (high - low) / N_ACROSS
         across_low[k], across_width[k] = low, width
         if beside < lowest + 10.0:
@@ -486,7 +489,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
             mass = 0.0
             if value < NEGLIGIBLE_COST:
                 # every ratio of melanin is as likely as any other
-                weight = math.exp(-0.5 * value) / (each * (_LOW + (k + x) * _STEP_A))
+                weight = math.exp(-0.5 * value) / (each * (_MIN_AXIS_FRACTION + (k + x) * _STEP_A))
                 b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
                 if not (wide[k] or wide[k + 1]):
                     bent, _ = _hermite(
@@ -586,7 +589,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
             np.empty(N_COARSE),
         )
         between = np.empty(N_LINES - 1)
-        edges_a, total_a = np.empty(_ROOM + N_LINES), np.empty(_ROOM + N_LINES)
+        edges_a, total_a = np.empty(_MAX_NODES + N_LINES), np.empty(_MAX_NODES + N_LINES)
         edges_b, total_b = np.empty(N_BINS + 1), np.empty(N_BINS + 1)
         bins = np.empty(N_BINS)
         for n in range(task * block, min(pixels, (task + 1) * block)):

@@ -25,7 +25,7 @@ MIN_FACTOR_COSINE = 0.05
 
 _N_LOBES = len(BECKMANN_ROUGHNESS) + len(GGX_ROUGHNESS)
 _N_BECKMANN = len(BECKMANN_ROUGHNESS)
-_ALPHA2 = np.array(BECKMANN_ROUGHNESS + GGX_ROUGHNESS) ** 2
+_ROUGHNESS_SQUARED = np.array(BECKMANN_ROUGHNESS + GGX_ROUGHNESS) ** 2
 
 
 @njit(inline="always")
@@ -57,7 +57,7 @@ def _shapes(light, view, normal, eta, through, slope, lobe):  # type: ignore[no-
     cos_h = min((mu_l + mu_v) / max(2.0 * cos_d, 1e-9), 1.0)
     f_r = _fresnel(cos_d, eta)
     for k in range(_N_LOBES):
-        a2 = _ALPHA2[k]
+        a2 = _ROUGHNESS_SQUARED[k]
         tail = cos_h * cos_h * (a2 - 1.0) + 1.0
         hidden = mu_v * math.sqrt(a2 + (1.0 - a2) * mu_l * mu_l) + mu_l * math.sqrt(
             a2 + (1.0 - a2) * mu_v * mu_v

@@ -322,14 +322,14 @@ def _model_errors(
     return flat, usual
 
 
-_UPPER = np.triu_indices(3)
+_UPPER_TRIANGLE = np.triu_indices(3)
 
 
 def _own_errors(
     own_error: ArrayLike | None, least: Float64Array, shape: tuple[int, ...], usable: BoolArray
 ) -> Float64Array:
     """Return upper triangles of the states' own covariances, (S, n or 1, 6)."""
-    diagonal = np.diag(least)[_UPPER]
+    diagonal = np.diag(least)[_UPPER_TRIANGLE]
     if own_error is None:
         return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
     given = np.asarray(own_error, np.float64)
@@ -337,7 +337,7 @@ def _own_errors(
         raise ChromophoreError(
             f"own_error: expected shape {(*shape, 3, 3)} for states and pixels, got {given.shape}"
         )
-    flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER[0], _UPPER[1]]
+    flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]]
     if not (np.isfinite(flat[usable]).all() and (flat[usable][:, [0, 3, 5]] >= 0.0).all()):
         raise ChromophoreError("own_error: expected finite covariances without negative variances")
     return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
@@ -349,7 +349,7 @@ def _with_mean_of(
     """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
     if owns.shape[1] == 1:
         own = np.zeros((3, 3))
-        own[_UPPER] = owns[0, 0]
+        own[_UPPER_TRIANGLE] = owns[0, 0]
         most = max(int(usable.sum(axis=0).max(initial=0)), 1)
         return np.asarray((common if len(common) > 1 else common[0]) + own / most)
     # each state's part in the mean, as `shared_melanin_kernels.mean_color` takes it
@@ -357,8 +357,8 @@ def _with_mean_of(
     share /= np.maximum(share.sum(axis=0), 1e-300)
     mean = (np.square(share)[..., None] * owns).sum(axis=0)
     whole = np.empty((len(mean), 3, 3))
-    whole[(slice(None), *_UPPER)] = mean
-    whole[(slice(None), *_UPPER[::-1])] = mean
+    whole[(slice(None), *_UPPER_TRIANGLE)] = mean
+    whole[(slice(None), *_UPPER_TRIANGLE[::-1])] = mean
     return np.asarray(whole + common)
 
 

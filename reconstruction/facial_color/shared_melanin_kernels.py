@@ -30,7 +30,7 @@ STATE_MAPS = (
 )
 
 _FAST_MATH = {"contract"}
-_LOW = float(MIN_AXIS_FRACTION)
+_MIN_AXIS_FRACTION = float(MIN_AXIS_FRACTION)
 
 
 @njit(fastmath=_FAST_MATH)
@@ -148,7 +148,7 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
         curvature = _dot(weighted, color[2])
         step = _dot(weighted, rest) / (curvature + 1e-12)
         step = min(max(step, -MAX_BLOOD_STEP), MAX_BLOOD_STEP)
-        b = min(max(b + step, _LOW), 1.0)
+        b = min(max(b + step, _MIN_AXIS_FRACTION), 1.0)
         if abs(b - before) < SHARED_STEP_TOL:
             _color(cells, a, b, color)
             break

@@ -183,10 +183,10 @@ def nearest_medium(
     (0.5, 2.0)
     """
     settings = {"collection": "fibre"} | optics
-    light = Optics(eta, **settings, g=nearest.ASYMMETRY, g_error=0.0)
+    light = Optics(eta, **settings, g=nearest.NEAREST_MEDIUM_G, g_error=0.0)
     _check_settings("photon_table", light)
     layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
-    batch = layout.batch(_prior(nearest.LOG_FACTOR_SIGMA, nearest.ASYMMETRY, 0.0))
+    batch = layout.batch(_prior(nearest.LOG_FACTOR_SIGMA, nearest.NEAREST_MEDIUM_G, 0.0))
     fits = layout.fit(batch, "photon_table", light, nearest.fit_nearest)
     return evaluate_fits(batch, fits, layout.shape, "photon_table", by_definition=True)
 

@@ -238,7 +238,7 @@ def profile_model(method: Method, radius_mm: Float64Array, optics: Optics) -> Pr
     """Return a method's model at some radii (F,)."""
     if method == "photon_table":
         return _tabled(radius_mm.tobytes(), optics)
-    constants, error, bias = _CLOSED[method](optics.eta)
+    constants, error, bias = _CLOSED_FORM_MODELS[method](optics.eta)
     return ProfileModel(
         radius_mm=radius_mm,
         kind=0,
@@ -350,4 +350,4 @@ def _diffusion(eta: float) -> tuple[Float64Array, Float64Array, tuple[float, flo
     return np.array([stretch, c_phi, c_j, 1.0]), DIFFUSION_ERROR, DIFFUSION_BIAS
 
 
-_CLOSED = {"dipole": _dipole, "diffusion": _diffusion}
+_CLOSED_FORM_MODELS = {"dipole": _dipole, "diffusion": _diffusion}

@@ -1,9 +1,9 @@
 """The homogeneous medium whose profile is nearest to that of layered tissue, and how sure it is.
 
 Tissue of layers has no sigma_tr of its own. What stands for it is a definition: of all half spaces
-of asymmetry `ASYMMETRY` the one whose profile is nearest up to a factor, by the mean square of the
-logarithms of the ratios over all fibres that take `MIN_REFLECTANCE_PER_MM2` or more,
-each of one weight.
+of asymmetry `NEAREST_MEDIUM_G` the one whose profile is nearest up to a factor, by the mean square
+of the logarithms of the ratios over all fibres that take `MIN_REFLECTANCE_PER_MM2` or more, each of
+one weight.
 What is left of the profile then is no error of that medium: residuals that are there without any
 noise move it as little as they move the mean of a sample. So they must not widen its interval, and
 no fibre may be left out for the sake of its residual, or weighed by its noise: any other weights
@@ -37,7 +37,7 @@ from reconstruction.subsurface.profile_batch import Fits, ProfileBatch, fit_from
 from reconstruction.subsurface.profile_fit import MIN_DEVIATION, START_DEVIATION
 from reconstruction.subsurface.smooth_misfit import smooth_misfit
 
-ASYMMETRY: Final = 0.8
+NEAREST_MEDIUM_G: Final = 0.8
 """Asymmetry of the media, of the definition."""
 MIN_REFLECTANCE_PER_MM2: Final = 1e-7
 """Of the definition's fibres: what 23 exposures up to 30 s still tell to about a tenth."""

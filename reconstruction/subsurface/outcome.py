@@ -50,8 +50,8 @@ class Outcome(IntFlag):
     COEFFICIENTS_NOT_IDENTIFIED = 512
 
 
-_INVALID = 255
-_REASONS = {
+_INVALID_CODE = 255
+_REASON_BY_CODE = {
     Outcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} fibres to use",
     Outcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibres stand out of their noise",
     Outcome.NOT_CONVERGED: "the fit did not settle",
@@ -171,7 +171,7 @@ class SubsurfaceFit:
             Of the leading axes; () for a single profile.
         """
         code = int(self.outcome[index])
-        return "; ".join(text for bit, text in _REASONS.items() if code & bit)
+        return "; ".join(text for bit, text in _REASON_BY_CODE.items() if code & bit)
 
 
 def evaluate_fits(
@@ -232,7 +232,7 @@ def evaluate_fits(
         "sigma_s_prime_per_mm": s,
         "sigma_tr_per_mm": sigma_tr,
         "covariance": covariance,
-        "valid": (outcome & np.uint16(_INVALID)) == 0,
+        "valid": (outcome & np.uint16(_INVALID_CODE)) == 0,
         "sigma_tr_stderr": _deviation(sigma_tr, log_stderr),
         "interval_per_mm": np.stack(_interval(sigma_tr, log_stderr * reach), axis=-1),
         "chi2": fits.chi2,

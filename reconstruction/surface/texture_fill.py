@@ -23,7 +23,7 @@ from reconstruction.arrays import BoolArray, Float32Array, Int32Array
 FILL_SIZE_RANGE_PX: Final = (8, 8192)
 N_RELAXATION_SWEEPS: Final = 5
 """Of relaxation on each level, which bend the filled texels into a membrane (no kinks)."""
-_OVERRELAXATION: Final = np.float32(1.5)
+_OVERRELAXATION_FACTOR: Final = np.float32(1.5)
 """Over-relaxation; below 2 it converges."""
 
 
@@ -379,4 +379,4 @@ def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
                     if count > 0.0:
                         mean = total / count
                         goal = w * fine[i, j, c] + (np.float32(1.0) - w) * mean
-                        filled[i, j, c] += _OVERRELAXATION * (goal - filled[i, j, c])
+                        filled[i, j, c] += _OVERRELAXATION_FACTOR * (goal - filled[i, j, c])

@@ -103,7 +103,7 @@ def calibrate(
         calibration, summary, findings = made.calibration, made.summary, made.findings
     else:
         frames = _Frames(opened)
-        calibration = _MAKERS[kind](frames, made_on)
+        calibration = _CALIBRATION_MAKERS[kind](frames, made_on)
         summary, findings = tuple(_summary(calibration)), tuple(frames.findings)
     drift: tuple[store.Drift, ...] = ()
     try:
@@ -280,7 +280,7 @@ def _polarization(frames: _Frames, created: date) -> store.Calibration:
     )
 
 
-_MAKERS: dict[str, Callable[[_Frames, date], store.Calibration]] = {
+_CALIBRATION_MAKERS: dict[str, Callable[[_Frames, date], store.Calibration]] = {
     "sensor": _sensor,
     "color": _color,
     "polarization": _polarization,

@@ -23,7 +23,10 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
 OTHER_SECTION: Final = "More"
 
 
-_KINDS: Final = ((re.compile(r"<list\[(\w+)\]>"), r"<\1>"), (re.compile("<%Y-%m-%d>"), "<date>"))
+_TYPE_LABELS: Final = (
+    (re.compile(r"<list\[(\w+)\]>"), r"<\1>"),
+    (re.compile("<%Y-%m-%d>"), "<date>"),
+)
 """How Typer writes kinds of arguments after Python's types, and what is written instead."""
 
 
@@ -56,7 +59,7 @@ def plain(name: str) -> str:
     >>> plain("paths... <list[Path]>"), plain("--consent-expires <%Y-%m-%d>"), plain("--size <int>")
     ('paths... <path>', '--consent-expires <date>', '--size <int>')
     """
-    for pattern, words in _KINDS:
+    for pattern, words in _TYPE_LABELS:
         name = pattern.sub(words, name)
     return name.replace("<Path>", "<path>")
 

@@ -14,7 +14,7 @@ from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
 from skinrig.arrays import BoolArray, FloatArray
 
-METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
+PREDICTION_METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
 """How a state's blood can be had: as measured, by the rig, by one factor of the neutral map, or
 by not changing it at all."""
 MAX_LEVEL_ERROR: Final = 0.15
@@ -28,7 +28,7 @@ class StateError:
     Attributes
     ----------
     state, way
-        Name of the state; one of `METHODS`.
+        Name of the state; one of `PREDICTION_METHODS`.
     median_relative, interval
         Median of |found - true| / true and its 68 % bootstrap interval.
     rms
@@ -128,10 +128,10 @@ def compare(
         neutral = rig.neutral.astype(np.float64)
         level = float(np.mean(measured.values[seen]) / np.mean(neutral[seen]))
         found: Mapping[str, tuple[FloatArray, FloatArray | None]] = {
-            METHODS[0]: (measured.values, measured.stderr),
-            METHODS[1]: (blend.hemoglobin, blend.stderr),
-            METHODS[2]: (level * neutral, None),
-            METHODS[3]: (neutral, None),
+            PREDICTION_METHODS[0]: (measured.values, measured.stderr),
+            PREDICTION_METHODS[1]: (blend.hemoglobin, blend.stderr),
+            PREDICTION_METHODS[2]: (level * neutral, None),
+            PREDICTION_METHODS[3]: (neutral, None),
         }
         states += [
             _row(state, way, values, stderr, true.values, seen, rng)

@@ -21,7 +21,7 @@ from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.flash_observation import (
-    CHROMOPHORES,
+    CHROMOPHORE_NAMES,
     CONFIRM_PX,
     Observation,
     simulate_observation,
@@ -90,7 +90,7 @@ def predict(observation: Observation, *, repeats: int, power: float, darks: int)
     )
     sigma, valid = {}, {}
     for name, truth, bound in zip(
-        CHROMOPHORES, (observation.melanin, observation.hemoglobin), bounds, strict=True
+        CHROMOPHORE_NAMES, (observation.melanin, observation.hemoglobin), bounds, strict=True
     ):
         told = np.full(skin.shape, np.inf)
         told[skin] = ERROR_OVER_BOUND[name] * bound
@@ -134,7 +134,7 @@ def choose(
         if settings["power"] == POWER_CHOICES[-1]:
             path.append(
                 {name: float(settings[name]) for name in ("repeats", "darks")}
-                | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORES}
+                | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
             )
         chosen = settings
         if _good(found, best, wants, valid_share):
@@ -214,7 +214,7 @@ def confirm(
     progress("reconstruct")
     pipeline.reconstruct(
         done.session,
-        want=CHROMOPHORES,
+        want=CHROMOPHORE_NAMES,
         out=out / "appearance",
         calibration=calibration,
         truth=done.truth.name if done.truth else "",
@@ -305,7 +305,7 @@ def _choice(
             interval_of(100.0 * found.median(name), FORECAST_RELATIVE_SD[name]),
             wants.get(name),
         )
-        for name in CHROMOPHORES
+        for name in CHROMOPHORE_NAMES
     )
     left_out = []
     if not parallel:
@@ -351,7 +351,7 @@ def _choice(
         {
             **own,
             "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
-            "valid_share": {name: found.valid_share(name) for name in CHROMOPHORES},
+            "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
         },
         tuple(left_out),
         path,

@@ -11,7 +11,7 @@ from capture.rig import Rig
 from reconstruction.chromophores import shading_prior
 from skinrig.arrays import BoolArray, Float64Array
 
-CHROMOPHORES = ("melanin", "hemoglobin")
+CHROMOPHORE_NAMES = ("melanin", "hemoglobin")
 TEXTURE_TEXELS = 512
 """Side of the face's texture: finer than what the forecast's pixels show."""
 WIDTH_PX = 256
@@ -88,7 +88,7 @@ def simulate_observation(
     )
     melanin, hemoglobin = (
         to_superpixels(np.asarray(truth[f"{name}_blurred"], np.float64), bare)
-        for name in CHROMOPHORES
+        for name in CHROMOPHORE_NAMES
     )
     skin = to_superpixels(bare.astype(np.float64)) == 1.0
     skin &= (melanin > 0) & (melanin <= table.c_m_max)

@@ -38,7 +38,7 @@ WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
 PERCENT_BY_SITE = "percent_by_site"
 """Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
 
-_WANT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
+_WANTED_LIMIT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
 
 class PlanningError(ValueError):
@@ -157,7 +157,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):
-        match = _WANT.fullmatch(part)
+        match = _WANTED_LIMIT.fullmatch(part)
         if match is None:
             raise OptionsError(f"--want: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()

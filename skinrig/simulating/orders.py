@@ -22,7 +22,7 @@ PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """What may be done with a face that is nobody's, unless said otherwise."""
 MIN_WIDTH_PX = 16
-_COUNTS = {"width_px": "width", "lights": "lights", "views": "views"}
+_COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
 
@@ -114,7 +114,7 @@ class Order:
     """Called with one line a frame."""
 
     def __post_init__(self) -> None:
-        for name, shown in _COUNTS.items():
+        for name, shown in _COUNT_OPTIONS.items():
             number = getattr(self, name, None)
             if number is not None and number < 1:
                 raise SimulationError(f"{shown}: got {number}, expected a number above 0, or none")

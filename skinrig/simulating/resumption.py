@@ -7,7 +7,7 @@ from typing import Any
 
 from capture.session import Session, Subject
 
-_LONGEST = 60
+_MAX_SHOWN_CHARACTERS = 60
 """Characters of a value that are shown; of a plan nobody reads more."""
 
 
@@ -99,4 +99,4 @@ def _short(value: Any) -> str:
         text = ", ".join(value) or "none"
     else:
         text = value if isinstance(value, str) and value else repr(value)
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+    return text if len(text) <= _MAX_SHOWN_CHARACTERS else text[: _MAX_SHOWN_CHARACTERS - 3] + "..."

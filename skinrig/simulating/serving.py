@@ -13,7 +13,7 @@ from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
 from skinrig.arrays import UInt16Array
 from skinrig.console import Console
-from skinrig.errors import INTERRUPTED, UsageError
+from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
@@ -107,7 +107,7 @@ def serve_rig(
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
             if console.as_json:  # its one document stands there already
-                raise SystemExit(INTERRUPTED) from None
+                raise SystemExit(EXIT_INTERRUPTED) from None
             raise
 
 

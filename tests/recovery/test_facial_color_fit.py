@@ -14,7 +14,7 @@ from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.evaluating.facial_color import METHODS, compare, true_blood
+from skinrig.evaluating.facial_color import PREDICTION_METHODS, compare, true_blood
 from skinrig.fitting.facial_color import fit_facial_color
 from skinrig.simulating.simulation import simulate_session
 
@@ -60,14 +60,14 @@ def test_the_rig_gives_each_states_blood_nearer_than_the_neutral_map_does(fitted
     rows, _ = errors(folder, truths)
     error = {(row.state, row.way): row.median_relative for row in rows}
     for state in ("anger", "exercise"):
-        assert error[state, METHODS[1]] < 0.7 * error[state, METHODS[3]]
-        assert error[state, METHODS[1]] < 0.15
+        assert error[state, PREDICTION_METHODS[1]] < 0.7 * error[state, PREDICTION_METHODS[3]]
+        assert error[state, PREDICTION_METHODS[1]] < 0.15
     # one factor of all blood is not what exercise does (observation 5)
-    assert error["exercise", METHODS[1]] < error["exercise", METHODS[2]]
+    assert error["exercise", PREDICTION_METHODS[1]] < error["exercise", PREDICTION_METHODS[2]]
     # and a rig whose states are exchanged is no better than no rig
     exchanged = truths | {"exercise": truths["smile"], "smile": truths["exercise"]}
     wrong = {(row.state, row.way): row.median_relative for row in errors(folder, exchanged)[0]}
-    assert wrong["exercise", METHODS[1]] > 1.2 * error["exercise", METHODS[1]]
+    assert wrong["exercise", PREDICTION_METHODS[1]] > 1.2 * error["exercise", PREDICTION_METHODS[1]]
 
 
 def test_the_mean_change_of_blood_is_found(fitted, folder, truths):

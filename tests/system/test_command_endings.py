@@ -153,12 +153,12 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
         "rigsim.world.serve.serve", lambda *args, **settings: Served(addresses=addresses)
     )
     monkeypatch.setattr("skinrig.simulating.serving._flash_scene", lambda *args: None)
-    assert main(["serve", "flash", "--json"]) == errors.INTERRUPTED
+    assert main(["serve", "flash", "--json"]) == errors.EXIT_INTERRUPTED
     told = json.loads(capsys.readouterr().out)
     assert told["schema"] == "skinrig.serve/1"
     assert told["addresses"] == addresses
     assert told["next"].startswith("skinrig capture flash --port flash=tcp://127.0.0.1:1/flash")
-    assert main(["serve", "flash"]) == errors.INTERRUPTED
+    assert main(["serve", "flash"]) == errors.EXIT_INTERRUPTED
     assert capsys.readouterr().out.splitlines() == [f"{n} {url}" for n, url in addresses.items()]
 
 

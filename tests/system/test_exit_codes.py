@@ -201,21 +201,21 @@ def test_every_command_is_held_to_the_rule():
 
 @pytest.mark.parametrize("name", [*COMMANDS, *OF_RIGS])
 def test_the_words_of_every_command_are_checked_alike(name, here, capsys):
-    assert main([*name.split(), "--help"]) == errors.DONE
+    assert main([*name.split(), "--help"]) == errors.EXIT_DONE
     said = capsys.readouterr().out
     assert "Usage:" in said
     assert not re.search(r"list\[|Path|%Y|\.\.\.\]?\.\.\.", said)  # Python, dots twice
-    assert main([*name.split(), "--no-such-option", "--json"]) == errors.USAGE
-    assert told(capsys) == errors.USAGE
+    assert main([*name.split(), "--no-such-option", "--json"]) == errors.EXIT_USAGE
+    assert told(capsys) == errors.EXIT_USAGE
     if name.split()[0] not in SPEECHLESS and name not in RIG_ALONE:
-        assert main([*name.split(), "--json"]) == errors.USAGE
-        assert told(capsys) == errors.USAGE
+        assert main([*name.split(), "--json"]) == errors.EXIT_USAGE
+        assert told(capsys) == errors.EXIT_USAGE
 
 
 @pytest.mark.parametrize("argv", cases(UNREADABLE))
 def test_words_that_no_file_could_make_right_end_with_2(argv, here, capsys):
-    assert main(argv if "--json" in argv else [*argv, "--json"]) == errors.USAGE
-    assert told(capsys) == errors.USAGE
+    assert main(argv if "--json" in argv else [*argv, "--json"]) == errors.EXIT_USAGE
+    assert told(capsys) == errors.EXIT_USAGE
     assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
 
 
@@ -227,7 +227,7 @@ def test_names_numbers_and_files_of_no_use_end_with_3(argv, here, capsys):
 
 
 def test_the_help_tells_every_exit_code(capsys):
-    assert main(["--help"]) == errors.DONE
+    assert main(["--help"]) == errors.EXIT_DONE
     said = " ".join(capsys.readouterr().out.split())
     assert errors.EXIT_CODE_HELP in said
     for code in (0, 1, 2, 3, 4, 5, 70, 130):

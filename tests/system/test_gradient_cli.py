@@ -24,28 +24,28 @@ PORTS = [
 
 def test_a_dry_run_prints_plan_and_light_and_needs_neither_address_nor_force(capsys):
     arguments = ["capture", "gradient", "--dry-run", "--angles", "0,90", "--steps", "-1..2"]
-    assert main([*arguments, "--json"]) == errors.DONE
+    assert main([*arguments, "--json"]) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
     assert document["steps"] == 2 + 2 * 4 * 16
     assert document["light"]["open_eyes"] == "refused"
     assert document["light"]["duty"] <= 0.25
-    assert main(arguments) == errors.DONE
+    assert main(arguments) == errors.EXIT_DONE
     printed = capsys.readouterr()
     assert "must be closed or shielded" in printed.out + printed.err
 
 
 def test_a_capture_of_skin_without_a_force_limit_is_a_usage_error(capsys, tmp_path):
     code = main(["capture", "gradient", *PORTS, "--out", str(tmp_path / "s")])
-    assert code == errors.USAGE
+    assert code == errors.EXIT_USAGE
     assert re.search(r"--force-limit N.*no default", capsys.readouterr().err)
     assert not (tmp_path / "s").exists()
 
 
 def test_a_missing_address_is_named_and_a_target_needs_no_caliper(capsys, tmp_path):
     out = ["--out", str(tmp_path / "s")]
-    assert main(["capture", "gradient", "--force-limit", "1", *out]) == errors.USAGE
+    assert main(["capture", "gradient", "--force-limit", "1", *out]) == errors.EXIT_USAGE
     assert "--port caliper=URL" in capsys.readouterr().err
-    assert main(["capture", "gradient", "--target", "ball", *out]) == errors.USAGE
+    assert main(["capture", "gradient", "--target", "ball", *out]) == errors.EXIT_USAGE
     text = capsys.readouterr().err
     assert "--port gradient_sphere=URL" in text
     assert "caliper" not in text
@@ -55,10 +55,10 @@ def test_a_missing_address_is_named_and_a_target_needs_no_caliper(capsys, tmp_pa
     ("arguments", "code", "match"),
     [
         (["--angles", "30"], errors.BAD_INPUT, "angles: got 30"),
-        (["--steps", "1-2"], errors.USAGE, "FIRST..LAST"),
+        (["--steps", "1-2"], errors.EXIT_USAGE, "FIRST..LAST"),
         (["--steps", "-9..0"], errors.BAD_INPUT, "steps"),
         (["--target", "chart"], errors.BAD_INPUT, "expected one of ball, dark, flat"),
-        (["--target", "ball", "--angles", "0"], errors.USAGE, "own plan of skin"),
+        (["--target", "ball", "--angles", "0"], errors.EXIT_USAGE, "own plan of skin"),
     ],
 )
 def test_a_wrong_option_is_named(capsys, arguments, code, match):
@@ -68,7 +68,7 @@ def test_a_wrong_option_is_named(capsys, arguments, code, match):
 
 def test_a_target_is_simulated_and_the_next_step_named(capsys, tmp_path):
     out = tmp_path / "session-dark"
-    assert main(["simulate", "gradient", "--out", str(out), "--target", "dark"]) == errors.DONE
+    assert main(["simulate", "gradient", "--out", str(out), "--target", "dark"]) == errors.EXIT_DONE
     assert verify(out).ok
     printed = capsys.readouterr()
     assert f"skinrig calibrate sensor {out}" in printed.out + printed.err
@@ -116,7 +116,7 @@ def test_a_served_rig_is_captured_by_the_command_that_it_names(tmp_path):
                 text=True,
                 timeout=100,
             )
-            assert run.returncode == errors.DONE, run.stderr
+            assert run.returncode == errors.EXIT_DONE, run.stderr
             assert "tape the skin at 0 degrees" in run.stderr
             session = Session.open(out)
             assert session.closed

@@ -50,7 +50,7 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
                 text=True,
                 timeout=120,
             )
-            assert run.returncode == errors.DONE, run.stderr
+            assert run.returncode == errors.EXIT_DONE, run.stderr
             assert "place the head on the cheek at 0 degrees" in run.stderr
             session = Session.open(out)
             assert (session.closed, session.source) == (True, "simulated")

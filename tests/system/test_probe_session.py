@@ -39,12 +39,12 @@ def simulate(out, *more):
 
 def test_a_dry_run_prints_plan_time_and_light_and_needs_no_address(capsys):
     arguments = ["capture", "probe", "--dry-run", "--sites", "cheek", "--json"]
-    assert main(arguments) == errors.DONE
+    assert main(arguments) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
     assert document["steps"] == 6 + 23
     assert 160.0 < document["estimated_s"] < 175.0  # 66 s of darks, 88 s of brackets, suction
     assert document["light"]["led_ws"] < document["light"]["limit_ws"]
-    assert main(arguments[:-1]) == errors.DONE
+    assert main(arguments[:-1]) == errors.EXIT_DONE
     printed = capsys.readouterr()
     assert "not to be looked into" in printed.out + printed.err
 
@@ -52,12 +52,12 @@ def test_a_dry_run_prints_plan_time_and_light_and_needs_no_address(capsys):
 @pytest.mark.parametrize(
     ("arguments", "code", "match"),
     [
-        (["--angles", "0,90"], errors.USAGE, "how many directions"),
-        (["--steps", "-1..1"], errors.USAGE, "--steps"),
+        (["--angles", "0,90"], errors.EXIT_USAGE, "how many directions"),
+        (["--steps", "-1..1"], errors.EXIT_USAGE, "--steps"),
         (["--sites", "cheek,cheek"], errors.BAD_INPUT, "none twice"),
         (["--repeats", "0"], errors.BAD_INPUT, "repeats"),
         (["--target", "ball"], errors.BAD_INPUT, "expected one of phantom, dark"),
-        (["--target", "phantom", "--sites", "cheek"], errors.USAGE, "own plan of skin"),
+        (["--target", "phantom", "--sites", "cheek"], errors.EXIT_USAGE, "own plan of skin"),
     ],
 )
 def test_a_wrong_option_is_named(capsys, arguments, code, match):
@@ -67,7 +67,7 @@ def test_a_wrong_option_is_named(capsys, arguments, code, match):
 
 @pytest.mark.parametrize("option", [["--sites", "cheek"], ["--all-brackets"]])
 def test_other_rigs_know_nothing_of_the_probe_s_options(capsys, tmp_path, option):
-    assert main(["simulate", "gradient", "--out", str(tmp_path / "s"), *option]) != errors.DONE
+    assert main(["simulate", "gradient", "--out", str(tmp_path / "s"), *option]) != errors.EXIT_DONE
     assert "knows nothing of it" in capsys.readouterr().err
 
 
@@ -85,7 +85,7 @@ def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
     capsys, tmp_path, arguments, match
 ):
     out = tmp_path / "session"
-    assert main([*simulate(out), *arguments]) != errors.DONE
+    assert main([*simulate(out), *arguments]) != errors.EXIT_DONE
     assert match in capsys.readouterr().err
     assert not out.exists()
 
@@ -96,7 +96,7 @@ def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
 @pytest.mark.usefixtures("small")
 def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
     out = tmp_path / "session-probe"
-    assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.DONE
+    assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
     session = Session.open(out)
     assert document["frames"] == len(session.frames()) == 3 + len(session.frames("fibres"))
@@ -118,7 +118,9 @@ def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
     hashes = []
     for name in ("a", "b"):
-        assert main(simulate(tmp_path / name, "--target", "dark", "--seed", "4")) == errors.DONE
+        assert (
+            main(simulate(tmp_path / name, "--target", "dark", "--seed", "4")) == errors.EXIT_DONE
+        )
         session = Session.open(tmp_path / name)
         hashes.append([record.line.xxh128 for record in session.frames()])
         # the identity of the session stands in each file: what the sensor saw does not
@@ -131,7 +133,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 @pytest.mark.usefixtures("small")
 def test_the_phantom_is_captured_with_each_fibre_uncovered(capsys, tmp_path):
     out = tmp_path / "session-phantom"
-    assert main(simulate(out, "--target", "phantom")) == errors.DONE
+    assert main(simulate(out, "--target", "phantom")) == errors.EXIT_DONE
     printed = capsys.readouterr()
     assert f"skinrig calibrate fibre {out}" in printed.out + printed.err
     session = Session.open(out)
@@ -166,7 +168,7 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
         main(words)
     monkeypatch.setattr(probe.HeadLog, "exposure", honest)
     assert {r.index["site"] for r in Session.open(out).frames("fibres")} == {"forehead"}
-    assert main([*words, "--resume"]) == errors.DONE
+    assert main([*words, "--resume"]) == errors.EXIT_DONE
     session = Session.open(out)
     assert session.closed
     assert verify(out).ok
@@ -181,10 +183,10 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
 def test_the_next_command_is_named_and_a_closed_session_is_not_gone_on_with(capsys, tmp_path):
     out = tmp_path / "session-dark"
     words = simulate(out, "--target", "dark")
-    assert main(words) == errors.DONE
+    assert main(words) == errors.EXIT_DONE
     printed = capsys.readouterr()
     assert f"next: skinrig verify {out}" in printed.out + printed.err
-    assert main([*words, "--resume"]) != errors.DONE
+    assert main([*words, "--resume"]) != errors.EXIT_DONE
     assert "closed" in capsys.readouterr().err
 
 
@@ -216,7 +218,7 @@ def test_a_simulation_that_is_killed_in_a_series_is_resumed(tmp_path):
     before = {r.step_id for r in Session.open(out).frames("fibres")}
     assert {step.split("-")[0] for step in before} == {"forehead"}
     done = subprocess.run([*command, "--resume", "--json"], capture_output=True, text=True)
-    assert done.returncode == errors.DONE, done.stderr
+    assert done.returncode == errors.EXIT_DONE, done.stderr
     assert json.loads(done.stdout)["frames"] == 6 + 2 * 23
     session = Session.open(out)
     assert session.closed
@@ -252,7 +254,7 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
                 capture_output=True,
                 text=True,
             )
-            assert run.returncode == errors.DONE, run.stderr
+            assert run.returncode == errors.EXIT_DONE, run.stderr
             # on the rig's own clock a whole series would take its minute and a half
             document = json.loads(plan.read_text())
             document["steps"] = [
@@ -279,7 +281,7 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
                 text=True,
                 timeout=100,
             )
-            assert run.returncode == errors.DONE, run.stderr
+            assert run.returncode == errors.EXIT_DONE, run.stderr
             assert "place the head on the cheek at 0 degrees" in run.stderr
             session = Session.open(out)
             assert session.closed

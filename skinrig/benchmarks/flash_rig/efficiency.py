@@ -69,7 +69,7 @@ def efficiency(*, toy: bool) -> StageBenchmark:
     limits: list[Limit] = []
     left_out: list[tuple[str, str]] = []
     worst: dict[str, BandError] = {}
-    for name, made in _ESTIMATORS.items():
+    for name, made in _ESTIMATOR_TRIALS.items():
         ratios: dict[str, list[tuple[float, float]]] = {band: [] for band in MELANIN_BANDS}
         for subject, trial in made(draws):
             timing = measure(trial.squared_errors, repeats=1)
@@ -285,7 +285,7 @@ def _differences(value: Callable[[Float64Array], Float64Array], at: Float64Array
     return np.column_stack(columns)
 
 
-_ESTIMATORS: Final[dict[str, Callable[[int], Iterator[tuple[str, Trial]]]]] = {
+_ESTIMATOR_TRIALS: Final[dict[str, Callable[[int], Iterator[tuple[str, Trial]]]]] = {
     "melanin, shading known": partial(_chromophores, "melanin", "known"),
     "melanin, shading free": partial(_chromophores, "melanin", "free"),
     "hemoglobin, shading known": partial(_chromophores, "hemoglobin", "known"),

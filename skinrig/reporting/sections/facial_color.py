@@ -173,7 +173,7 @@ def _errors(
 ) -> Iterator[page.Block]:
     if not states:
         return
-    by_rig = [row for row in states if row.way == evaluation.METHODS[1]]
+    by_rig = [row for row in states if row.way == evaluation.PREDICTION_METHODS[1]]
     for row in by_rig:
         worst = _worst(row.state, banded)
         checks.append(
@@ -234,7 +234,7 @@ def _errors(
             )
             for label in labels
         ]
-        for way in evaluation.METHODS
+        for way in evaluation.PREDICTION_METHODS
     }
     yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
 

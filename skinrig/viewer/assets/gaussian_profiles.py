@@ -23,7 +23,7 @@ from scipy.special import erf
 from model import dipole, fresnel
 from skinrig.arrays import Float64Array
 
-GAUSSIANS: Final = 4
+N_GAUSSIANS: Final = 4
 """Spread an edge of light within 0.1 % (three: 0.4 %; six: 0.01 %) and are two passes each."""
 _RADIUS_NODES: Final = 240
 _MAX_RELATIVE_RADIUS: Final = 12.0  # radii reach so many times 1/sigma_tr, where e^-12 is left
@@ -72,7 +72,7 @@ def fit(
     sigma_tr_per_mm: ArrayLike,
     *,
     eta: float = fresnel.ETA_SKIN,
-    count: int = GAUSSIANS,
+    count: int = N_GAUSSIANS,
 ) -> GaussianProfile:
     """Fit Gaussians to the dipoles of three channels.
 

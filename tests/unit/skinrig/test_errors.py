@@ -14,12 +14,12 @@ class StoreError(ValueError):
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (KeyboardInterrupt(), errors.INTERRUPTED),
+        (KeyboardInterrupt(), errors.EXIT_INTERRUPTED),
         (DeviceError("box silent"), errors.DEVICE_FAILED),
         (StoreError("bad hash"), errors.BAD_INPUT),
         (FileNotFoundError(2, "No such file", "x"), errors.BAD_INPUT),
         (errors.MissingExtra("this", "usd"), errors.EXTRA_MISSING),
-        (ZeroDivisionError("division by zero"), errors.BUG),
+        (ZeroDivisionError("division by zero"), errors.EXIT_BUG),
     ],
 )
 def test_each_kind_of_failure_has_its_exit_code(error, code):
