@@ -32,7 +32,8 @@ EXIT_INTERRUPTED = 130
 EXIT_CODE_HELP = (
     f"{EXIT_DONE} done; {LIMIT_MISSED} a limit was missed; {EXIT_USAGE} the command line cannot be "
     f"read (an argument missing, not of its form, or at odds with another); {BAD_INPUT} what it "
-    f"names is not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a capture failed; "
+    f"names is not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a "
+    "capture failed; "
     f"{EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a fault of skinrig's own; "
     f"{EXIT_INTERRUPTED} interrupted."
 )

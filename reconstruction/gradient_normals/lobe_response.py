@@ -358,7 +358,13 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
         For vectors that are not finite.
     """
     require_finite("vector", vector)
-    size = np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
+    largest = np.maximum(np.abs(vector).max(axis=1), 1e-300)
+    size = np.linalg.norm(vector, axis=1)
+    # squares of vectors shorter than this are subnormal or zero
+    size = np.where(
+        size > 1e-150, size, largest * np.linalg.norm(vector / largest[:, None], axis=1)
+    )
+    size = np.maximum(size, 1e-300)[:, None]
     n = vector / size
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]
     if mirror:

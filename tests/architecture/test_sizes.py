@@ -11,7 +11,7 @@ MAX_PARAMETERS = 12
 
 LONG_MODULES = {
     "reconstruction/brdf_basis/nnls_kernels.py": 568,
-    "reconstruction/chromophores/posterior_kernels.py": 630,
+    "reconstruction/chromophores/posterior_kernels.py": 633,
     "reconstruction/correspondence/common_parameterization.py": 554,
     "reconstruction/facial_color/repeatability.py": 457,
     "reconstruction/scan/registration.py": 502,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from model import color_table, merl, metrics, skin_reflectance, spectra
@@ -356,6 +356,7 @@ RING = sphere_lights.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
     vector=st.tuples(*[st.floats(-1e9, 1e9)] * 3),
     mirror=st.booleans(),
 )
+@example(view=(0.0, 0.0, 1.0), eta=2.0, vector=(0.0, 0.0, 2.7e-204), mirror=False)
 def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, mirror):
     across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
     if abs(unit(view)[1]) > 0.9999995:

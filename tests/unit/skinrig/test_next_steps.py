@@ -8,6 +8,7 @@ import pytest
 
 from skinrig.cli import main
 from skinrig.next_steps import CALIBRATION_BY_TARGET, OPEN_COMMAND, after_session, suggest, welcome
+from skinrig.reporting import page
 from skinrig.reporting.page import document
 from skinrig.workspace import scan
 
@@ -37,7 +38,7 @@ def commands(folder=Path()):
 
 
 def report_page():
-    return document("a report", "<p>All checks.</p>", "<h2>Maps</h2>")
+    return document("a report", [page.note("All checks.")], [page.Heading("Maps")])
 
 
 @pytest.fixture(autouse=True)
