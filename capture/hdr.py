@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from capture.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from capture.documents import Checks, InputError
 
-__all__ = ["BracketError", "Response", "merge", "merge_reference", "recover_response"]
-
 N_WEIGHTING_STEPS: Final = 1
 """Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
 _TILE_PIXELS: Final = 512

@@ -9,8 +9,6 @@ from model.fresnel import ETA_SKIN
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
-__all__ = ["PolarizerAxes", "Separation", "separate"]
-
 MIN_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
 
 

@@ -13,23 +13,6 @@ from numpy.typing import NDArray
 from capture.arrays import Float32Array, Float64Array
 from capture.documents import InputError
 
-__all__ = [
-    "CALIBRATION_KINDS",
-    "Calibration",
-    "CalibrationDamaged",
-    "CalibrationError",
-    "CalibrationExpired",
-    "CalibrationMismatch",
-    "CalibrationMissing",
-    "Provenance",
-    "Quantity",
-    "Source",
-    "default_validity",
-    "digest_arrays",
-    "of_one_device",
-    "require_plain_name",
-]
-
 CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
 DEFAULT_VALIDITY_DAYS = 90
 

@@ -8,8 +8,6 @@ import numpy as np
 
 from capture.calibration.record import Calibration, CalibrationExpired, CalibrationMismatch
 
-__all__ = ["Drift", "drift", "require"]
-
 
 @dataclass(frozen=True, slots=True)
 class Drift:

@@ -13,8 +13,6 @@ from capture.devices.port import BadAnswer, DeviceError, Hello, Port, WrongDevic
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Box", "BoxStatus"]
-
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:

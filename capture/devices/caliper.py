@@ -18,8 +18,6 @@ from typing import ClassVar, Literal
 from capture.devices.box import Box, BoxStatus
 from capture.devices.port import PortTimeout
 
-__all__ = ["CaliperBox", "CaliperStatus", "Ended", "MoveReport"]
-
 Ended = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
 _END_WORDS: dict[str, Ended] = {
     "REACHED": "reached",

@@ -2,18 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "BadAnswer",
-    "BoxRebooted",
-    "CommandRefused",
-    "DeviceError",
-    "LinkLost",
-    "PortBusy",
-    "PortTimeout",
-    "PortUrlError",
-    "WrongDevice",
-]
-
 
 class DeviceError(Exception):
     """Root of what drivers raise about a device."""

@@ -15,8 +15,6 @@ from typing import Literal
 from capture.devices.box import Box, BoxStatus
 from capture.devices.port import Clock, LinkLost, Port, PortTimeout, WrongDevice
 
-__all__ = ["ChargeState", "FlashBox", "FlashReport", "Status", "find_box"]
-
 FLASH_KIND = "flash"
 Polarizer = Literal["parallel", "crossed"]
 _POLARIZER_WORDS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}

@@ -15,8 +15,6 @@ from capture.devices import wire
 from capture.devices.box import Box, BoxStatus
 from capture.devices.port import Port
 
-__all__ = ["LEVEL_STEPS", "Eyes", "Judgment", "LedBox", "LedStatus", "Position"]
-
 Eyes = Literal["open", "closed", "shielded"]
 EYE_STATES: tuple[str, ...] = ("open", "closed", "shielded")
 LEVEL_STEPS = 1000

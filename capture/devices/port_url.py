@@ -10,9 +10,6 @@ import serial
 
 from capture.devices.errors import PortBusy
 
-__all__ = ["serial_ports"]
-
-
 URL_HANDLERS = "capture.urlhandlers"
 
 

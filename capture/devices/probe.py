@@ -17,8 +17,6 @@ from typing import ClassVar, Literal
 from capture.devices.box import Box, BoxStatus
 from capture.devices.port import PortTimeout
 
-__all__ = ["Opening", "ProbeBox", "ProbeStatus", "SuctionReport", "SuctionState"]
-
 Shut = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
 Vented = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
 _SHUTTER_WORDS: dict[str, Shut] = {

@@ -20,25 +20,6 @@ import enum
 import re
 from dataclasses import dataclass
 
-__all__ = [
-    "MAX_LINE_BYTES",
-    "PROTOCOL_VERSION",
-    "UNKNOWN_BOOT",
-    "BadFrame",
-    "Code",
-    "Event",
-    "LineSplitter",
-    "Reply",
-    "Request",
-    "crc16",
-    "decode",
-    "encode",
-    "looks_framed",
-    "next_seq",
-    "seal",
-    "unseal",
-]
-
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 1024
 """Longest line in bytes, its newline included."""

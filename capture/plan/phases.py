@@ -15,20 +15,6 @@ from fractions import Fraction
 from capture.documents import Fault, shown
 from capture.plan.steps import Plan, PlanError, Step, require
 
-__all__ = [
-    "PhaseGrid",
-    "Phases",
-    "Seconds",
-    "equivalent_period_s",
-    "exact",
-    "period_for",
-    "phase_grid",
-    "phases",
-    "reorder",
-    "timed_steps",
-]
-
-
 Seconds = int | float | str | Decimal | Fraction
 """A time; numbers count as the decimals that they are printed as."""
 

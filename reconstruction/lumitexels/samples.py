@@ -20,8 +20,6 @@ MIN_VISIBLE_COSINE: Final = 0.1
 SHADOW_RAY_OFFSET_MM: Final = 0.1
 """Shadow rays start so far above the surface."""
 
-__all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "visibility"]
-
 
 class Camera(Protocol):
     """What is needed of a calibrated camera."""

@@ -28,8 +28,6 @@ from capture.devices.wire import Code
 from capture.rig import Caliper
 from rigsim.boxes.controller import Command, Refused, number
 
-__all__ = ["CALIPER_CONTROL_PERIOD_S", "CaliperUnit", "JawLoad"]
-
 CALIPER_CONTROL_PERIOD_S = 5e-3
 """Period in which position and force are looked at while the motor runs, s."""
 MAX_CAPTURE_STEPS = 15

@@ -22,8 +22,6 @@ import numpy as np
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
 
-__all__ = ["Command", "Controller", "Device", "Later", "Refused", "choice", "number", "word"]
-
 CACHED_REPLIES = 8
 ERROR_QUEUE = 16
 CAPABILITY_PART = 48

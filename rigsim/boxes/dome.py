@@ -30,8 +30,6 @@ from rigsim.boxes.led_table import (
     switches,
 )
 
-__all__ = ["DomeUnit", "LedPulse"]
-
 DEFAULT_LED_MS = 100.0
 
 

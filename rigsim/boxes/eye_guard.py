@@ -16,8 +16,6 @@ import numpy as np
 from capture.rig import Light
 from rigsim.arrays import Float64Array
 
-__all__ = ["EyeGuard", "Lit"]
-
 EYE_MM = (0.0, 25.0, 80.0)
 """Between the eyes of a nominal head, rig frame; it looks along +z."""
 FLICKER_BAND_HZ = (3.0, 65.0)

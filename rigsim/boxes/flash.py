@@ -24,8 +24,6 @@ import numpy as np
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Command, Later, Refused, choice, number, word
 
-__all__ = ["FlashPop", "FlashUnit"]
-
 Polarizer = Literal["parallel", "crossed"]
 
 MIN_POWER = 1.0 / 256.0

@@ -37,8 +37,6 @@ from rigsim.boxes.pattern_table import (
     starts,
 )
 
-__all__ = ["GradientSphereUnit", "PatternLight"]
-
 DEFAULT_LED_MS = 100.0
 STATUS_TURNING = 1024
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")

@@ -13,8 +13,6 @@ from capture.rig import LedLimits, Light
 from rigsim.boxes.controller import Refused
 from rigsim.boxes.eye_guard import Lit
 
-__all__ = ["LedBank"]
-
 CLEAR_SHARE = 0.5
 """Temperature, of the trip's, below which a hot LED may be lit again."""
 

@@ -22,8 +22,6 @@ from rigsim.boxes.eye_guard import EyeGuard, Lit
 from rigsim.boxes.led_bank import LedBank
 from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, table_crc
 
-__all__ = ["LED_MS", "LedSequencer", "Run", "TableRow", "whole"]
-
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")

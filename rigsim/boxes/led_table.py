@@ -11,8 +11,6 @@ from capture.devices.wire import Code
 from rigsim.boxes.controller import Refused
 from rigsim.boxes.eye_guard import Lit
 
-__all__ = ["Row", "Switch", "lit_by", "parse_leds", "parse_rows", "switches", "table_crc"]
-
 LEVEL_STEPS = 1000
 ROW_US = (2_000, 500_000)
 _ROW_PATTERN = re.compile(r"(-|[0-9+]{1,400}):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})")

@@ -16,15 +16,6 @@ from rigsim.arrays import Float64Array
 from rigsim.boxes.controller import Refused, number
 from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch
 
-__all__ = [
-    "ANALYZER_RANGE_DEG",
-    "PatternRow",
-    "parse_patterns",
-    "pattern_shares",
-    "schedule",
-    "starts",
-]
-
 ANALYZER_RANGE_DEG = (0.0, 180.0)
 _ROW_PATTERN = re.compile(
     r"([A-Za-z-]{1,4}):([0-9]{1,3}(?:\.[0-9]{1,3})?):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})"

@@ -15,8 +15,6 @@ import numpy as np
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Refused
 
-__all__ = ["LEVEL_STEPS", "SHUTTER_MS", "SourceLight", "SourceShutter"]
-
 LEVEL_STEPS = 1000
 SHUTTER_MS = 1.0
 """Shortest opening, ms, and time from the command to blades that have cleared the fibre."""

@@ -19,15 +19,6 @@ from capture.devices.wire import Code
 from capture.rig import Probe
 from rigsim.boxes.controller import Refused
 
-__all__ = [
-    "MAX_PUMPING_S",
-    "MIN_SUCTION_MBAR",
-    "PUMP_CONTROL_PERIOD_S",
-    "Gauge",
-    "SuctionLoad",
-    "SuctionPump",
-]
-
 PUMP_CONTROL_PERIOD_S = 0.05
 """Period in which the gauge is looked at while the pump runs, s."""
 MAX_PUMPING_S = 2.0

@@ -434,21 +434,3 @@ def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
         for k in range(3):
             total[i, k] = inside * packed[i, k] + surface
     return total, specular
-
-
-__all__ = [
-    "Coating",
-    "SkinSurface",
-    "SurfaceError",
-    "beckmann",
-    "boundary",
-    "boundary_transmittance",
-    "coated_terms",
-    "evaluate",
-    "ggx",
-    "grains",
-    "skin_surface",
-    "surface_floor",
-    "surface_terms",
-    "transmittance",
-]

@@ -330,14 +330,3 @@ def _over(below: Coating, film: _Film, share: Float32Array) -> Coating:
         film_eta=np.asarray((1.0 - weight) * below.film_eta + weight * film.eta, np.float32),
         powder=below.powder,
     )
-
-
-__all__ = [
-    "CONDITION_NAMES",
-    "ConditionError",
-    "checked",
-    "coated",
-    "conditioned",
-    "conditioned_subject",
-    "conditioned_surface",
-]

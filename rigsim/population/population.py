@@ -473,15 +473,3 @@ def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[
     atlas = unwrap(mesh, size)
     points = face_regions.on_mean_head(atlas.position_mm, mesh)
     return mesh, atlas, points, face_regions.region_masks(points)
-
-
-__all__ = [
-    "HEAD_SHAPES",
-    "POPULATION_GROUPS",
-    "Group",
-    "Member",
-    "PopulationError",
-    "member",
-    "shifted",
-    "table_1",
-]

@@ -27,8 +27,6 @@ from rigsim.world.faults import Faults
 from rigsim.world.link import Link, LinkStalled, Unplugged
 from rigsim.world.rig_boxes import RIG_OF_BOX
 
-__all__ = ["Serial", "world_of_url"]
-
 REAL_POLL_S = 0.002
 """How often a port on the real clock looks whether another thread did something."""
 

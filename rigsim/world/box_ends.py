@@ -15,8 +15,6 @@ from typing import Protocol
 from rigsim.world.link import Link, LinkStalled, Unplugged
 from rigsim.world.world import World
 
-__all__ = ["BoxEnd", "PtyEnd", "TcpEnd"]
-
 log = logging.getLogger(__name__)
 
 CHUNK_BYTES = 4096

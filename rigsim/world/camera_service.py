@@ -18,8 +18,6 @@ from rigsim.world.camera import SimCamera
 from rigsim.world.camera_body import CameraBody
 from rigsim.world.world import World
 
-__all__ = ["CameraService"]
-
 log = logging.getLogger(__name__)
 
 MAX_WAIT_S = 600.0

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 from capture.documents import near_miss
 
-__all__ = ["FAULT_CATALOG", "NO_FAULTS", "FaultKind", "Faults"]
-
 _PROBABILITY_FIELDS = (
     "drop",
     "flip",

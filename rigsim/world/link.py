@@ -16,8 +16,6 @@ import numpy as np
 from rigsim.boxes.controller import Controller
 from rigsim.world.faults import Faults
 
-__all__ = ["Link", "LinkStalled", "Unplugged"]
-
 STALL_BUFFER_BYTES = 256
 """What the line holds while a stalled box takes nothing."""
 BOOT_BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"

@@ -9,8 +9,6 @@ from rigsim.arrays import UInt16Array
 from rigsim.world.suction import HeadState
 from rigsim.world.taped_skin import GripState
 
-__all__ = ["CaliperScene", "ProbeScene", "Scene"]
-
 
 class Scene(Protocol):
     """What is in front of the cameras."""

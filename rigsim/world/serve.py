@@ -25,8 +25,6 @@ from rigsim.world.faults import Faults
 from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
 from rigsim.world.world import World
 
-__all__ = ["ServeError", "Served", "serve"]
-
 log = logging.getLogger(__name__)
 
 MAX_IDLE_S = 0.5

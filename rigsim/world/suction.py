@@ -25,8 +25,6 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["CameraCooler", "HeadState", "SuckedHead", "SuctionError", "SuctionMechanics"]
-
 AIR_MBAR: Final = 1013.25
 """Standard atmosphere, mbar (ISO 2533:1975)."""
 OPEN_RIM_ML_PER_S_MBAR: Final = 1.0

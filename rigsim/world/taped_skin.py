@@ -29,8 +29,6 @@ import numpy as np
 
 from capture.rig import Caliper
 
-__all__ = ["GripState", "TapeMechanics", "TapedSkin", "TapedSkinError", "draw_mechanics"]
-
 MIN_STRETCH, MAX_STRETCH = 0.2, 2.5
 """Between them the skin's stretch is sought; jaws that ask for more are no caliper's."""
 

@@ -9,8 +9,6 @@ import numpy as np
 from capture.calibration.sensor.transfer_curve import block_sums
 from skinrig.arrays import BoolArray, FloatArray
 
-__all__ = ["MIN_EVEN_FRACTION", "NoTileError", "evenness", "examine"]
-
 BLOCKS_ACROSS: Final = 24
 """Along the shorter side of the picture; the noise of a pixel is averaged away in them."""
 MIN_BLOCK_PX: Final = 4

@@ -11,8 +11,6 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.color.colorimetry import chart_reference, xyz_to_linear_srgb
 from capture.calibration.record import CalibrationError
 
-__all__ = ["ChartError", "Patches", "find_chart", "measure_patches"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -8,18 +8,6 @@ from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
 
-__all__ = [
-    "WHITE_XYZ",
-    "chart_reference",
-    "delta_e_2000",
-    "lab_from_xyz",
-    "lab_jacobian",
-    "white_point",
-    "xyz_from_lab",
-    "xyz_to_linear_srgb",
-]
-
-
 WHITE_XYZ: dict[str, tuple[float, float, float]] = {  # 2 degree observer, Y = 1; ASTM E308-01
     "A": (1.09850, 1.0, 0.35585),
     "D50": (0.96422, 1.0, 0.82521),

@@ -12,9 +12,6 @@ from capture.calibration.record import Calibration, Provenance, Quantity, of_one
 from capture.calibration.sensor.flat_field import fit_smooth_field
 from capture.calibration.sensor.transfer_curve import block_sums
 
-__all__ = ["WhiteReference", "white_reference"]
-
-
 N_WHITE_BLOCKS = 24  # samples along the shorter side for the smooth fit
 
 

@@ -14,9 +14,6 @@ from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import CalibrationError
 
-__all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
-
-
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
 GROUP_MEAN_DISTANCE: Final = 4

@@ -16,9 +16,6 @@ from capture.calibration.sensor import SensorCalibration
 from capture.documents import Checks
 from capture.rig import CFA_PATTERNS, View
 
-__all__ = ["CameraNoise", "DarkError", "DarkModel", "measure_darks"]
-
-
 HOT_FIT_SIGMAS: Final = 6.0
 MIN_HOT_DN: Final = 1.0
 """What no hot pixel stays below at the longest exposure."""

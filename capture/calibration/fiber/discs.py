@@ -12,8 +12,6 @@ from scipy.special import erfc
 from capture.arrays import Float64Array
 from capture.calibration.fiber.merge import MergedSeries, color_masks
 
-__all__ = ["DiscFit", "candidates", "distinct", "fit_disc", "gray_image"]
-
 GrayImage = tuple[Float64Array, Float64Array]
 """Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
 DiscFit = tuple[Float64Array, Float64Array, float]

@@ -14,9 +14,6 @@ from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberE
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
 
-__all__ = ["calibrate_fibers"]
-
-
 DEAD_FIBER_GAIN: Final = 0.05
 """Of the usual gain: a fibre that surely gives less is dead."""
 MIN_GAIN_SIGMAS: Final = 3.0

@@ -16,9 +16,6 @@ from capture.calibration.sensor.transfer_curve import cfa_planes
 from capture.documents import Checks
 from capture.hdr import BracketError
 
-__all__ = ["MergedSeries", "color_masks", "merge_series"]
-
-
 NOISE_WINDOW_PX: Final = 3
 """Side of the square of one color's pixels that the noise of each is told from."""
 SATURATION_MARGIN_SIGMAS: Final = 4.0

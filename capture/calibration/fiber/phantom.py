@@ -13,15 +13,6 @@ from capture.arrays import Float64Array
 from capture.calibration.record import CalibrationError
 from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json, shown
 
-__all__ = [
-    "SCHEMA",
-    "CertificateError",
-    "CertificateUncertainty",
-    "ExpectedReflectance",
-    "PhantomCertificate",
-    "read_certificate",
-]
-
 SCHEMA: Final = "skinrig.phantom/1"
 
 

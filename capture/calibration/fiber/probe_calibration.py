@@ -27,8 +27,6 @@ from capture.calibration.store import load
 from capture.calibration.validity import require
 from capture.rig import Rig
 
-__all__ = ["FiberCalibration", "FiberError", "FiberReflectance"]
-
 
 class FiberError(CalibrationError):
     """Readings that a fibre probe cannot be calibrated from, or that are not this probe's."""

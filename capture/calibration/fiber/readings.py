@@ -14,9 +14,6 @@ from capture.calibration.fiber.darks import CameraNoise, DarkModel
 from capture.calibration.fiber.merge import MergedSeries, color_masks, merge_series
 from capture.calibration.fiber.spots import FiberSpots
 
-__all__ = ["FiberReadings", "read_fibers", "sum_spots"]
-
-
 APERTURE_GUARD_PX: Final = 6.0
 """Between the row's apertures and the pixels that tell the light around them."""
 BACKGROUND_HALF_WIDTH_PITCH: Final = 2.0

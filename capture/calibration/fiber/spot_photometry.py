@@ -11,18 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.raw import RawFrame
 
-__all__ = [
-    "Flux",
-    "RateImage",
-    "Shot",
-    "measure_flux",
-    "measure_middles",
-    "rate_image",
-    "share_within",
-    "shot",
-]
-
-
 # pixels of the background further off than this belong to something else
 BACKGROUND_CLIP_SIGMAS = 3.0
 MIN_RING_PIXELS = 8

@@ -14,8 +14,6 @@ from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import CalibrationError
 
-__all__ = ["FiberSpots", "SpotError", "find_fiber_spots"]
-
 MAX_SPOT_OFFSET_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
 MAX_ROW_SHIFT_PITCH: Final = 0.5

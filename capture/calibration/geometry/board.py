@@ -18,17 +18,6 @@ from scipy.ndimage import map_coordinates
 from capture.arrays import Float64Array, Int64Array, UInt8Array
 from capture.calibration.record import CalibrationError
 
-__all__ = [
-    "Board",
-    "BoardError",
-    "Intrinsics",
-    "Pattern",
-    "Sighting",
-    "calibrate_intrinsics",
-    "find_board",
-    "find_markers",
-]
-
 logger = logging.getLogger(__name__)
 
 Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]

@@ -11,8 +11,6 @@ from capture.arrays import Float64Array
 from capture.calibration.geometry.board import Board, Sighting
 from capture.calibration.geometry.intrinsics import CameraPose
 
-__all__ = ["BoardPose", "Target", "gaps_px"]
-
 
 class Target(Protocol):
     """A flat target with known points."""
@@ -56,4 +54,5 @@ def motion_between(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Arr
 
 
 def move_pose(place: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
+    """Return a pose after a rotation, (3, 3), and a shift, mm, of its frame."""
     return BoardPose(rotation @ place.rotation, rotation @ place.translation_mm + shift)

@@ -22,9 +22,6 @@ from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
 
-__all__ = ["Bundle", "BundleError", "Gauge", "LensPrior", "Sightings"]
-
-
 Gauge: TypeAlias = Literal["board", "cameras"]
 
 

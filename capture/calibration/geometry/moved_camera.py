@@ -15,9 +15,6 @@ from capture.calibration.geometry.bundle import place_board
 from capture.calibration.geometry.bundle_equations import BundleError, Sightings
 from capture.calibration.geometry.intrinsics import CameraPose
 
-__all__ = ["MovedCamera", "find_moved"]
-
-
 RMS_PER_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2) ** 0.5
 
 

@@ -11,9 +11,6 @@ from capture.calibration.led_sphere.glass_ball import Ball
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.led_sphere.polarization import FilmFit
 
-__all__ = ["SphereSurvey", "describe_findings"]
-
-
 MAX_ANALYZER_OFFSET_DEG = 2.0
 
 

@@ -22,17 +22,6 @@ from capture.calibration.lights.reflection import reflect, reflection_pixels
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
-__all__ = [
-    "Ball",
-    "BallError",
-    "BallFit",
-    "LightDirections",
-    "find_spots",
-    "light_directions",
-    "locate_ball",
-]
-
-
 SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
 SPOT_BLUR_MM = 0.012
 MIN_SPOT_SEPARATION_MM = 0.06  # two spots closer than this are one

@@ -23,8 +23,6 @@ from capture.calibration.store import load
 from capture.calibration.validity import require
 from capture.rig import Rig
 
-__all__ = ["SphereCalibration", "SphereFilms", "SphereLightTable"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereLightTable:

@@ -10,9 +10,6 @@ from capture.arrays import Float64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.reflection import reflection_pixels, reflection_points
 
-__all__ = ["Mirrored", "mirror_lights"]
-
-
 DERIVATIVE_STEP_MM = 0.01
 
 

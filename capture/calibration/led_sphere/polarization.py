@@ -18,9 +18,6 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.polarization import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection
 
-__all__ = ["FilmFit", "fit_films", "leakage"]
-
-
 MAX_ZERO_DEG = 30  # of the analyser, searched
 TYPICAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
 LOG_LEAK_SCATTER = 1.5  # of its logarithm

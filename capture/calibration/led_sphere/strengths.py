@@ -18,15 +18,6 @@ from capture.calibration.led_sphere.polarization import FilmFit, leakage
 from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import Rig
 
-__all__ = [
-    "add_geometry_errors",
-    "film_table",
-    "has_two_readings",
-    "measure_intensities",
-    "measure_rates",
-]
-
-
 EXPOSURE_REPEATABILITY = 1e-3  # how well an exposure's light repeats
 
 

@@ -38,9 +38,6 @@ from capture.calibration.led_sphere.strengths import (
 from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import Rig, View
 
-__all__ = ["GlassBall", "survey_sphere"]
-
-
 SPOT_MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
 WAVELENGTH_MM = 5.5e-4
 # of a spot's middle, whatever its light: the pixels' own responses, the polish

@@ -11,9 +11,6 @@ from scipy.ndimage import label
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 
-__all__ = ["ChromeBallError", "directions_from_chrome_ball"]
-
-
 HIGHLIGHT_LEVEL = 0.9  # of the brightest pixel: what belongs to a highlight
 MIN_HIGHLIGHT_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
 MIN_BALL_PIXELS = 100

@@ -22,9 +22,6 @@ from capture.calibration.lights.light_list import CameraResponse, LightTable
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.calibration.record import CalibrationError
 
-__all__ = ["LightFit", "LightFitError", "check_order", "fit_lights"]
-
-
 N_LIGHT, N_RESPONSE, N_TILT = (
     6,
     5,

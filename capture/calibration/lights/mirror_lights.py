@@ -22,9 +22,6 @@ from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition
 from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 from capture.calibration.robust import huber_weights, mad_sigma
 
-__all__ = ["Highlights", "LightPositions", "SphereWindow", "find_highlights", "locate_lights"]
-
-
 MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are left alone
 HIGHLIGHT_NOISE_SIGMAS = 8.0  # above the median in the sphere
 # of the brightest pixel in the sphere: fainter spots are reflections of spots

@@ -20,9 +20,6 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
-__all__ = ["SphereError", "SpherePosition", "contour", "find_outline", "locate_sphere"]
-
-
 N_OUTLINE_ANGLES = 180  # places on the outline where an edge is sought
 EDGE_SEARCH_RADII = 0.12  # how far from the outline, of its radius, in the first search
 MIN_EDGE_SEARCH_PX = 3.0

@@ -7,9 +7,6 @@ import numpy as np
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.geometry import CameraPose
 
-__all__ = ["reflect", "reflection_pixels", "reflection_points"]
-
-
 REFLECTION_TOL_RAD = 1e-12
 
 

@@ -14,9 +14,6 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.geometry.board import Sighting, find_markers
 from capture.calibration.geometry.board_pose import BoardPose
 
-__all__ = ["PlateSamples", "PlateWindow", "WhitePlate"]
-
-
 PLATE_CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
 MIN_CELL_PIXELS = 12  # of a part in an image
 MIN_CELL_FILL = 0.5  # share of a part's pixels that must be usable

@@ -18,15 +18,6 @@ from capture.calibration.record import (
     of_one_device,
 )
 
-__all__ = [
-    "MalusFit",
-    "PolarizationCalibration",
-    "PolarizationError",
-    "fit_malus",
-    "modulated_pixels",
-]
-
-
 CONFIDENCE_LEVEL = 0.95
 MIN_MODULATION_SIGMAS = 5.0
 MAX_JITTER = 0.3  # relative; a light less steady than this is out of order

@@ -13,8 +13,6 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.polarization.malus import PolarizationError
 from capture.rig import Light
 
-__all__ = ["Reflection", "fresnel_amplitudes"]
-
 
 def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Float64Array]:
     """Return Fresnel's amplitudes of reflection, across (s) and in (p) the plane of incidence.

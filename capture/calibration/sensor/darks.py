@@ -9,9 +9,6 @@ from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.robust import mad_sigma
 from capture.calibration.sensor.transfer_curve import plane
 
-__all__ = ["Darks", "pool", "reduce_darks"]
-
-
 HOT_PIXEL_SIGMAS = 6.0
 
 

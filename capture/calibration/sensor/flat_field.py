@@ -7,8 +7,6 @@ import numpy as np
 
 from capture.arrays import Float64Array
 
-__all__ = ["SmoothField", "fit_smooth_field", "pixel_response"]
-
 
 @cache
 def _terms(degree: int) -> tuple[tuple[int, int], ...]:

@@ -7,8 +7,6 @@ import numpy as np
 from capture.calibration.sensor.darks import Darks
 from capture.calibration.sensor.transfer_curve import FlatPair, plane
 
-__all__ = ["fit_linearity"]
-
 
 def fit_linearity(
     pairs: Sequence[FlatPair], positions: tuple[tuple[int, int], ...], pattern: str, dark: Darks

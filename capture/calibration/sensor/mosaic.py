@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 from capture.arrays import Float32Array, Float64Array
 from capture.raw import RawFrame
 
-__all__ = ["channel_levels", "neutral_mosaic"]
-
 _COLOR_LETTERS = "RGB"
 
 

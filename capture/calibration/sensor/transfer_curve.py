@@ -14,18 +14,6 @@ from numpy.typing import NDArray
 from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.record import CalibrationError
 
-__all__ = [
-    "Blocks",
-    "CurveFit",
-    "FlatPair",
-    "PhotonTransferError",
-    "block_statistics",
-    "block_sums",
-    "cfa_planes",
-    "fit_curve",
-]
-
-
 LOW_SIGNAL_LEVEL = 0.4  # of the white level: below it nothing saturates in a usable sensor
 # variance over its prediction below which a block counts as saturated
 SATURATED_VARIANCE_RATIO = 0.5

@@ -32,21 +32,6 @@ from capture.arrays import UInt16Array
 from capture.devices import wire
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger
 
-__all__ = [
-    "CAMERA_WIRE_VERSION",
-    "MAX_BLOB_BYTES",
-    "MAX_HEADER_BYTES",
-    "BadMessage",
-    "blob_size",
-    "check_blob",
-    "decode_header",
-    "encode_message",
-    "frame_from_message",
-    "frame_to_message",
-    "info_from_json",
-    "info_to_json",
-]
-
 CAMERA_WIRE_VERSION = 1
 MAX_HEADER_BYTES = 65_536
 MAX_BLOB_BYTES = 2**30

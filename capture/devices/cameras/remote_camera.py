@@ -25,8 +25,6 @@ from capture.devices.cameras import camera_wire
 from capture.devices.cameras.camera_wire import BadMessage
 from capture.devices.port import LinkLost
 
-__all__ = ["RemoteCamera", "open_camera"]
-
 ANSWER_TIMEOUT_S = 5.0
 """How long an answer may take beyond what was asked for, s."""
 DEVELOP_TIMEOUT_S = 300.0

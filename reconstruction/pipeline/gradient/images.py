@@ -15,8 +15,6 @@ from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
-__all__ = ["GradientImages", "Patterns", "SkinState"]
-
 Key = tuple[str, str]
 
 

@@ -14,8 +14,6 @@ from capture.plan.suction import Placement, placement_of
 from capture.session import FrameRecord, Session
 from reconstruction.pipeline.evidence import EvidenceError
 
-__all__ = ["Measurement", "ProbeImages", "measurement_name"]
-
 
 def measurement_name(placement: Placement) -> str:
     """Return what the profile of one placement is called.

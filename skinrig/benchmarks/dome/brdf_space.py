@@ -114,6 +114,3 @@ def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
         brdf_space_datasets.dataset_a(1_400, rng=rng),
         brdf_space_datasets.dataset_b(70, members=table_1()[::4], rng=rng),
     )
-
-
-__all__ = ["space"]
