@@ -354,6 +354,8 @@ class LedSequencer(ABC, Generic[RowT]):
         self._require_closed_stop()
         if not self._sequence_armed:
             raise Refused(Code.NOT_ARMED, "SEQ:ARM judges the table first")
+        # light that was under way at SEQ:ARM, or came after it, has been given by now
+        self.bank.require(self._lit_by(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)

@@ -365,6 +365,18 @@ def test_duty_counts_light_of_before_the_table(bench):
     assert bench.code("SEQ:ARM 1") == Code.DUTY
 
 
+def test_light_under_way_at_arming_counts_when_the_table_runs(bench):
+    bench.ask("SAFE:EYES CLOSED")
+    bench.ask("SYST:ARM")
+    bench.ask("SEQ:DEF 0,17:1000:40000:7")
+    bench.ask("LED:ON 17,240")
+    bench.ask("SEQ:ARM 1")
+    bench.wait(0.3)
+    assert bench.code("TRIG r1") == Code.DUTY
+    bench.wait(1.0)
+    bench.ask("TRIG r2")
+
+
 def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
     bench = Bench(heat=0.55)
     led = behind(1)[0]
