@@ -104,9 +104,11 @@ def pytest_terminal_summary(terminalreporter, config):
         )
     if config.getoption("record_durations"):
         seconds = {path: spent for path, spent in recorded_durations_s().items() if path.is_file()}
-        seconds |= dict.fromkeys({ROOT / report.fspath for report in reports}, 0.0)
+        measured = Counter()
         for report in reports:
-            seconds[ROOT / report.fspath] += report.duration
+            measured[ROOT / report.fspath] += report.duration
+        for path, spent in measured.items():  # a file has long tests and others: two runs
+            seconds[path] = max(spent, seconds.get(path, 0.0))
         with DURATIONS.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow(("file", "seconds"))
