@@ -37,6 +37,9 @@ _REQUIRED_PACKAGES = {
     "sklearn": "scikit-learn",
     "mitsuba": "mitsuba",
     "matplotlib": "matplotlib",
+    "jinja2": "Jinja2",
+    "PIL": "pillow",
+    "pygltflib": "pygltflib",
 }
 _EXTRA_PACKAGES = {
     "distributed": "cluster",
