@@ -18,7 +18,6 @@ LONG_MODULES = {
     "rigsim/boxes/caliper.py": 493,
     "rigsim/boxes/controller.py": 465,
     "rigsim/light/olat.py": 625,
-    "rigsim/light/surface_brdf.py": 454,
     "rigsim/population/population.py": 487,
     "rigsim/scenes/flash/scene.py": 503,
     "rigsim/scenes/gradient/scene.py": 533,
