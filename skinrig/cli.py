@@ -30,6 +30,7 @@ from skinrig.commands import (
 from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed
 from skinrig.console import Console
+from skinrig.next_steps import welcome
 
 app = typer.Typer(
     name="skinrig",
@@ -66,8 +67,6 @@ def _root(
     )
     if context.invoked_subcommand is None:
         from importlib.metadata import version as version_of
-
-        from skinrig.next_steps import welcome
 
         typer.echo(welcome(Path(), version_of("skinrig")))
 

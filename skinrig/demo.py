@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import suggest
@@ -95,8 +96,6 @@ def run_demo(
         found.tables += part.tables
         shares |= seconds
     with _share("measure error against run time", shares, console):
-        from skinrig.benchmarks.stages import run_stages
-
         bench = run_stages(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
         )

@@ -16,8 +16,16 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
+from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.applying.expression import hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.light_safety import light_rows
+from skinrig.evaluating import facial_color, flash, microrelief, subsurface
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.fitting.facial_color import fit_facial_color
+from skinrig.fitting.microstructure import fit_microstructure
+from skinrig.rendering.photographs.comparison import FULL_MODEL
+from skinrig.reporting.map_names import state_words
 from skinrig.simulating.orders import Simulated
 from skinrig.simulating.simulation import simulate_session
 
@@ -80,8 +88,6 @@ Share = Callable[[str], AbstractContextManager[None]]
 
 def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
     """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
-    from skinrig.fitting.facial_color import fit_facial_color
-
     calibration = out / "calibration-flash"
     with share("flash: capture the calibration targets"):
         for target in ("flat", "white", "chart", "malus"):
@@ -171,7 +177,6 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         )
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):
-        from skinrig.rendering.photographs.comparison import FULL_MODEL
         from skinrig.rendering.photographs.evaluation import evaluate_folders
 
         compared = evaluate_folders(
@@ -204,8 +209,6 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
 
 def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
     """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
-    from skinrig.fitting.microstructure import fit_microstructure
-
     calibration = out / "calibration-gradient"
     ball = out / "session-gradient-ball"
     with share("gradient: capture a ball of black glass"):
@@ -297,7 +300,6 @@ def _left_out(rig: str, capture: Simulated) -> dict[str, Any]:
 
 
 def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig.evaluating import flash
 
     if truth is None:
         return []
@@ -317,9 +319,6 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
-    from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
-    from skinrig.applying.expression import hemoglobin_rig
-    from skinrig.evaluating import facial_color
 
     found = store.read(appearance)
     named = parts_of(found)[FACIAL_COLOR]["truth"]
@@ -343,7 +342,6 @@ def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
 
 def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
     from skinrig.evaluating import reflection
-    from skinrig.evaluating import surface as surface_evaluation
 
     if truth is None:
         return []
@@ -360,7 +358,6 @@ def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig.evaluating import subsurface
 
     if truth is None:
         return []
@@ -384,7 +381,6 @@ def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig.evaluating import microrelief
 
     if truth is None:
         return []
@@ -415,8 +411,6 @@ def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
             )
     strain = microrelief.compare_stretch(found, true)
     if strain:
-        from skinrig.reporting.map_names import state_words
-
         worst = max(strain, key=lambda row: abs(row.error))
         rows.append(
             [

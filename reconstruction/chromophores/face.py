@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
 from reconstruction.arrays import Float32Array, Float64Array
+from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
@@ -123,7 +124,6 @@ def fit_face_distribution(
     def fitted(
         light: float, color: Float64Array, begin: FaceDistribution | None = None
     ) -> FaceDistribution:
-        from reconstruction.chromophores import face_kernels as kernels  # compiled when imported
 
         shape = (len(colors), rows, N_BLOOD_NODES // _N_BLOOD_NODES_SUMMED)
         probability = np.zeros(shape, dtype=np.float32)

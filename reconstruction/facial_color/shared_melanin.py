@@ -43,6 +43,7 @@ from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, Chromophor
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.facial_color import light_change
+from reconstruction.facial_color import shared_melanin_kernels as kernels
 
 OWN_VARIANCE_FRACTION = 0.01
 """Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
@@ -163,10 +164,6 @@ def estimate_shared_melanin(
     >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
     ('0.020', '0.020')
     """
-    from reconstruction.facial_color import (
-        shared_melanin_kernels as kernels,  # compiled when imported
-    )
-
     colors = np.asarray(rgb, np.float32)
     if colors.ndim < 2 or colors.shape[-1] != 3 or not colors.shape[0]:
         raise ChromophoreError(f"rgb: expected shape (S, ..., 3), got {colors.shape}")
@@ -371,10 +368,6 @@ def _mean_color(
     owns: Float64Array,
 ) -> tuple[Float32Array, Float32Array]:
     """Return the states' mean log color, as of skin with their mean blood, and its variance."""
-    from reconstruction.facial_color import (
-        shared_melanin_kernels as kernels,  # compiled when imported
-    )
-
     count = np.maximum(usable.sum(axis=0), 1)[:, None]
     keep = usable[..., None]
     plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count

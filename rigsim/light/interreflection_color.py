@@ -14,6 +14,7 @@ import numpy as np
 from capture.rig import View
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
+from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.interreflection import DEFAULT_LAST_BOUNCE, Interreflection
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_table import SkinTable
@@ -105,8 +106,6 @@ class InterreflectionColor:
 
     def on_texture(self, direct: Float32Array, size: int) -> Float32Array:
         """Return `entering` on a texture of so many texels a side, shape (size, size, 3)."""
-        from rigsim.geometry.atlas import dilate_texture, sample
-
         coarse = self.entering(direct)
         filled = dilate_texture(coarse, self._bounce.atlas.covered, steps=2)
         middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)

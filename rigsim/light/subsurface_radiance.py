@@ -14,6 +14,7 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import Atlas
 from rigsim.light import lateral
+from rigsim.light.interreflection_color import InterreflectionColor
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
 from rigsim.render import Caster, visibility
@@ -184,10 +185,6 @@ def light_skin(
     covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
     within = surface.entered[..., None]
     if bounce is not None:
-        from rigsim.light.interreflection_color import (
-            InterreflectionColor,  # which knows of skin, and so of this module
-        )
-
         outside = scale * ((1.0 - hair) * reflectance + covering)
         color = InterreflectionColor(
             bounce,

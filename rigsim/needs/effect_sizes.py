@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh
+from rigsim.light.interreflection import Interreflection
 from rigsim.needs.effects import Noise
 from rigsim.render import Caster
 from rigsim.tissue.skin_layers import ETA
@@ -107,7 +108,6 @@ def exchange_share(caster: Caster) -> float:
     """
     if is_flat(caster.mesh):
         return 0.0
-    from rigsim.light.interreflection import Interreflection
 
     exchange = Interreflection(caster, patches=EXCHANGE_PATCHES).exchange
     return float(np.asarray(exchange.sum(axis=1)).max(initial=0.0))

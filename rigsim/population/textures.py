@@ -13,6 +13,7 @@ from scipy.ndimage import zoom
 from scipy.sparse import csr_array
 
 from capture.documents import InputError
+from model.store import StoreError, read_exr
 from rigsim.arrays import Float32Array
 from rigsim.subject import pigment
 from rigsim.subject.person import SIZE_RANGE
@@ -54,8 +55,6 @@ def load(key: str, path: str) -> Float32Array:
     if path.endswith(".npy"):
         values = _npy(key, path)
     elif path.endswith(".exr"):
-        from model.store import StoreError, read_exr
-
         try:
             values = read_exr(path)
         except StoreError as error:

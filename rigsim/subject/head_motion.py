@@ -14,6 +14,7 @@ import numpy as np
 
 from rigsim.arrays import Float64Array
 from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
+from rigsim.subject.face_regions import on_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 
 SPAN_S: Final = 25.0
@@ -107,8 +108,6 @@ class HeadMotion:
         Mesh
             The same triangles; normals are turned as the surface is.
         """
-        from rigsim.subject.face_regions import on_mean_head
-
         points = on_mean_head(mesh.vertices_mm, mesh)
         corner = np.array(LANDMARKS_MM[f"mouth corner {self.twitch_side}"])
         squared = np.sum((points - corner) ** 2, axis=-1) / TWITCH_RADIUS_MM**2

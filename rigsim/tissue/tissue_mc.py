@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim.arrays import Float64Array
+from rigsim.tissue import photon_lanes
 from rigsim.tissue.photon_walk import TALLY_COUNT, walk
 
 _T = TypeVar("_T")
@@ -323,7 +324,6 @@ def escape_paths(
 
 
 def _lanes_work() -> bool:
-    from rigsim.tissue import photon_lanes
 
     return photon_lanes.is_usable()
 
@@ -331,7 +331,6 @@ def _lanes_work() -> bool:
 def _walk_lanes(
     table: Float64Array, edges2: Float64Array, count: int, seeds: NDArray[np.uint64]
 ) -> tuple[Float64Array, int]:
-    from rigsim.tissue import photon_lanes  # starts the renderer: only for those who want it
 
     if not photon_lanes.is_usable():
         raise TransportError("engine: expected numba or auto, as Dr.Jit finds no LLVM; got drjit")

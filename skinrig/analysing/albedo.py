@@ -20,6 +20,7 @@ from model.texture_statistics import histograms as texture_histograms
 from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
+from rigsim.population.population import table_1
 from skinrig import consent
 from skinrig.appearances import face_textures
 from skinrig.arrays import BoolArray, Float64Array
@@ -28,6 +29,7 @@ from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
+from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
 
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
@@ -166,9 +168,6 @@ def analyse_simulated(
     seed
         Of the population.
     """
-    from rigsim.population.population import table_1
-    from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
-
     tell = progress or (lambda text: None)
     everybody = table_1(seed=seed)
     if not 2 <= people <= len(everybody):

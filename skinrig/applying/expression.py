@@ -15,11 +15,13 @@ import numpy as np
 from model import color_table, store
 from model.facial_color import HemoglobinRig
 from model.facial_color import rig as facial_color
+from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
+from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
@@ -269,8 +271,6 @@ def _source(appearance: SkinAppearance, expression: Expression) -> str:
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
-    from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
-
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
 
 
@@ -328,8 +328,6 @@ def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinR
         )
     shape = (blood.values.shape[0], blood.values.shape[1])
     if other.landmarks is not None and other.landmarks_rig is not None:
-        from reconstruction.facial_color.rig_transfer import transfer_rig
-
         rig = transfer_rig(
             rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks
         )

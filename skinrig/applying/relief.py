@@ -17,6 +17,11 @@ from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
 from model.microstructure.strain_fields import KernelRegions
 from model.skin import SkinAppearance, SkinMap
+from rigsim.geometry.atlas import dilate_texture, unwrap
+from rigsim.geometry.mesh import build_mesh
+from rigsim.subject.expressions import displacement_mm, moves
+from rigsim.subject.face_regions import on_mean_head, region_masks
+from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
@@ -244,10 +249,6 @@ def _with_states(
     mesh: BlendShapeMesh, names: Sequence[str]
 ) -> tuple[BlendShapeMesh, tuple[str, ...]]:
     """Return the mesh with shapes for states that it lacks, and the names that it has itself."""
-    from rigsim.geometry.mesh import build_mesh
-    from rigsim.subject.expressions import displacement_mm, moves
-    from rigsim.subject.perfusion import STATE_NAMES
-
     own = tuple(name for name in names if name in mesh.shapes)
     unknown = [name for name in names if name not in mesh.shapes and name not in STATE_NAMES]
     if unknown:
@@ -285,8 +286,6 @@ def _noise(
     out: Float32Array | None,
 ) -> Float32Array:
     """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
-    from rigsim.geometry.atlas import dilate_texture, unwrap
-
     finest = NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
     if finest <= MIN_WAVES_PER_MM:
         raise ApplyError(
@@ -330,7 +329,6 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
         return None
-    from rigsim.subject.face_regions import on_mean_head, region_masks
 
     unknown = [name for name in names if name not in SITE_REGIONS]
     if unknown:
@@ -347,12 +345,10 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
 
 
 def _atlas(mesh: BlendShapeMesh) -> Any:
-    from rigsim.geometry.atlas import unwrap
 
     return unwrap(_face(mesh), REGION_ATLAS_PX)
 
 
 def _face(mesh: BlendShapeMesh) -> Any:
-    from rigsim.geometry.mesh import build_mesh
 
     return build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv)

@@ -12,8 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from capture.acquire import run_plan
 from capture.devices.box import Box
-from capture.devices.camera import Camera
+from capture.devices.camera import Camera, open_camera
 from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
@@ -114,8 +115,6 @@ def _run(
     rig: Rig, plan: Plan, out: Path, order: CaptureOrder, console: Console
 ) -> Mapping[str, Any]:
     """Run a plan through the drivers into a session, new or gone on with."""
-    from capture.acquire import run_plan
-
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
         width, _ = next(iter({(c.info.width_px, c.info.height_px) for c in cameras.values()}))
@@ -176,8 +175,6 @@ def _open_devices(
     stack: contextlib.ExitStack, rig: Rig, plan: Plan, order: CaptureOrder, console: Console
 ) -> tuple[dict[str, Box], dict[str, Camera]]:
     """Open the boxes that a plan needs and all cameras; the stack closes them."""
-    from capture.devices.camera import open_camera
-
     boxes: dict[str, Box] = {}
     for kind in needed_boxes(rig, plan):
         opening = partial(open_box, kind, order.boxes[kind])

@@ -8,9 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
+from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
+from skinrig.errors import UsageError
 from skinrig.next_steps import shell_quote
 
 Weights = Annotated[
@@ -286,9 +288,7 @@ def apply_microstructure(
 def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
     """Return the face that a rig is applied to, with its landmarks."""
     from model import store
-    from reconstruction.correspondence import landmark_table
     from skinrig.applying.expression import OtherFace
-    from skinrig.errors import UsageError
 
     if onto is None:
         if landmarks:

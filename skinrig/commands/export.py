@@ -11,6 +11,7 @@ import typer
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console, counted
 from skinrig.errors import UnusableError
+from skinrig.exporting.options import Delivery
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
@@ -92,7 +93,6 @@ def export(
     Example: skinrig export appearance --to gltf --out delivery
     """
     from skinrig.exporting import appearances, brdfs
-    from skinrig.exporting.options import Delivery
     from skinrig.exporting.sessions import handing as sessions
     from skinrig.exporting.sessions import light_lists, stokes
 

@@ -9,9 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from skinrig import errors
+from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
 from skinrig.commands.options import Json
 from skinrig.console import Console
+from skinrig.doctor import examine
 from skinrig.waiting_threads import wait_asleep
 
 BUDGET_S = 600.0
@@ -76,7 +78,6 @@ def bench(
 
         document = run_extremes(stages or (), out=out, console=console)
     else:
-        from skinrig.benchmarks import table as bench_table
         from skinrig.benchmarks.stages import run_stages
 
         document = run_stages(stages, budget_s=budget, toy=toy, out=out, console=console)
@@ -92,8 +93,6 @@ def doctor(json: Json = False) -> None:
 
     Example: skinrig doctor
     """
-    from skinrig.doctor import examine
-
     console = Console(json)
     findings = examine()
     console.rows(

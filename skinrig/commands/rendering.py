@@ -10,6 +10,7 @@ import typer
 from skinrig import errors
 from skinrig.commands.options import Json
 from skinrig.console import Console
+from skinrig.errors import UnusableError, UsageError
 
 Views = Annotated[
     str, typer.Option(help="View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
@@ -112,7 +113,6 @@ def render(
     Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
     picture --components
     """
-    from skinrig.errors import UnusableError, UsageError
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
     from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
@@ -188,7 +188,6 @@ def render(
 
 
 def _ranks(text: str) -> list[int]:
-    from skinrig.errors import UsageError
 
     try:
         found = [int(part) for part in text.split(",")]

@@ -33,6 +33,7 @@ from skinrig.commands.options import (
     target_of,
 )
 from skinrig.console import Console, counted
+from skinrig.next_steps import after_session
 
 if TYPE_CHECKING:
     from skinrig.simulating.orders import Order
@@ -333,7 +334,6 @@ def simulate_probe(
 
 def _simulate(order: Order, console: Console, target: str | None) -> None:
     """Simulate an order, and print what was made and the next step."""
-    from skinrig.next_steps import after_session
     from skinrig.simulating.simulation import simulate
 
     done = simulate(order)

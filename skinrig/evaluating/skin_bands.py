@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import metrics
+from model import metrics, spectra, tissue_optics
 from skinrig.arrays import Float64Array
 
 TYPOLOGY_NAMES: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
@@ -108,7 +108,6 @@ MELANIN_BANDS: Final = {
 
 @cache
 def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
-    from model import spectra, tissue_optics
 
     spectrum = tissue_optics.two_layer_reflectance(
         spectra.WAVELENGTH_NM, np.array([melanin]), np.array([hemoglobin])

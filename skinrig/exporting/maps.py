@@ -19,11 +19,12 @@ from skinrig.exporting.images import (
     ImageFolder,
     png_range,
 )
-from skinrig.exporting.materials import materialx
+from skinrig.exporting.materials import materialx, tangents
+from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
-from skinrig.rendering.geometry import MESH_FILES
+from skinrig.rendering.geometry import MESH_FILES, GeometryError, own_mesh
 
 DOCUMENT_FILE: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
@@ -182,10 +183,6 @@ def _tangent_normals(
     appearance: SkinAppearance, names: list[str], out: ImageFolder, delivery: Delivery
 ) -> tuple[str | None, str]:
     """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
-    from skinrig.exporting.materials import tangents
-    from skinrig.exporting.materials.tangents import FramedMesh
-    from skinrig.rendering.geometry import GeometryError, own_mesh
-
     found = next((n for n in ("normals_refined", "normals") if n in names), None)
     if found is None:
         return None, "neither normals_refined nor normals is among the maps"

@@ -7,6 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from capture import hdr
+from model import dipole, facial_color, tissue_optics
+from model.dipole import kienle_patterson as diffusion
+from model.traits import reduced_spaces
+from reconstruction import normal_integration, polarization
+from reconstruction import photometric_stereo as stereo
+from reconstruction.surface import texture_fill
+from rigsim import render
 from skinrig.extremes.expectations import (
     WHY_INTEGERS,
     WHY_SINGLE_PRECISION,
@@ -34,7 +42,6 @@ def _ring(count: int, tilt_rad: float):  # type: ignore[no-untyped-def]
 
 
 def _no_numbers_in_light(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = _ring(8, 0.6)
     for bad in NON_FINITE_VALUES:
@@ -50,7 +57,6 @@ def _no_numbers_in_light(real: Real) -> str:
 
 
 def _no_numbers_in_normals(real: Real) -> str:
-    from reconstruction import normal_integration
 
     y, x = np.mgrid[0:12, 0:12]
     normals = np.stack([-0.3 + 0.0 * x, 0.1 + 0.0 * y, np.ones((12, 12))], -1)
@@ -66,7 +72,6 @@ def _no_numbers_in_normals(real: Real) -> str:
 
 
 def _no_numbers_in_statistics(real: Real) -> str:
-    from model import facial_color
 
     plain = as_real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)), real)
     told = []
@@ -88,8 +93,6 @@ def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
 
 
 def _no_numbers_in_media(real: Real) -> str:
-    from model import dipole, tissue_optics
-    from model.dipole import kienle_patterson as diffusion
 
     def stack(value: float) -> object:
         return tissue_optics.layer_stack_reflectance(
@@ -109,9 +112,6 @@ def _no_numbers_in_media(real: Real) -> str:
 
 
 def _single_pixels(real: Real) -> str:
-    from model import facial_color
-    from reconstruction import normal_integration, polarization
-    from reconstruction.surface import texture_fill
 
     near(normal_integration.integrate(as_real([[[0.0, 0.6, 0.8]]], real)), [[0.0]])
     one = as_real(np.full((1, 1, 3), 0.5), real)
@@ -124,7 +124,6 @@ def _single_pixels(real: Real) -> str:
 
 
 def _eight_thousand(_: Real) -> str:
-    from capture import hdr
 
     shape = (4320, 7680)
     dn = np.empty((2, *shape), np.uint16)
@@ -144,7 +143,6 @@ def _eight_thousand(_: Real) -> str:
 
 
 def _missed_range(_: Real) -> str:
-    from capture import hdr
 
     # rows: below the noise of all, saturated in all, in all but the shortest, in none
     dn = np.array(
@@ -162,7 +160,6 @@ def _missed_range(_: Real) -> str:
 
 
 def _mirror_and_chalk(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = np.concatenate([_ring(24, 0.6), _ring(12, 0.3)])
     seen = np.zeros((36, 1, 3))
@@ -180,7 +177,6 @@ def _mirror_and_chalk(real: Real) -> str:
 
 
 def _conditions(real: Real) -> str:
-    from model.traits import reduced_spaces
 
     rng = np.random.default_rng(0)
     one = rng.random(20)
@@ -200,7 +196,6 @@ def _conditions(real: Real) -> str:
 
 
 def _light_in_renderer(_: Real) -> str:
-    from rigsim import render
 
     def scene(emitter: dict[str, object]) -> dict[str, object]:
         film = {"type": "hdrfilm", "width": 4, "height": 4}

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from capture import hdr
+from model import fresnel, microstructure, photon_table
+from model.texture_statistics import masks as texture_masks
+from model.tissue_optics import adding_doubling, layered_diffusion
+from reconstruction import photometric_stereo as stereo
 from skinrig.extremes.expectations import (
     Case,
     Real,
@@ -20,7 +25,6 @@ INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
 
 def _far_lights(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     turn = np.arange(8) * (np.pi / 4)
     way = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(8, np.sqrt(0.75))], -1)
@@ -43,8 +47,6 @@ def _far_lights(real: Real) -> str:
 
 
 def _one_photon(real: Real) -> str:
-    from capture import hdr
-    from reconstruction import photometric_stereo as stereo
 
     rng = np.random.default_rng(9)
     turn = np.arange(24) * (np.pi / 12)
@@ -75,7 +77,6 @@ def _one_photon(real: Real) -> str:
 
 
 def _one_turned_triangle(real: Real) -> str:
-    from model import microstructure
 
     u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
     flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
@@ -99,7 +100,6 @@ def _one_turned_triangle(real: Real) -> str:
 
 
 def _profile_beyond_numbers(real: Real) -> str:
-    from model import photon_table
 
     ends = as_real([1e-18, 1e18] if real is np.float32 else [1e-50, 1e50], real)
     slopes = photon_table.derivatives(ends, real(0.02), real(1.0))
@@ -115,7 +115,6 @@ def _profile_beyond_numbers(real: Real) -> str:
 
 
 def _layers_of_no_medium(real: Real) -> str:
-    from model.tissue_optics import adding_doubling, layered_diffusion
 
     told = 0
     for solver in (adding_doubling, layered_diffusion):
@@ -133,7 +132,6 @@ def _layers_of_no_medium(real: Real) -> str:
 
 
 def _nothing_to_continue(real: Real) -> str:
-    from model.texture_statistics import masks as texture_masks
 
     image = as_real(np.full((7, 5, 3), 0.4), real)
     refused(lambda: texture_masks.fill_smoothly(image, np.zeros((7, 5), bool)), ValueError, "valid")
@@ -144,7 +142,6 @@ def _nothing_to_continue(real: Real) -> str:
 
 
 def _index_of_nothing(real: Real) -> str:
-    from model import fresnel
 
     averages = (fresnel.normal_reflectance, fresnel.boundary_factor, fresnel.diffuse_internal)
     for average in averages:

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capture import hdr
+from model import color_table
+from reconstruction import chromophores, polarization
 from skinrig.extremes.expectations import (
     WHY_INTEGERS,
     Case,
@@ -28,7 +31,6 @@ EXPOSURES_S = (1.0, 0.25, 0.0625)
 
 
 def _merged(dn: NDArray[np.integer]) -> tuple[NDArray[Any], ...]:
-    from capture import hdr
 
     radiance, variance, valid = hdr.merge(dn, EXPOSURES_S, **_SENSOR_SETTINGS)
     clean(radiance, valid, what="radiance")
@@ -58,7 +60,6 @@ def _below_black(_: Real) -> str:
 
 
 def _full_scale(_: Real) -> str:
-    from capture import hdr
 
     dn = np.full((1, 2, 2), 65534, np.uint16)
     radiance, _variance, valid = hdr.merge(
@@ -88,7 +89,6 @@ def _one_electron(_: Real) -> str:
 
 
 def _not_polarized(real: Real) -> str:
-    from reconstruction import polarization
 
     same = as_real(np.full((2, 2, 3), 0.3), real)
     found = polarization.separate(same, same)
@@ -96,14 +96,12 @@ def _not_polarized(real: Real) -> str:
 
 
 def _useless_polarizer(real: Real) -> str:
-    from reconstruction import polarization
 
     same = as_real(np.full((2, 2, 3), 0.3), real)
     return refused(lambda: polarization.separate(same, same, extinction=1.0), ValueError, "1")
 
 
 def _not_a_number(real: Real) -> str:
-    from reconstruction import polarization
 
     one, other = (as_real(np.full((2, 2, 3), v), real) for v in (0.5, 0.2))
     one[0, 0] = np.nan
@@ -114,13 +112,11 @@ def _not_a_number(real: Real) -> str:
 
 
 def _table() -> ColorTable:
-    from model import color_table
 
     return color_table.build("Nikon 5100 (NPL)", "D55", size=32)
 
 
 def _black_pixels(real: Real) -> str:
-    from reconstruction import chromophores
 
     found = chromophores.invert(as_real(np.zeros((4, 3)), real), _table())
     clean(found.melanin, found.valid, what="melanin")
@@ -128,7 +124,6 @@ def _black_pixels(real: Real) -> str:
 
 
 def _odd_colors(real: Real) -> str:
-    from reconstruction import chromophores
 
     no_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
     rgb = as_real(np.array(no_skin), real)
@@ -140,7 +135,6 @@ def _odd_colors(real: Real) -> str:
 
 
 def _pigment_corners(real: Real) -> str:
-    from reconstruction import chromophores
 
     table = _table()
     c_m, c_hd = np.array([0.0, 0.0, 0.5, 0.5]), np.array([0.0, 0.32, 0.0, 0.32])
@@ -156,7 +150,6 @@ def _pigment_corners(real: Real) -> str:
 
 
 def _tiny_light(real: Real) -> str:
-    from reconstruction import chromophores
 
     table = _table()
     rgb = table.lookup(np.array([0.03]), np.array([0.05]))
@@ -166,7 +159,6 @@ def _tiny_light(real: Real) -> str:
 
 
 def _no_pixel(real: Real) -> str:
-    from reconstruction import chromophores
 
     found = chromophores.invert(as_real(np.zeros((0, 3)), real), _table())
     if found.melanin.shape != (0,):

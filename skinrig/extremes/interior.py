@@ -6,6 +6,8 @@ import itertools
 
 import numpy as np
 
+from model.dipole.gather import GatherError, exitance
+from model.dipole.maps import DipoleMaps
 from skinrig.extremes.expectations import (
     Case,
     Real,
@@ -30,7 +32,6 @@ def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignor
 
 
 def _even(real: Real) -> str:
-    from model.dipole.gather import exitance
 
     place, area = _patch(real)
     light = as_real(np.full((len(area), 3), 3.0), real)
@@ -44,7 +45,6 @@ def _even(real: Real) -> str:
 
 
 def _coarse(real: Real) -> str:
-    from model.dipole.gather import exitance
 
     place, area = _patch(real, step_mm=5.0)
     light = as_real(1.0 + np.sin(place.astype(np.float64)), real)
@@ -53,8 +53,6 @@ def _coarse(real: Real) -> str:
 
 
 def _above_one(real: Real) -> str:
-    from model.dipole.gather import exitance
-    from model.dipole.maps import DipoleMaps
 
     found = DipoleMaps.of(as_real([[[1.2, 1.0, 0.5]]], real), as_real(2.0, real), eta=1.4)
     if found.outlier.tolist() != [[[True, False, False]]]:
@@ -66,7 +64,6 @@ def _above_one(real: Real) -> str:
 
 
 def _inverse(real: Real) -> str:
-    from model.dipole.maps import DipoleMaps
 
     lost = np.geomspace(1e-9 if real is np.float64 else 1e-6, 0.999999, 60)
     found = DipoleMaps.of((1.0 - as_real(lost, real))[:, None], [1.0], eta=1.4)
@@ -75,7 +72,6 @@ def _inverse(real: Real) -> str:
 
 
 def _single(real: Real) -> str:
-    from model.dipole.gather import exitance
 
     one = as_real([[1.0, 2.0, 3.0]], real)
     return near(
@@ -84,8 +80,6 @@ def _single(real: Real) -> str:
 
 
 def _empty(real: Real) -> str:
-    from model.dipole.gather import exitance
-    from model.dipole.maps import DipoleMaps
 
     shape = (2, 2, 3)
     found = DipoleMaps.of(
@@ -100,7 +94,6 @@ def _empty(real: Real) -> str:
 
 
 def _folded(real: Real) -> str:
-    from model.dipole.gather import exitance
 
     place, area = _patch(real)
     both = np.concatenate([place, place + as_real([0.0, 0.0, 1e-3], real)])
@@ -111,7 +104,6 @@ def _folded(real: Real) -> str:
 
 
 def _opaque(real: Real) -> str:
-    from model.dipole.gather import GatherError, exitance
 
     place, area = _patch(real)
     light = as_real(np.ones((len(area), 3)), real)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from model import facial_color, microstructure, wrinkles
+from model.facial_color import FacialColorError, HemoglobinRig
 from skinrig.extremes.expectations import Case, Real, as_real, clean, masked, near, refused, within
 
 
 def _near_constant(real: Real) -> str:
-    from model import facial_color
 
     rng = np.random.default_rng(0)
     h = as_real(1.0 + 1e-6 * rng.standard_normal((64, 64)), real)
@@ -21,14 +22,12 @@ def _near_constant(real: Real) -> str:
 
 
 def _constant(real: Real) -> str:
-    from model import facial_color
 
     _, deviation = facial_color.local_statistics(as_real(np.full((16, 16), 0.1), real), 5.0)
     return within(deviation, 0.0, 1e-7, what="deviation")
 
 
 def _flat_neutral(real: Real) -> str:
-    from model.facial_color import HemoglobinRig
 
     neutral = as_real(np.full((64, 64), 0.05), real)
     smile = as_real(0.05 + 0.01 * np.random.default_rng(1).random((64, 64)), real)
@@ -39,7 +38,6 @@ def _flat_neutral(real: Real) -> str:
 
 
 def _weights_do_not_sum(real: Real) -> str:
-    from model.facial_color import FacialColorError, HemoglobinRig
 
     h = as_real(0.05 + 0.01 * np.random.default_rng(1).random((32, 32)), real)
     rig = HemoglobinRig.from_maps(h, {"smile": 1.2 * h}, radius_px=4.0)
@@ -47,7 +45,6 @@ def _weights_do_not_sum(real: Real) -> str:
 
 
 def _disc_beyond_map(real: Real) -> str:
-    from model import facial_color
 
     h = as_real(np.random.default_rng(2).random((8, 8)), real)
     mean, deviation = facial_color.local_statistics(h, 1000.0)
@@ -56,7 +53,6 @@ def _disc_beyond_map(real: Real) -> str:
 
 
 def _horizon_normals(real: Real) -> str:
-    from model import wrinkles
 
     normals = as_real([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]], real)
     report = wrinkles.encoding_report(normals)
@@ -67,7 +63,6 @@ def _horizon_normals(real: Real) -> str:
 
 
 def _wrinkle_sum(real: Real) -> str:
-    from model import wrinkles
 
     outward = np.array([0.0, 0.0, 1.0])
     base = wrinkles.encode(as_real(np.zeros((4, 4, 3)) + outward, real))
@@ -83,7 +78,6 @@ def _wrinkle_sum(real: Real) -> str:
 
 
 def _strain_of(deform, real: Real):  # type: ignore[no-untyped-def]
-    from model import microstructure
 
     u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
     flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
@@ -122,7 +116,6 @@ def _turned_over(real: Real) -> str:
 
 
 def _no_area(real: Real) -> str:
-    from model import microstructure
 
     points = as_real([[0, 0, 0], [1, 0, 0], [2, 0, 0]], real)
     uv = as_real([[0, 0], [1, 0], [0, 1]], real)
@@ -132,7 +125,6 @@ def _no_area(real: Real) -> str:
 
 
 def _sharpened_again(real: Real) -> str:
-    from model import microstructure
 
     height = as_real(np.random.default_rng(4).standard_normal((48, 48)), real)
     axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -144,7 +136,6 @@ def _sharpened_again(real: Real) -> str:
 
 
 def _vanishing_kernel(real: Real) -> str:
-    from model import microstructure
 
     height = as_real(np.random.default_rng(4).standard_normal((32, 32)), real)
     axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -153,7 +144,6 @@ def _vanishing_kernel(real: Real) -> str:
 
 
 def _table_ends(real: Real) -> str:
-    from model import microstructure
 
     alpha, sigma = microstructure.kernel_parameters(as_real([0.01, 0.5, 1.0, 2.0, 50.0], real))
     within(alpha, -2.0, 1.0, what="alpha")

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from model import tissue_optics
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.extremes.expectations import Case, Real, Unexpected, as_real, near, within
 
 STAGE_NAME = "Monte Carlo"
@@ -15,8 +17,6 @@ Matter = tuple[float, float, float, float]
 
 def _walked(real: Real, *layers: Matter, eta: float = 1.4, photons: int = 40_000):  # type: ignore[no-untyped-def]
     """Return what becomes of photons in layers."""
-    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
-
     made = []
     for one in layers:
         depth, absorption, scattering, g = (float(real(value)) for value in one)
@@ -29,8 +29,6 @@ def _walked(real: Real, *layers: Matter, eta: float = 1.4, photons: int = 40_000
 
 def _z_of_layers(real: Real, *layers: Matter, eta: float = 1.4) -> str:
     """Return how far the walks are from the doubled layers, in standard errors."""
-    from model import tissue_optics
-
     depth, absorption, scattering, g = np.array(layers, np.float64).T
     if np.any(g != 0.0):
         raise ValueError("g: expected 0, for which sigma_s' is sigma_s")

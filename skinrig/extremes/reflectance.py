@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from model import dipole, merl
+from model.brdf import tables as brdf_tables
+from reconstruction import brdf_basis
 from skinrig.extremes.expectations import Case, Real, as_real, masked, near, refused, rising, within
 
 
 def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]
     """Return surface samples of `value`, called with light and view, at random directions."""
-    from reconstruction import brdf_basis
-
     rng = np.random.default_rng(9)
     ways = rng.normal(size=(2, points, count, 3))
     ways[..., 2] = np.abs(ways[..., 2]) + 0.4
@@ -24,8 +25,6 @@ def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: i
 
 
 def _dark_surface(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
-    from reconstruction import brdf_basis
 
     found = brdf_basis.fit_weights(
         _samples(lambda light, view: np.zeros(light.shape[:-1]), real), brdf_tables.default()
@@ -34,8 +33,6 @@ def _dark_surface(real: Real) -> str:
 
 
 def _negative_surface(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
-    from reconstruction import brdf_basis
 
     found = brdf_basis.fit_weights(
         _samples(lambda light, view: np.full(light.shape[:-1], -0.01), real), brdf_tables.default()
@@ -44,8 +41,6 @@ def _negative_surface(real: Real) -> str:
 
 
 def _twins(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
-    from reconstruction import brdf_basis
 
     basis = brdf_tables.default()
     one = basis.mixed(np.eye(basis.size)[[20]])
@@ -61,8 +56,6 @@ def _twins(real: Real) -> str:
 
 
 def _ill_conditioned(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
-    from reconstruction import brdf_basis
 
     basis = brdf_tables.default()
 
@@ -81,8 +74,6 @@ def _ill_conditioned(real: Real) -> str:
 
 
 def _no_samples(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
-    from reconstruction import brdf_basis
 
     samples = _samples(lambda light, view: np.full(light.shape[:-1], np.nan), real)
     found = brdf_basis.fit_weights(samples, brdf_tables.default())
@@ -91,14 +82,12 @@ def _no_samples(real: Real) -> str:
 
 
 def _rank_above_data(real: Real) -> str:
-    from reconstruction import brdf_basis
 
     weights = as_real(np.random.default_rng(1).random((3, 59)), real)
     return refused(lambda: brdf_basis.reduce(weights, 10), ValueError, "rank")
 
 
 def _zero_rows(real: Real) -> str:
-    from reconstruction import brdf_basis
 
     weights = np.random.default_rng(1).random((40, 12))
     weights[:20] = 0.0
@@ -108,7 +97,6 @@ def _zero_rows(real: Real) -> str:
 
 
 def _duplicated_rows(real: Real) -> str:
-    from reconstruction import brdf_basis
 
     one = np.random.default_rng(1).random(12)
     _, _, error = brdf_basis.reduce(as_real(np.tile(one, (30, 1)), real), 3)
@@ -116,7 +104,6 @@ def _duplicated_rows(real: Real) -> str:
 
 
 def _merl_bins(real: Real) -> str:
-    from model import merl
 
     half = real(0.5) * real(np.pi)
     first, last = merl.bins(real(0.0), real(0.0), real(0.0)), merl.bins(half, half, real(np.pi))
@@ -126,7 +113,6 @@ def _merl_bins(real: Real) -> str:
 
 
 def _conditions(real: Real) -> str:
-    from model import dipole
 
     # sigma_t' = sigma_tr / sqrt(3 (1 - alpha')): sixteen decades of 1 - alpha'
     deficit = as_real(np.logspace(-15, 0, 16), real)
@@ -137,7 +123,6 @@ def _conditions(real: Real) -> str:
 
 
 def _mirror_like(real: Real) -> str:
-    from model.brdf import tables as brdf_tables
 
     basis = brdf_tables.default(0.0)
     up = as_real([0.0, 0.0, 1.0], real)

@@ -9,6 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capture.rig import load_rig
+from model.brdf import microfacet
+from rigsim import render, sensor
+from rigsim.geometry.mesh import MeshError, build_mesh, vertex_normals
+from rigsim.light import surface_brdf
+from rigsim.render import Caster, visibility
+from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
     WHY_SINGLE_PRECISION,
@@ -27,8 +33,6 @@ if TYPE_CHECKING:
 
 def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float = 1.0):  # type: ignore[no-untyped-def]
     """Return a square sheet facing +z as a mesh of the rig frame."""
-    from rigsim.geometry.mesh import build_mesh
-
     across = (np.arange(side) - (side - 1) / 2) * pitch_mm
     x, y = np.meshgrid(across, across)
     points = np.stack([x, y, height_mm(x, y)], -1).reshape(-1, 3) + np.asarray(offset_mm)
@@ -45,7 +49,6 @@ def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float
 
 
 def _seen(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
-    from rigsim.render import Caster, visibility
 
     return visibility(
         Caster(mesh), mesh.vertices_mm, mesh.normals, np.asarray(light_mm, np.float64)
@@ -104,7 +107,6 @@ def _light_behind(_: Real) -> str:
 
 
 def _zero_triangles(real: Real) -> str:
-    from rigsim.geometry.mesh import build_mesh, vertex_normals
 
     points = as_real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]), real)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
@@ -115,7 +117,6 @@ def _zero_triangles(real: Real) -> str:
 
 
 def _wrong_unit(real: Real) -> str:
-    from rigsim.geometry.mesh import MeshError, build_mesh
 
     points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
     return refused(
@@ -126,7 +127,6 @@ def _wrong_unit(real: Real) -> str:
 
 
 def _surface(direction: Float64Array, roughness: float, real: Real) -> tuple[float, float]:
-    from rigsim.light import surface_brdf
 
     packed = as_real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0], real)
     up = np.array([0.0, 0.0, 1.0])
@@ -140,7 +140,6 @@ def _tilted(degrees: float) -> Float64Array:
 
 
 def _grazing(real: Real) -> str:
-    from model.brdf import microfacet
 
     values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
     cosine = math.cos(math.radians(89.9))
@@ -160,7 +159,6 @@ def _grazing(real: Real) -> str:
 
 
 def _roughness_ends(real: Real) -> str:
-    from model.brdf import microfacet
 
     sharp = microfacet.brdf(
         real(1.0), real(1.0), real(1.0), real(1.0), roughness=0.01, eta=1.4, kind="ggx"
@@ -177,7 +175,6 @@ def _roughness_ends(real: Real) -> str:
 
 
 def _furnace(real: Real) -> str:
-    from rigsim.light import surface_brdf
 
     rng = np.random.default_rng(7)
     count = 200_000
@@ -194,13 +191,11 @@ def _furnace(real: Real) -> str:
 
 
 def _chip() -> Sensor:
-    from rigsim.sensor import sensor_of
 
     return sensor_of(load_rig("flash").views[0])
 
 
 def _bad_light(real: Real) -> str:
-    from rigsim import sensor
 
     def exposed(value: float) -> object:
         light = as_real(np.full((2, 2, 3), value), real)
@@ -212,7 +207,6 @@ def _bad_light(real: Real) -> str:
 
 
 def _very_bright(real: Real) -> str:
-    from rigsim import sensor
 
     chip = _chip()
     dn = sensor.expose(
@@ -222,7 +216,6 @@ def _very_bright(real: Real) -> str:
 
 
 def _negative_environment(_: Real) -> str:
-    from rigsim import render
 
     scene = {
         "type": "scene",

@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from model.metrics import angular_error_rad
+from reconstruction import diffuse_albedo, kernel_fit, normal_histogram, normal_integration
+from reconstruction import photometric_stereo as stereo
+from reconstruction.surface import texture_fill
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
     Case,
@@ -32,7 +36,6 @@ def _ring(count: int, tilt_rad: float) -> Float64Array:
 
 
 def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
-    from model.metrics import angular_error_rad
 
     return float(np.degrees(np.max(angular_error_rad(normals, truth))))
 
@@ -42,7 +45,6 @@ def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]
 
 
 def _coplanar(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return refused(
@@ -54,7 +56,6 @@ def _coplanar(real: Real) -> str:
 
 
 def _collinear(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = np.repeat(UP_NORMAL[None], 5, axis=0)
     return refused(
@@ -66,7 +67,6 @@ def _collinear(real: Real) -> str:
 
 
 def _all_shadowed(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = _ring(8, 0.6)
     found = stereo.estimate_normals(as_real(np.zeros((8, 3, 3)), real), lights)
@@ -75,7 +75,6 @@ def _all_shadowed(real: Real) -> str:
 
 
 def _two_lights_left(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = _ring(8, 0.6)
     seen = np.zeros((8, 1, 1), bool)
@@ -85,7 +84,6 @@ def _two_lights_left(real: Real) -> str:
 
 
 def _nearly_coplanar(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = np.array(
         [
@@ -113,7 +111,6 @@ def _nearly_coplanar(real: Real) -> str:
 
 
 def _grazing(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = _ring(12, np.radians(89.9))
     found = stereo.estimate_normals(
@@ -127,7 +124,6 @@ def _grazing(real: Real) -> str:
 
 
 def _near_light(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     places = 1.0 * _ring(8, 0.6)  # a millimetre from the skin
     away = np.linalg.norm(places, axis=-1)
@@ -143,7 +139,6 @@ def _near_light(real: Real) -> str:
 
 
 def _far_light(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     places = 1e7 * _ring(8, 0.6)
     lit = np.clip(_ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
@@ -159,7 +154,6 @@ def _far_light(real: Real) -> str:
 
 
 def _scales(real: Real) -> str:
-    from reconstruction import photometric_stereo as stereo
 
     lights = _ring(8, 0.6)
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
@@ -172,7 +166,6 @@ def _scales(real: Real) -> str:
 
 
 def _cliff(real: Real) -> str:
-    from reconstruction import normal_integration
 
     slope = np.zeros((24, 24))
     slope[:, 12] = 20.0  # a wall of 87 degrees
@@ -185,7 +178,6 @@ def _cliff(real: Real) -> str:
 
 
 def _horizontal_normals(real: Real) -> str:
-    from reconstruction import normal_integration
 
     normals = np.zeros((8, 8, 3))
     normals[..., 2] = 1.0
@@ -198,7 +190,6 @@ def _horizontal_normals(real: Real) -> str:
 
 
 def _islands(real: Real) -> str:
-    from reconstruction import normal_integration
 
     normals = np.zeros((16, 16, 3))
     normals[..., 2] = 1.0
@@ -209,7 +200,6 @@ def _islands(real: Real) -> str:
 
 
 def _empty_mask(real: Real) -> str:
-    from reconstruction import normal_integration
 
     normals = np.zeros((4, 4, 3))
     normals[..., 2] = 1.0
@@ -221,7 +211,6 @@ def _empty_mask(real: Real) -> str:
 
 
 def _flat_height(real: Real) -> str:
-    from reconstruction import normal_histogram
 
     shares = normal_histogram.histogram(as_real(np.zeros((64, 64)), real), pixel=10.0)
     near(shares.sum(), 1.0, absolute=1e-9)
@@ -229,7 +218,6 @@ def _flat_height(real: Real) -> str:
 
 
 def _steep_height(real: Real) -> str:
-    from reconstruction import normal_histogram
 
     rows = np.arange(64.0)[:, None] * np.ones((1, 64))
     shares = normal_histogram.histogram(as_real(1e6 * rows, real), pixel=1.0)
@@ -239,7 +227,6 @@ def _steep_height(real: Real) -> str:
 
 
 def _one_point(real: Real) -> str:
-    from reconstruction import normal_histogram
 
     return refused(
         lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0), ValueError
@@ -247,7 +234,6 @@ def _one_point(real: Real) -> str:
 
 
 def _relief_without_relief(real: Real) -> str:
-    from reconstruction import kernel_fit, normal_histogram
 
     flat = as_real(np.zeros((64, 64)), real)
     target = normal_histogram.histogram(flat, pixel=10.0)
@@ -259,7 +245,6 @@ def _relief_without_relief(real: Real) -> str:
 
 
 def _no_diffuse(real: Real) -> str:
-    from reconstruction import diffuse_albedo
 
     lights = np.vstack([_ring(20, 0.5), _ring(20, 0.9)])
     views = np.broadcast_to(UP_NORMAL, lights.shape)
@@ -276,7 +261,6 @@ def _no_diffuse(real: Real) -> str:
 
 
 def _nothing_to_fill(real: Real) -> str:
-    from reconstruction.surface import texture_fill
 
     empty = texture_fill.push_pull(as_real(np.zeros((9, 7, 3)), real), np.zeros((9, 7)))
     one = np.zeros((9, 7))

@@ -6,6 +6,10 @@ import math
 
 import numpy as np
 
+from model import dipole, photon_table, tissue_optics
+from model.dipole import kienle_patterson as diffusion
+from reconstruction import subsurface
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.extremes.expectations import (
     Case,
     Real,
@@ -21,7 +25,6 @@ from skinrig.extremes.expectations import (
 
 
 def _albedo_near_one(real: Real) -> str:
-    from model import dipole
 
     deficit = np.logspace(-15, -1, 57)
     lost = dipole.absorbed_fraction(as_real(deficit, real), 1.4)
@@ -42,14 +45,12 @@ def _least_step(real: Real) -> float:
 
 
 def _reflectance_ends(real: Real) -> str:
-    from model import dipole
 
     r_d = np.concatenate([np.logspace(-6, -1, 21), 1.0 - np.logspace(-1.2, _least_step(real), 21)])
     return rising(-dipole.invert_to_deficit(as_real(r_d, real), 1.4), what="alpha' - 1")
 
 
 def _all_light_back(real: Real) -> str:
-    from model import dipole
 
     return near(
         [dipole.total_reflectance(real(1.0), eta) for eta in (1.0, 1.3, 1.4, 1.6)],
@@ -59,7 +60,6 @@ def _all_light_back(real: Real) -> str:
 
 
 def _more_than_all(real: Real) -> str:
-    from model import dipole
 
     return refused(
         lambda: dipole.invert_total_reflectance(real(1.02), 1.4),
@@ -69,7 +69,6 @@ def _more_than_all(real: Real) -> str:
 
 
 def _no_absorption(real: Real) -> str:
-    from model import dipole
 
     r = as_real([0.1, 1.0, 10.0], real)
     clear = dipole.reflectance(r, real(0.0), real(1.0), 1.4)
@@ -78,7 +77,6 @@ def _no_absorption(real: Real) -> str:
 
 
 def _black_medium(real: Real) -> str:
-    from model import dipole, tissue_optics
 
     inside = tissue_optics.layer_stack_reflectance(
         as_real([1e3], real), as_real([1.0], real), as_real([math.inf], real)
@@ -95,8 +93,6 @@ def _black_medium(real: Real) -> str:
 
 
 def _radius_ends(real: Real) -> str:
-    from model import dipole
-    from model.dipole import kienle_patterson as diffusion
 
     r = as_real([0.0, 1e-9, 1e-3, 1e2, 1e4], real)
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
@@ -114,7 +110,6 @@ def _radius_ends(real: Real) -> str:
 
 
 def _index_ends(real: Real) -> str:
-    from model import tissue_optics
 
     found = [
         float(
@@ -130,7 +125,6 @@ def _index_ends(real: Real) -> str:
 
 
 def _index_not_physical(real: Real) -> str:
-    from model import tissue_optics
 
     eta = float(real(0.9))
     return refused(
@@ -141,7 +135,6 @@ def _index_not_physical(real: Real) -> str:
 
 
 def _thin_layer(real: Real) -> str:
-    from model import tissue_optics
 
     bare = tissue_optics.layer_stack_reflectance(
         as_real([0.02], real), as_real([1.5], real), as_real([math.inf], real)
@@ -153,7 +146,6 @@ def _thin_layer(real: Real) -> str:
 
 
 def _no_layer_at_all(real: Real) -> str:
-    from model import tissue_optics
 
     clear = tissue_optics.layer_stack_reflectance(
         as_real([0.0], real), as_real([0.0], real), as_real([1.0], real)
@@ -164,7 +156,6 @@ def _no_layer_at_all(real: Real) -> str:
 
 
 def _stiff_layers(real: Real) -> str:
-    from model import tissue_optics
 
     fine = tissue_optics.layer_stack_reflectance(
         as_real([60.0, 0.05], real),
@@ -182,7 +173,6 @@ def _stiff_layers(real: Real) -> str:
 
 
 def _conserving_layers(real: Real) -> str:
-    from model import tissue_optics
 
     white = tissue_optics.layer_stack_reflectance(
         as_real([0.0, 0.0], real), as_real([5.0, 1.0], real), as_real([0.25, math.inf], real)
@@ -192,7 +182,6 @@ def _conserving_layers(real: Real) -> str:
 
 
 def _pigment_ends(real: Real) -> str:
-    from model import tissue_optics
 
     wavelength = as_real([400.0, 500.0, 600.0, 700.0], real)
     c_m, c_hd = as_real([0.0, 0.5], real)[:, None, None], as_real([0.0, 0.32], real)[:, None]
@@ -203,7 +192,6 @@ def _pigment_ends(real: Real) -> str:
 
 
 def _pigment_beyond(real: Real) -> str:
-    from model import tissue_optics
 
     return refused(
         lambda: tissue_optics.two_layer_reflectance(real(500.0), real(-0.01), real(0.05)),
@@ -213,7 +201,6 @@ def _pigment_beyond(real: Real) -> str:
 
 
 def _table_far(real: Real) -> str:
-    from model import photon_table
 
     refused(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
     r = as_real([1e-4, 0.5, 20.0, 1e3], real)
@@ -223,7 +210,6 @@ def _table_far(real: Real) -> str:
 
 
 def _profile_flat(real: Real) -> str:
-    from reconstruction import subsurface
 
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(r, as_real(np.full((1, 28), 1e-3), real))
@@ -232,7 +218,6 @@ def _profile_flat(real: Real) -> str:
 
 
 def _profile_dark(real: Real) -> str:
-    from reconstruction import subsurface
 
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(
@@ -243,8 +228,6 @@ def _profile_dark(real: Real) -> str:
 
 
 def _profile_broken(real: Real) -> str:
-    from model import photon_table
-    from reconstruction import subsurface
 
     r = np.linspace(1.0, 15.0, 28)
     truth = photon_table.reflectance(r, 0.08, 1.2)
@@ -257,7 +240,6 @@ def _profile_broken(real: Real) -> str:
 
 
 def _one_photon(real: Real) -> str:
-    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
     found = transport(stack, photons=1, rng=np.random.default_rng(0))

@@ -18,13 +18,18 @@ from capture.plan import Plan
 from capture.plan.dome import EXPOSURES_S, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig
+from model import store
 from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Prediction
+from reconstruction.pipeline import recipes as pipeline
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from skinrig.arrays import Float64Array
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import surface as surface_evaluation
 from skinrig.planning.dome_observation import LIGHT_ERROR, Observation, simulate_observation
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
+from skinrig.simulating.simulation import simulate_session
 
 VALID_SHARE = 0.9
 """Of the points that the whole dome gives an estimate, so many must keep one."""
@@ -155,12 +160,6 @@ def confirm(
     choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Simulate the dome of a choice and its calibration, reconstruct, compare with the truth."""
-    from model import store
-    from reconstruction.pipeline import recipes as pipeline
-    from skinrig.calibrating.calibrate import calibrate
-    from skinrig.evaluating import surface as surface_evaluation
-    from skinrig.simulating.simulation import simulate_session
-
     width = choice.rig.views[0].width_px
     sessions = {name: out / f"session-{name}" for name in ("charuco", "mirror", "white")}
     for target, session in sessions.items():

@@ -16,6 +16,12 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Information
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
+from rigsim.light.lateral import scatter_laterally
+from rigsim.light.led_light import white_intensity
+from rigsim.light.surface_brdf import skin_surface
+from rigsim.population import files as subject_file
+from rigsim.render import OFFSET_MM, Caster
+from rigsim.sensor import sensor_of
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 FACE_POINTS = 1500
@@ -88,12 +94,6 @@ def simulate_observation(
     points
         How many to look at; `FACE_POINTS` by default.
     """
-    from rigsim.light.led_light import white_intensity
-    from rigsim.light.surface_brdf import skin_surface
-    from rigsim.population import files as subject_file
-    from rigsim.render import OFFSET_MM, Caster
-    from rigsim.sensor import sensor_of
-
     points = FACE_POINTS if points is None else points
     face = subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_TEXELS)
     texels = np.flatnonzero(face.atlas.covered & (face.hair < 0.5))
@@ -178,8 +178,6 @@ def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: flo
 
 def _averaged(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
     """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
-    from rigsim.light.lateral import scatter_laterally
-
     covered = atlas.covered[..., None]
     field = np.where(covered, r_d, 0.0).astype(np.float32)
     spread = scatter_laterally(field, atlas, [sigma_mm], np.ones((field.shape[-1], 1)))

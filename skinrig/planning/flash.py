@@ -16,9 +16,13 @@ import numpy as np
 
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
+from model import store
 from reconstruction.chromophores.detectability import detectable
+from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import flash
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
@@ -27,6 +31,7 @@ from skinrig.planning.flash_observation import (
     simulate_observation,
 )
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
+from skinrig.simulating.simulation import simulate_session
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
 """Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
@@ -194,12 +199,6 @@ def confirm(
     choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Simulate a face under a choice, and the calibration, reconstruct, compare with the truth."""
-    from model import store
-    from reconstruction.pipeline import recipes as pipeline
-    from skinrig.calibrating.calibrate import calibrate
-    from skinrig.evaluating import flash
-    from skinrig.simulating.simulation import simulate_session
-
     width = min(choice.rig.views[0].width_px, CONFIRM_PX)
     calibration = out / "calibration"
     for kind, target in (("sensor", "flat"), ("white", "white"), ("polarization", "malus")):

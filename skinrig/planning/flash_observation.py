@@ -7,9 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from capture import raw
 from capture.rig import Rig
+from model import color_table
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import shading_prior
+from rigsim.population import files as subject_file
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.sensor import sensor_of, vignetting_map
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.simulating.flash_truth import to_superpixels
 
 CHROMOPHORE_NAMES = ("melanin", "hemoglobin")
 TEXTURE_TEXELS = 512
@@ -64,13 +71,6 @@ def simulate_observation(
     width_px
         Pixels across; fewer see the same face with the same noise a pixel.
     """
-    from model import color_table
-    from model.tissue_optics.layers import ANISOTROPY_SKIN
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.flash.scene import FlashScene
-    from rigsim.sensor import sensor_of, vignetting_map
-    from skinrig.simulating.flash_truth import to_superpixels
-
     small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
     view = small.views[0]
     scene = FlashScene(
@@ -121,8 +121,6 @@ def light_spread() -> float:
 
 def _shares(pattern: str) -> Float64Array:
     """Return the variance of superpixels over that of the sensor's pixels, by channel, (3,)."""
-    from capture import raw
-
     frame = raw.RawFrame(
         cfa=np.full((8, 8), 500, np.uint16), pattern=pattern, black=(0.0,) * 4, white=1000
     )

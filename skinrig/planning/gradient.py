@@ -20,9 +20,17 @@ from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
+from model import metrics, store
+from reconstruction.gradient_normals import estimate_roughness, from_patterns
+from reconstruction.gradient_normals.patterns import MissingPatterns, require
+from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 from skinrig.arrays import Float32Array
+from skinrig.calibrating.calibrate import calibrate
 from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
+from skinrig.simulating.simulation import simulate_session
 
 PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
@@ -75,10 +83,6 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
     setting
         Patterns, exposure and darks.
     """
-    from reconstruction.gradient_normals import estimate_roughness, from_patterns
-    from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
-    from reconstruction.pipeline.gradient.stages import SMOOTH_PX
-
     rng = np.random.default_rng([observation.seed, 23])
     gain, floor = observation.chip.noise_profile(setting.exposure_s)
     values: dict[Key, Float32Array] = {}
@@ -179,11 +183,6 @@ def confirm(
     choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Simulate the neutral skin under a choice, and the calibration, reconstruct, compare."""
-    from model import metrics, store
-    from reconstruction.pipeline import recipes as pipeline
-    from skinrig.calibrating.calibrate import calibrate
-    from skinrig.simulating.simulation import simulate_session
-
     width = min(choice.rig.views[0].width_px, 128)
     calibration = out / "calibration"
     progress("simulate flat and ball")
@@ -277,8 +276,6 @@ def setting_of(plan: Plan) -> Setting:
     PlanningError
         Where its pictures do not tell light and three gradients, in both polarizations.
     """
-    from reconstruction.gradient_normals.patterns import MissingPatterns, require
-
     shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
     if not neutral:

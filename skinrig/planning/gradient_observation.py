@@ -10,8 +10,13 @@ import numpy as np
 
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
+from model.metrics import angular_error_rad
+from rigsim.as_built.sphere import nominal_sphere
+from rigsim.population import files as subject_file
+from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.scenes.gradient.truth import appearance as ground_truth
 from skinrig.arrays import Float32Array, Float64Array
+from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
 
 Key = tuple[str, str]
 
@@ -52,12 +57,6 @@ def simulate_observation(
     side_px
         Pixels across.
     """
-    from model.metrics import angular_error_rad
-    from rigsim.as_built.sphere import nominal_sphere
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.gradient.scene import GradientScene
-    from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
-
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
     size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
     skin = subject_file.load_subject(subject).patch("forehead", seed=seed, size_mm=size_mm)

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
+from skinrig.capturing.plan_choice import read_plan
 from skinrig.errors import UsageError
 from skinrig.written_units import written
 
@@ -237,8 +238,6 @@ def choose(
     if most_lights is not None and rig_name != "dome":
         raise OptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
-        from skinrig.capturing.plan_choice import read_plan
-
         plan = read_plan(forecast)
         if plan.rig != rig.name:
             raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")

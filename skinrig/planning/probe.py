@@ -18,6 +18,11 @@ from capture.plan import Plan, PlanError
 from capture.plan.probe import MAX_EXPOSURE_S, N_BRACKETS, exposure_series_s, probe_plan
 from capture.plan.suction import placement_of
 from capture.rig import Rig
+from model import store
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import subsurface
 from skinrig.planning.plans import (
     PERCENT_BY_SITE,
     Choice,
@@ -28,6 +33,7 @@ from skinrig.planning.plans import (
 )
 from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
 from skinrig.planning.probe_observation import Observation, simulate_observation
+from skinrig.simulating.simulation import simulate_session
 
 __all__ = [
     "Memory",
@@ -140,13 +146,6 @@ def confirm(
     choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Simulate the skin of a choice and the phantom, reconstruct, compare with the truth."""
-    from model import store
-    from reconstruction.pipeline import recipes as pipeline
-    from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
-    from skinrig.calibrating.calibrate import calibrate
-    from skinrig.evaluating import subsurface
-    from skinrig.simulating.simulation import simulate_session
-
     progress("simulate phantom")
     simulate_session("probe", out / "session-phantom", target="phantom", seed=seed)
     calibrate("fibre", [out / "session-phantom"], out / "calibration")

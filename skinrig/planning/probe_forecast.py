@@ -14,8 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from capture.calibration.fiber.crosstalk import CrossTalk
+from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.probe import exposure_series_s
 from capture.plan.suction import Placement
+from reconstruction.pipeline.probe.images import Measurement
+from reconstruction.pipeline.probe.profile_fits import Profile, fit_profiles
+from reconstruction.subsurface import translucency
+from reconstruction.subsurface.probe_sites import SITE_UV
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.planning.plans import median_of_normals
 from skinrig.planning.probe_observation import Observation, reading_variance
@@ -189,10 +195,6 @@ def _fitted(
     noise: bool,
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
-    from capture.calibration.fiber.probe_calibration import FiberReflectance
-    from reconstruction.pipeline.probe.images import Measurement
-    from reconstruction.pipeline.probe.profile_fits import Profile, fit_profiles
-
     names = tuple(fibre.name for fibre in observation.probe.fibres)
     radius = np.array(observation.probe.radius_mm)
     # gains are known from a series of all exposures on the phantom, as far as its light is known
@@ -230,8 +232,6 @@ def _crosstalk(count: int) -> Any:
     on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
     the two are alike.
     """
-    from capture.calibration.fiber.crosstalk import CrossTalk
-
     place = np.arange(count)
     apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
     nothing = np.zeros((count, 3))
@@ -243,9 +243,6 @@ def _between(
     observation: Observation, found: Float64Array, sigma: Float64Array, good: BoolArray
 ) -> Float64Array:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
-    from reconstruction.subsurface import translucency
-    from reconstruction.subsurface.probe_sites import SITE_UV
-
     known = [k for k, site in enumerate(observation.sites) if site in SITE_UV]
     measured = [k for k in known if good[k].any()]
     out = np.full(found.shape, np.inf)

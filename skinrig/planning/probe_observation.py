@@ -11,8 +11,16 @@ import numpy as np
 
 from capture.plan.probe import PROBE_SITES
 from capture.rig import Rig
+from model import spectra
+from rigsim.as_built.probe import SPOT_RADIUS_PX
+from rigsim.fiber.probe_profile import Profiles
+from rigsim.population import files as subject_file
+from rigsim.scenes.probe.scene import DARK_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
+from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
+from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 from skinrig.planning.plans import PlanningError
+from skinrig.simulating.probe import TRUTH_PHOTONS
 
 MAX_READ_FRACTION = 0.95
 """Of the full scale: what is above it is not read."""
@@ -55,14 +63,6 @@ def simulate_observation(
     sites
         Where the head may be placed.
     """
-    from rigsim.as_built.probe import SPOT_RADIUS_PX
-    from rigsim.fiber.probe_profile import Profiles
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.probe.scene import DARK_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
-    from rigsim.sensor import sensor_of
-    from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
-    from skinrig.simulating.probe import TRUTH_PHOTONS
-
     if rig.probe is None:
         raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
     tissue = subject_file.tissue(subject, seed=seed)
@@ -71,7 +71,6 @@ def simulate_observation(
     reflectance = np.stack([one.reflectance_per_mm2 for one in made])
     block = expected_reflectance(packaged_certificate(), rig)
     view = rig.views[0]
-    from model import spectra
 
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2

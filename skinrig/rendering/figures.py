@@ -15,6 +15,7 @@ from model.skin_reflectance import SkinReflectance
 from rigsim.render import Caster
 from skinrig import consent
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
+from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, reduced
@@ -23,6 +24,7 @@ from skinrig.rendering.geometry import FittedSurface, own_mesh, read_mesh
 from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
+from skinrig.rendering.photographs.held_out import Photographs
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
 from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
@@ -169,8 +171,6 @@ def draw_photograph(
     UnusableError
         The session holds no such photograph that the model has not seen.
     """
-    from skinrig.rendering.photographs.held_out import Photographs
-
     folder.check(out)
     photographs = Photographs.of(session, subject.appearance, calibration=calibration)
     shot = next((s for s in photographs.shots if (s.view, s.light) == (view, light)), None)
@@ -375,7 +375,6 @@ def _words(sigma: Sequence[float]) -> str:
 
 
 def _png(image: FloatArray, exposure: float) -> bytes:
-    from skinrig.drawing import png
 
     return png.encode(tone(image, exposure))
 

@@ -14,6 +14,18 @@ from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance
+from rigsim.as_built.dome import build
+from rigsim.needs.effects import SceneEffects, longest_on_s
+from rigsim.population import files as subject_file
+from rigsim.population.conditions import ConditionError, checked
+from rigsim.population.population import PopulationError, member
+from rigsim.scanner.flaws import binary_ply
+from rigsim.scanner.pods import Scanner, scan_face, wrap_template
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals, target_scene
+from rigsim.subject.head_motion import head_motion
+from rigsim.subject.perfusion import STATE_NAMES
+from rigsim.targets import make_target
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
@@ -113,8 +125,6 @@ def _asked(order: DomeOrder, rig: Rig) -> dict[str, Any]:
 
 def _check_state(order: DomeOrder) -> None:
     """Raise for a state that no face has."""
-    from rigsim.subject.perfusion import STATE_NAMES
-
     if order.state not in STATE_NAMES:
         raise SimulationError(
             f"state: got {order.state!r}, expected one of {', '.join(STATE_NAMES)}"
@@ -123,8 +133,6 @@ def _check_state(order: DomeOrder) -> None:
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
     """Return the conditions of the face, checked."""
-    from rigsim.population.conditions import ConditionError, checked
-
     try:
         return checked(order.conditions)
     except ConditionError as error:
@@ -133,8 +141,6 @@ def _conditions(order: DomeOrder) -> dict[str, float]:
 
 def _member(order: DomeOrder) -> Member | None:
     """Return the member of the simulated population that is asked for; None: a preset is."""
-    from rigsim.population.population import PopulationError, member
-
     if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
         return None
     if order.mesh is not None:
@@ -147,8 +153,6 @@ def _member(order: DomeOrder) -> Member | None:
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
     """Return the true mesh, its expressions, and how it reflects where no light is."""
-    from rigsim.scanner.flaws import binary_ply
-
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
         TRUE_MESH_FILE: binary_ply(mesh.vertices_mm, mesh.faces),
@@ -270,7 +274,6 @@ def _rig(order: DomeOrder) -> Rig:
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-    from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals
 
     few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else TARGET_POSES
     return dome_calibration_plan(
@@ -284,13 +287,6 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-    from rigsim.as_built.dome import build
-    from rigsim.needs.effects import SceneEffects, longest_on_s
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.dome.scene import DomeScene
-    from rigsim.scenes.dome.targets import target_scene
-    from rigsim.subject.head_motion import head_motion
-    from rigsim.targets import make_target
 
     built = build(rig, seed=order.seed)
     if order.target == "dark":
@@ -337,9 +333,6 @@ def _light_of_skin(order: DomeOrder) -> dict[str, Any]:
 
 def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
-    from rigsim.scanner.pods import Scanner, scan_face, wrap_template
-    from rigsim.subject.perfusion import STATE_NAMES
-
     scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:

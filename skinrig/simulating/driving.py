@@ -17,6 +17,7 @@ from capture.rig import Rig
 from capture.session import Session, Subject
 from model import store
 from model.skin import SkinAppearance
+from rigsim.world import World
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
@@ -168,8 +169,6 @@ def drive(
     float
         Time that has passed on the rig, s.
     """
-    from rigsim.world import World
-
     world = World(
         rig, seed=order.seed, clock="virtual", scene=scene, shots_made=shots_made(session)
     )

@@ -7,22 +7,24 @@ from typing import Any
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
 from model import store
+from rigsim import targets
+from rigsim.needs.effects import SceneEffects
+from rigsim.population import files as subject_file
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import drive, finish, open_session
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_mm, truth_of
 from skinrig.simulating.orders import FlashOrder, Simulated, SimulationError, truth_folder
+from skinrig.simulating.sequence import simulate_sequence
 
 
 def simulate_flash(order: FlashOrder) -> Simulated:
     """Simulate a capture with the flash rig; see `simulation.simulate`."""
     if order.sequence is not None:
-        from skinrig.simulating.sequence import simulate_sequence
-
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states
     if target is None:
-        from rigsim.subject.perfusion import STATE_NAMES
-
         unknown = [state for state in states if state not in STATE_NAMES]
         if unknown:
             raise SimulationError(
@@ -75,10 +77,6 @@ def _plan(rig: Rig, order: FlashOrder) -> Plan:
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
-    from rigsim import targets
-    from rigsim.needs.effects import SceneEffects
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.flash.scene import FlashScene
 
     seed = order.seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]

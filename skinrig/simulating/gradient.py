@@ -17,7 +17,14 @@ from capture.plan.gradient import (
 )
 from capture.rig import Rig, load_rig
 from capture.session import Session
+from rigsim.as_built.sphere import build_sphere
+from rigsim.needs.effects import SceneEffects, longest_on_s
+from rigsim.population import files as subject_file
+from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.skin_patch.motion import PatchMotion
+from rigsim.skin_patch.stretch import size_for
+from rigsim.world.taped_skin import GripState
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
 from skinrig.simulating.exposure_log import SceneLog
@@ -113,13 +120,6 @@ def make_scene(
     without
         What of the skin is not built, see `skinrig.simulating.leaving_out`.
     """
-    from rigsim.as_built.sphere import build_sphere
-    from rigsim.needs.effects import SceneEffects, longest_on_s
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.gradient.scene import GradientScene
-    from rigsim.skin_patch.motion import PatchMotion
-    from rigsim.skin_patch.stretch import size_for
-
     sphere = build_sphere(rig, seed=seed)
     if target is not None:
         return GradientScene(rig, cast(Any, target), sphere=sphere, seed=seed)
@@ -184,8 +184,6 @@ class GripLog(SceneLog):
 
     def grips(self, session: Session) -> list[Any]:
         """Return what was held in each state that the session has, in the plan's order."""
-        from rigsim.world.taped_skin import GripState
-
         entries = self.read()
         found = []
         for name, steps in states(session.plan):

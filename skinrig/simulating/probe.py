@@ -18,6 +18,10 @@ from capture.plan.probe import (
 from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
+from rigsim.fiber.probe_tissue import PHANTOM_BLOCK as BLOCK
+from rigsim.fiber.probe_tissue import TissueError
+from rigsim.population import files as subject_file
+from rigsim.scenes.probe.scene import ProbeScene, Probing
 from rigsim.scenes.probe.truth import appearance as ground_truth
 from skinrig.capturing.plan_choice import directions_of
 from skinrig.simulating import subject_records
@@ -74,8 +78,6 @@ def simulate_probe(order: ProbeOrder) -> Simulated:
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
     """Raise where the tissue has no such site, before anything is captured."""
-    from rigsim.fiber.probe_tissue import TissueError
-
     suction_mbar = rig.probe.suction_mbar if rig.probe is not None else 0.0
     for site in sites:
         try:
@@ -120,11 +122,6 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim.fiber.probe_tissue import PHANTOM_BLOCK as BLOCK
-    from rigsim.fiber.probe_tissue import TissueError
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.probe.scene import ProbeScene
-
     try:
         tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
     except TissueError as error:
@@ -171,8 +168,6 @@ class HeadLog(SceneLog):
 
     def probings(self, session: Session) -> list[Any]:
         """Return the placements that the session has series of, in the plan's order."""
-        from rigsim.scenes.probe.scene import Probing
-
         entries = self.read()
         by_run: dict[int, list[tuple[float, float]]] = {}
         for entry in entries:

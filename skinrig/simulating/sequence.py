@@ -14,6 +14,10 @@ import numpy as np
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
+from rigsim.population import files as subject_file
+from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
+from rigsim.subject.perfusion import STATE_NAMES
+from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
@@ -56,11 +60,6 @@ INTERRUPTION_S = 10.0
 
 def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     """Simulate a sequence with the flash rig; see `simulation.simulate`."""
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
-    from rigsim.subject.perfusion import STATE_NAMES
-    from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
-
     if sequence.state not in STATE_NAMES or sequence.state == "neutral":
         expected = ", ".join(state for state in STATE_NAMES if state != "neutral")
         raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")

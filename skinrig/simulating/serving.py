@@ -9,8 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
+from rigsim.as_built.dome import build
+from rigsim.fiber import probe_tissue
+from rigsim.population import files as subject_file
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.probe.scene import ProbeScene
+from rigsim.world.serve import serve
+from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
 from skinrig.console import Console
 from skinrig.errors import EXIT_INTERRUPTED, UsageError
@@ -78,8 +87,6 @@ def serve_rig(
     seconds
         How long; None serves until Ctrl-C.
     """
-    from rigsim.world.serve import serve
-
     rig = load_rig(rig_name)
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
@@ -158,8 +165,6 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.flash.scene import FlashScene
 
     scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
@@ -168,20 +173,12 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
-    from rigsim.as_built.dome import build
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.dome.scene import DomeScene
 
     person = subject_file.load_subject(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
-    from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
-    from rigsim.fiber import probe_tissue
-    from rigsim.population import files as subject_file
-    from rigsim.scenes.probe.scene import ProbeScene
-    from rigsim.world.suction import HeadState
 
     try:
         tissue = subject_file.tissue(subject, seed=seed)

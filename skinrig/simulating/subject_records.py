@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rigsim.population import files as subject_file
+
 SUBJECT_FILE_SUFFIX = ".toml"
 """Of a subject's file, see `rigsim.population.files`."""
 
@@ -25,8 +27,6 @@ def pseudonym(subject: str, seed: int) -> str:
 
 def of_manifest(subject: str) -> str | dict[str, Any]:
     """Return a subject as a session's manifest holds it: a preset, or all that its file says."""
-    from rigsim.population import files as subject_file
-
     return subject_file.record(subject)
 
 
@@ -44,8 +44,6 @@ def unused_subject_keys(
     tell
         Told of them, in one line, where there are any.
     """
-    from rigsim.population import files as subject_file
-
     if not subject_file.is_file(subject):
         return ()
     keys = subject_file.read(subject).unused(rig)
@@ -66,8 +64,6 @@ def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> 
     progress
         Told what the file says and the rig does not see.
     """
-    from rigsim.population import files as subject_file
-
     if not subject_file.is_file(subject):
         return {}
     return {

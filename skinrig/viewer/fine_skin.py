@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from rigsim.geometry.atlas import unwrap
+from rigsim.subject import face_regions, pigment, relief
+from rigsim.subject.perfusion import perfuse
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.map_filling import filled
 
@@ -36,9 +39,6 @@ class FineSkin:
 
     def __init__(self, person: SimulatedSubject, size: int) -> None:
         """Lay out the surface."""
-        from rigsim.geometry.atlas import unwrap
-        from rigsim.subject import face_regions
-
         self._person = person
         self._atlas = person.atlas if size == person.size else unwrap(person.mesh, size)
         self.covered = self._atlas.covered
@@ -50,8 +50,6 @@ class FineSkin:
 
     def melanin(self) -> Float64Array:
         """Return the volume fraction of melanosomes in the epidermis, (N, N)."""
-        from rigsim.subject import pigment
-
         base = pigment.MELANIN_PRESETS[self._person.preset]
         return self._on_texture(
             pigment.melanin_map(self._points, self._regions, base, seed=self._person.seed)
@@ -59,15 +57,11 @@ class FineSkin:
 
     def hemoglobin(self) -> Float64Array:
         """Return the volume fraction of blood in the dermis of the neutral state, (N, N)."""
-        from rigsim.subject.perfusion import perfuse
-
         found = perfuse(self._points, self._regions, seed=self._person.seed)
         return self._on_texture(found.blood("neutral"))
 
     def height_um(self) -> Float64Array:
         """Return pores and lines over the mesh, um, (N, N)."""
-        from rigsim.subject import relief
-
         along_u, along_v = self._atlas.texel_mm()
         texel_mm = float(np.median(np.maximum(along_u, along_v)[self.covered]))
         return self._on_texture(

@@ -12,6 +12,7 @@ from typing import Final
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
+from rigsim.geometry.mesh import load_mesh
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.viewer import procedural
 from skinrig.viewer.assembling import assemble
@@ -144,8 +145,6 @@ def _mesh(
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH_FILE in appearance.files:
-            from rigsim.geometry.mesh import load_mesh
-
             with tempfile.TemporaryDirectory() as folder:
                 copy = Path(folder) / MESH_FILE
                 copy.write_bytes(appearance.files[MESH_FILE])

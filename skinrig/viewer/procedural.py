@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigsim.geometry.mesh import build_mesh, centered
+from rigsim.subject import make_subject
+from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.viewer.assembling import assemble
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
 from skinrig.viewer.scene import MAX_TEXTURE_PX, SceneError, SceneSource, ViewerMesh, ViewerScene
@@ -71,8 +74,6 @@ def check_size(size: int) -> None:
 
 def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> SimulatedSubject:
     """Return the simulated person that wears a mesh, or the procedural head, coarsely."""
-    from rigsim.subject import make_subject
-
     return make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=mesh)
 
 
@@ -85,9 +86,6 @@ def load_mesh(path: Path) -> Mesh:
         .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The
         face looks towards +z, and its foremost vertex is the tip of the nose.
     """
-    from rigsim.geometry.mesh import build_mesh, centered
-    from skinrig.blend_shapes import meshes as blend_shapes
-
     loaded = blend_shapes.load(path)
     if loaded.uv.min() < 0.0 or loaded.uv.max() > 1.0:
         raise SceneError(

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from model import store
 from skinrig import consent
-from skinrig.viewer import page
+from skinrig.viewer import from_appearance, page, procedural, server
+from skinrig.viewer.microstructure import assets as microstructure_assets
+from skinrig.viewer.microstructure import tiles
 from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import SceneError, ViewerScene
 
@@ -48,8 +50,6 @@ def compose(
     if progress is not None:
         progress("making textures and tables")
     if appearances:
-        from skinrig.viewer import from_appearance
-
         scene = from_appearance.scene(
             appearances, mesh=mesh, landmarks=landmarks, calibration=calibration, size=size
         )
@@ -66,7 +66,6 @@ def compose(
         raise SceneError(
             "calibration: got a folder but no dome's appearance whose colors it is of; name one"
         )
-    from skinrig.viewer import procedural
 
     return procedural.scene(preset=preset, size=size, seed=seed, mesh=mesh)
 
@@ -141,10 +140,6 @@ def serve(
         A port that is taken; a file that is no displacement.
     """
     import tempfile
-
-    from skinrig.viewer import server
-    from skinrig.viewer.microstructure import assets as microstructure_assets
-    from skinrig.viewer.microstructure import tiles
 
     with tempfile.TemporaryDirectory(prefix="skinrig-view-") as name:
         pyramid = None

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.brdf import tables as brdf_tables
 from reconstruction.brdf_basis import space as brdf_space
+from rigsim.population.population import table_1
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.arrays import Float64Array, Int64Array
@@ -104,7 +105,6 @@ def space(*, toy: bool) -> StageBenchmark:
 
 
 def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
-    from rigsim.population.population import table_1
 
     rng = np.random.default_rng(72)
     if toy:

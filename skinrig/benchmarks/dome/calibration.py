@@ -14,6 +14,9 @@ from capture.calibration.lights import mirror_lights, mirror_sphere
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import Rig, load_rig
+from rigsim.as_built.dome import Tolerances, build, image_of
+from rigsim.scenes.dome.targets import target_scene
+from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
@@ -37,9 +40,6 @@ class _Pulse:
 
 def geometry(*, toy: bool) -> StageBenchmark:
     """Adjust cameras to 4 to 12 places of a simulated board."""
-    from rigsim.as_built.dome import Tolerances, build, image_of
-    from rigsim.scenes.dome.targets import target_scene
-
     views = ["C03", "C07", "C11", "C14"] if toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
     rig = load_rig("dome").subset(views=views).resized(324 if toy else 650)
     dome = build(rig, seed=DOME_SEED, tolerances=Tolerances(distortion=0.2))
@@ -94,9 +94,6 @@ def geometry(*, toy: bool) -> StageBenchmark:
 
 def lights(*, toy: bool) -> StageBenchmark:
     """Place lights by one to four places of a simulated mirror sphere."""
-    from rigsim.as_built.dome import build
-    from rigsim.scenes.dome.targets import target_scene
-
     views = ["C05", "C07", "C14"] if toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")
     every = [light.name for light in dome_rig.lights][:: 30 if toy else 10]
@@ -175,7 +172,6 @@ def _add_sphere(
 def _frame(
     scene: TargetScene, name: str, lit: Sequence[int], exposure_s: float, level: float, seed: int
 ) -> RawFrame:
-    from rigsim.sensor import sensor_of
 
     view = scene.rig.view(name)
     pops = [_Pulse(k, level, 0.0, exposure_s) for k in lit]

@@ -8,7 +8,14 @@ from functools import partial
 
 import numpy as np
 
+from capture.calibration.geometry import CameraPose
+from capture.rig import load_rig
 from reconstruction.registration import head_motion
+from rigsim.boxes.dome import LedPulse
+from rigsim.needs.effects import SceneEffects
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.subject import make_subject
+from rigsim.subject.head_motion import head_motion as drawn
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import BandError, Case, StageBenchmark, compare
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -111,14 +118,6 @@ def simulate(
     texels
         Side of the person's maps.
     """
-    from capture.calibration.geometry import CameraPose
-    from capture.rig import load_rig
-    from rigsim.boxes.dome import LedPulse
-    from rigsim.needs.effects import SceneEffects
-    from rigsim.scenes.dome.scene import DomeScene
-    from rigsim.subject import make_subject
-    from rigsim.subject.head_motion import head_motion as drawn
-
     rig = load_rig("dome")
     leds = [light.name for light in rig.lights if light.position_mm[2] > 350.0][::6]
     front = sorted(rig.views, key=lambda view: -view.position_mm[2])[:views]

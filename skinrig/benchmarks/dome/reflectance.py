@@ -14,6 +14,8 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import SurfaceSamples
+from rigsim.light import surface_brdf
+from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.benchmarks.dome import texture as bench_texture
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
@@ -77,9 +79,6 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     rng
         Of points, pairs of light and camera, and noise.
     """
-    from rigsim.light import surface_brdf
-    from rigsim.subject import make_subject
-
     rig = load_rig("dome")
     face = make_subject(subject, seed=0, size=128)
     surface = surface_brdf.skin_surface(

@@ -10,6 +10,7 @@ from scipy import fft, ndimage
 
 from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
+from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, processor_seconds
 
@@ -29,8 +30,6 @@ CROP_SIDES_PX = {16: 256, 32: 160, 64: 96}
 
 def rig(*, toy: bool) -> StageBenchmark:
     """Predict states whose vessels dilated; then time discs of 2048 x 2048 beside libraries."""
-    from rigsim import subject
-
     rng = np.random.default_rng(0)
     face = subject.make_subject("III", seed=3, size=96 if toy else 512)
     neutral, covered = face.hemoglobin(), face.atlas.covered

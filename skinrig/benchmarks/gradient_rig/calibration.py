@@ -12,6 +12,10 @@ from capture.calibration.led_sphere.survey import survey_sphere
 from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import Rig, load_rig
+from rigsim.as_built.sphere import build_sphere
+from rigsim.boxes.gradient_sphere import PatternLight
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.sensor import vignetting_map
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, once
 
@@ -23,9 +27,6 @@ MAX_MISALIGNMENT_SIGMAS = 4.0
 
 def sphere_lights(*, toy: bool) -> StageBenchmark:
     """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
-    from rigsim.as_built.sphere import build_sphere
-    from rigsim.scenes.gradient.scene import GradientScene
-
     points, last = [], (np.inf, np.inf, np.inf)
     for width_px in (192,) if toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)
@@ -83,9 +84,6 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
 
 
 def _shots(scene: object, rig: Rig) -> list[Shot]:
-    from rigsim.boxes.gradient_sphere import PatternLight
-    from rigsim.scenes.gradient.scene import GradientScene
-    from rigsim.sensor import vignetting_map
 
     if not isinstance(scene, GradientScene):
         raise TypeError(f"scene: got {type(scene).__name__}, expected GradientScene")

@@ -27,7 +27,9 @@ from skinrig.benchmarks.intervals.trials import (
     truth_of,
     valid_of,
 )
-from skinrig.simulating.orders import Simulated
+from skinrig.evaluating import facial_color
+from skinrig.fitting.facial_color import fit_facial_color
+from skinrig.simulating.orders import Simulated, truth_folder
 from skinrig.simulating.simulation import simulate_session
 
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
@@ -119,9 +121,6 @@ def flash(
 def _of_rig(
     done: Simulated, folder: Path, state: str, *, subject: str, band: str
 ) -> Iterator[Trial]:
-    from skinrig.evaluating import facial_color
-    from skinrig.fitting.facial_color import fit_facial_color
-    from skinrig.simulating.orders import truth_folder
 
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")

@@ -26,6 +26,8 @@ from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
+from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.stretch import deform
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.intervals.trials import (
     ANY_BAND,
@@ -35,6 +37,7 @@ from skinrig.benchmarks.intervals.trials import (
     valid_of,
 )
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.microrelief import compare_stretch, document_of, true_relief
 from skinrig.simulating.simulation import simulate_session
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
@@ -56,8 +59,6 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
     Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
     as of `interval_trials_flash.flash`; a subject is a site of the face.
     """
-    from skinrig.evaluating.microrelief import compare_stretch, true_relief
-
     for seed, site in subjects.items():
         name = f"{site} {seed}"
         ball, calibration = folder / "session-ball", folder / "calibration"
@@ -128,8 +129,6 @@ def _kernels(
     found: SkinAppearance, truth: SkinAppearance, *, site: str, seed: int
 ) -> Iterator[Trial]:
     """Compare the kernels of strained states with those of more of the same skin."""
-    from skinrig.evaluating.microrelief import document_of
-
     document = document_of(found, KERNEL_FILE)
     fits = [fit for fit in document["fits"] if fit["valid"]] if document else []
     known = truth.parameters["states"]
@@ -192,9 +191,6 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
     pixel_um : float
         Distance of the heights, um.
     """
-    from rigsim.skin_patch.microrelief import make_micro_skin
-    from rigsim.skin_patch.stretch import deform
-
     skin = make_micro_skin(site, seed=seed, size_mm=REFERENCE_SKIN_MM + SIMULATED_BORDER_MM)
     strained = deform(skin, stretch=stretch, angle_deg=0.0)
     shown = []

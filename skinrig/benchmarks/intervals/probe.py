@@ -15,6 +15,8 @@ from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
+from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
+from rigsim.subject.pigment import MELANIN_PRESETS
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, truth_of
@@ -114,8 +116,6 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
     >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
     True
     """
-    from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
-
     paper = dict(phantom_certificate())
     for name, made in zip(COEFFICIENT_LABELS, PHANTOM_DEVIATIONS, strict=True):
         unsure = float(paper["uncertainty"][name])
@@ -132,8 +132,6 @@ def melanin_band_of(preset: str) -> str:
     >>> melanin_band_of("II"), melanin_band_of("VI")
     ('light', 'dark')
     """
-    from rigsim.subject.pigment import MELANIN_PRESETS
-
     return str(skin_bands.melanin_band(MELANIN_PRESETS[preset]))
 
 

@@ -13,6 +13,8 @@ from capture.calibration.fiber.readings import FiberReadings, read_fibers
 from capture.calibration.fiber.spots import FiberSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
+from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
+from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
 
@@ -116,8 +118,6 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
 
 
 def _bench(*, draws: int) -> _Bench:
-    from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
-    from rigsim.sensor import expose, fixed_pattern, sensor_of
 
     rig = load_rig("probe")
     view = rig.views[0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from model import color_table, metrics, spectra
 from model.tissue_optics import layers as tissue_optics
+from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import (
     BandError,
@@ -27,8 +28,6 @@ BAND_TABLE_SIZE = 64
 
 def layered_reflectance(*, toy: bool) -> StageBenchmark:
     """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
-    from rigsim.tissue.skin_table import SkinTable
-
     rng = np.random.default_rng(0)
     truth = SkinTable.load()
     count = 24 if toy else 200

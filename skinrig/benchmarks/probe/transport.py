@@ -10,6 +10,9 @@ import numpy as np
 from numba import njit
 
 from capture.rig import load_rig
+from rigsim.fiber.profile import fibre_profile
+from rigsim.render import RenderError, look_at, radiance
+from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
@@ -101,9 +104,6 @@ def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  #
 
 def photon_transport(*, toy: bool) -> StageBenchmark:
     """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
-    from rigsim.fiber.profile import fibre_profile
-    from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
-
     probe = load_rig("probe").probe
     if probe is None:
         raise ValueError("rig: the probe's rig has no probe")
@@ -175,9 +175,6 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
 
 def _bands(radii: Float64Array, *, photons: int) -> dict[str, BandError]:
     """Return the error of as many photons in skin that absorbs little and much."""
-    from rigsim.fiber.profile import fibre_profile
-    from rigsim.tissue.tissue_mc import Layer, LayerStack
-
     found = {}
     for name, band in MELANIN_BANDS.items():
         layer = Layer(
@@ -236,7 +233,6 @@ def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
 
 
 def _one_percent(radii: Float64Array, stack: Any) -> tuple[Limit, ...]:
-    from rigsim.fiber.profile import fibre_profile
 
     seconds, run = _spent(
         lambda: fibre_profile(
@@ -257,10 +253,6 @@ def _one_percent(radii: Float64Array, stack: Any) -> tuple[Limit, ...]:
 
 def _against_volpath(radii: Float64Array) -> tuple[Limit, ...]:
     """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
-    from rigsim.fiber.profile import fibre_profile
-    from rigsim.render import RenderError, radiance
-    from rigsim.tissue.tissue_mc import Layer, LayerStack
-
     scene = volpath_scene(radii)
     try:
         radiance(scene, kind="mono", samples=16)
@@ -308,8 +300,6 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
 
     The radiance times pi is the exitance per source power where the exit is Lambertian.
     """
-    from rigsim.render import look_at
-
     pitch = float(radii[1] - radii[0])
     middle, half = float(radii.mean()), 0.5 * pitch * len(radii)
     sigma_s = RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G)
@@ -362,8 +352,6 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
 
 def _rates(medium: Any) -> tuple[Limit, ...]:
     """Compare photons a processor second with the plain walk's; R_d with MCML's."""
-    from rigsim.tissue.tissue_mc import transport
-
     edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
     plain_walk(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
     plain_s, _ = _spent(lambda: plain_walk(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3)

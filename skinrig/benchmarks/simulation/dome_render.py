@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capture.rig import load_rig
+from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -24,8 +25,6 @@ def render(*, toy: bool) -> StageBenchmark:
     The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
     as even as our regular rays: with its default, independent ones it is twice as noisy.
     """
-    from rigsim.scenes.dome.reference import compare
-
     width, lights = (64, 2) if toy else (1300, 4)
     points = []
 
@@ -96,8 +95,6 @@ def _error(way: Way) -> BandError:
 
 def _on_skin(preset: str, width: int, fine: int) -> BandError:
     """Return our error with 4 rays a pixel on a face of a preset's melanin, one light, %."""
-    from rigsim.scenes.dome.reference import PlainScene, plain_face, point_rig
-
     rig = point_rig(load_rig("dome").resized(width).subset(views=["C02"]))
     face = plain_face(preset, size=128 if width < 128 else 512)
     light = len(rig.lights) // 2

@@ -5,6 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_erosion
 
+from rigsim.render import Caster
+from rigsim.render.variant import choose_variant
+from rigsim.scenes.flash.polarizer_reference import (
+    ANALYZER_AXIS_DEG,
+    closed_forms,
+    mitsuba_image,
+    polarizer_reference,
+    reference_rig,
+    sphere_mesh,
+)
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import tiled_rms
@@ -16,17 +26,6 @@ REFERENCE_RAYS = 144
 
 def render(*, toy: bool) -> StageBenchmark:
     """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
-    from rigsim.render import Caster
-    from rigsim.render.variant import choose_variant
-    from rigsim.scenes.flash.polarizer_reference import (
-        ANALYZER_AXIS_DEG,
-        closed_forms,
-        mitsuba_image,
-        polarizer_reference,
-        reference_rig,
-        sphere_mesh,
-    )
-
     efforts = ((1, 2), (2, 4)) if toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if toy else 256
     rig, view = reference_rig(width)

@@ -7,6 +7,15 @@ import time
 
 import numpy as np
 
+from rigsim.as_built.sphere import PATTERN_WEIGHTS
+from rigsim.scenes.gradient.reference import (
+    judge,
+    picture,
+    plain_scene,
+    plain_skin,
+    rendered,
+    traced,
+)
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
 
@@ -22,16 +31,6 @@ def render(*, toy: bool) -> StageBenchmark:
     processor time; ours are those of the table, which serves all states of a session, and of one
     state.
     """
-    from rigsim.as_built.sphere import PATTERN_WEIGHTS
-    from rigsim.scenes.gradient.reference import (
-        judge,
-        picture,
-        plain_scene,
-        plain_skin,
-        rendered,
-        traced,
-    )
-
     width = 48 if toy else 192
     skin = plain_skin(width * 0.006 + 0.9)
     rng = np.random.default_rng(0)

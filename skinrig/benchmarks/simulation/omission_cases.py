@@ -11,7 +11,22 @@ from typing import Any, Final
 
 import numpy as np
 
+from capture.rig import load_rig
+from model import spectra
+from rigsim.light.interreflection import Interreflection
+from rigsim.needs.effect_sizes import is_flat
+from rigsim.needs.effects import Noise, SceneEffects
+from rigsim.needs.flash import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT, WAVELENGTH_STEP_EFFECT
+from rigsim.render import Caster, visibility
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.gradient.reference import NEUTRAL
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.subject import make_subject
+from rigsim.targets import make_target
 from skinrig.arrays import Float32Array, Float64Array
+from skinrig.simulating.dome import small_dome
+from skinrig.simulating.gradient import make_scene
 
 FLOAT32_ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a picture in single precision, after a few sums."""
@@ -141,12 +156,6 @@ def flash_face(
         One of the lights alone, so far off the camera's axis to the right, degrees; None: all
         lights where they stand.
     """
-    from capture.rig import load_rig
-    from rigsim.needs.effects import Noise, SceneEffects
-    from rigsim.needs.flash import WAVELENGTH_STEP_EFFECT
-    from rigsim.scenes.flash.scene import FlashScene
-    from rigsim.subject import make_subject
-
     rig = load_rig("flash").resized(width_px)
     name = preset
     if light_deg is not None:
@@ -195,12 +204,6 @@ def _lit_from(rig: Any, angle_deg: float) -> Any:
 
 def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare pictures of a face in the dome under some lights, each exposed to full scale."""
-    from capture.rig import load_rig
-    from rigsim.needs.effects import Noise, SceneEffects
-    from rigsim.scenes.dome.scene import DomeScene
-    from rigsim.subject import make_subject
-    from skinrig.simulating.dome import small_dome
-
     rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
     face = make_subject(preset, seed=0, size=FACE_TEXELS)
     scene = DomeScene(rig, face)
@@ -237,12 +240,6 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
 
 def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     """Compare a face that has moved in the dome with and without shadows of its wrinkles."""
-    from capture.rig import load_rig
-    from rigsim.needs.effects import Noise, SceneEffects
-    from rigsim.scenes.dome.scene import DomeScene
-    from rigsim.subject import make_subject
-    from skinrig.simulating.dome import small_dome
-
     rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
     face = make_subject(preset, seed=0, size=FACE_TEXELS)
     plain = {"interreflections": False, "subsurface": False}
@@ -279,10 +276,6 @@ def _plainer(
     look
         Returns the pictures of a subject, in full scales.
     """
-    from model import spectra
-    from rigsim.needs.effects import Noise
-    from rigsim.needs.flash import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT
-
     face, noise = scene.subject, Noise.of(scene.sensor())
     begin = time.process_time()
     have = look(face)
@@ -327,12 +320,6 @@ def changed(
 
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
-    from capture.rig import load_rig
-    from rigsim.needs.effects import Noise, SceneEffects
-    from rigsim.scenes.gradient.reference import NEUTRAL
-    from rigsim.scenes.gradient.scene import GradientScene
-    from skinrig.simulating.gradient import make_scene
-
     rig = load_rig("gradient").cropped(width_px)
     base = make_scene(rig, site=site)
     brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL).values())
@@ -353,16 +340,6 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
 
 def flat_targets() -> Iterator[Omission]:
     """Show that targets neither shade nor light themselves: rays between their own points."""
-    from capture.rig import load_rig
-    from rigsim.light.interreflection import Interreflection
-    from rigsim.needs.effect_sizes import is_flat
-    from rigsim.needs.effects import Noise
-    from rigsim.render import Caster, visibility
-    from rigsim.scenes.dome.scene import DomeScene
-    from rigsim.scenes.flash.scene import FlashScene
-    from rigsim.targets import make_target
-    from skinrig.simulating.dome import small_dome
-
     flash = load_rig("flash").resized(64)
     dome = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
     scenes: list[tuple[str, str, Any]] = [

@@ -9,18 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from capture.rig import load_rig
+from rigsim.fiber.probe_tissue import HomogeneousTissue
+from rigsim.needs.effects import Noise
+from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
+from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
+from rigsim.world.suction import HeadState
 from skinrig.benchmarks.simulation.omission_cases import Omission, Pictures, changed
 
 
 def gray_tissue() -> Iterator[Omission]:
     """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
-    from capture.rig import load_rig
-    from rigsim.fiber.probe_tissue import HomogeneousTissue
-    from rigsim.needs.effects import Noise
-    from rigsim.needs.probe import COLOR_EFFECT
-    from rigsim.scenes.probe.scene import ProbeScene
-    from rigsim.world.suction import HeadState
-
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
     bands = tuple(float(nm) for nm in range(400, 701, 10))
@@ -47,9 +46,6 @@ def gray_tissue() -> Iterator[Omission]:
 
 def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     """Compare the probe as built with one without cross-talk, wings, or dark current."""
-    from rigsim.needs.probe import CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
-    from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
-
     profile = scene.profile(head)
     build = scene.build
 

@@ -19,6 +19,7 @@ from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
 from skinrig.exporting.options import FIRST_TILE, Delivery
 from skinrig.exporting.sealing import ExportError
+from skinrig.rendering.geometry import FittedSurface, own_mesh
 
 COLOR_NOTE: Final = (
     "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
@@ -108,8 +109,6 @@ class Material:
         rigsim.geometry.mesh.MeshError, ExportError
             Naming the map or file that is missing or does not fit.
         """
-        from skinrig.rendering.geometry import FittedSurface, own_mesh
-
         model = skin_reflectance.assemble(appearance)
         own = own_mesh(appearance)
         mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)

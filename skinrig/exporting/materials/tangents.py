@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.surface.texture_fill import push_pull, rasterize
 from rigsim.geometry.mesh import Mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from skinrig.exporting.materials.udim import TiledMesh
@@ -142,8 +143,6 @@ class FramedMesh:
             Rows are tangent, bitangent and normal, in the mesh's frame; row 0 is v = 1.
         covered : ndarray of bool, shape (size, size)
         """
-        from reconstruction.surface.texture_fill import rasterize
-
         texels = rasterize(self.uv[self.faces].astype(np.float64), size)
         covered = texels.covered
         corners = self.faces[texels.face[covered]]
@@ -214,8 +213,6 @@ def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     >>> filled(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
     [0.6000000238418579, 0.0, 0.800000011920929]
     """
-    from reconstruction.surface.texture_fill import push_pull
-
     given = np.asarray(tangent_normals, np.float32)
     if not valid.any():
         return np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), given.shape).copy()

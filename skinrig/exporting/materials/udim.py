@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
 from skinrig.arrays import Float32Array, FloatArray, Int32Array
+from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.exporting.options import FIRST_TILE
 from skinrig.exporting.sealing import ExportError
+from skinrig.rendering.geometry import read_mesh
 
 TILES_PER_ROW: Final = 10
 """Tiles side by side before the next row begins."""
@@ -155,9 +157,6 @@ Contents = tuple[FloatArray, NDArray[np.integer], FloatArray, dict[str, FloatArr
 
 def _contents(path: Path) -> Contents:
     """Return vertices, faces, texture coordinates and blend shapes as a file has them."""
-    from skinrig.blend_shapes import meshes as blend_shapes
-    from skinrig.rendering.geometry import read_mesh
-
     if path.is_dir() or path.suffix.lower() in (".gltf", ".glb"):
         read = blend_shapes.load(path)
         return read.vertices_mm, read.faces, read.uv, dict(read.shapes)

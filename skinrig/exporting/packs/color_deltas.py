@@ -11,6 +11,8 @@ import numpy as np
 from model import fresnel, store
 from model.skin import SkinAppearance
 from model.texture_resampling import resampled
+from reconstruction.correspondence import landmark_field, landmark_table
+from reconstruction.surface.texture_fill import push_pull
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder
@@ -120,8 +122,6 @@ def write(
 
 def _filled(base: Float64Array, valid: BoolArray) -> Float64Array:
     """Return colors with the holes filled from around, as a texture must have them."""
-    from reconstruction.surface.texture_fill import push_pull
-
     return np.asarray(push_pull(base, valid.astype(np.float32)).values, np.float64)
 
 
@@ -196,8 +196,6 @@ def _on_texture(
 
 def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
     """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
-    from reconstruction.correspondence import landmark_field, landmark_table
-
     own, onto = (landmark_table.read(path) for path in delivery.landmarks)
     names = sorted(set(own) & set(onto))
     try:

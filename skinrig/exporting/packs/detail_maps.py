@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import store, wrinkles
 from model.skin import SkinAppearance
+from reconstruction.normal_integration import integrate_map
+from reconstruction.surface.texture_fill import push_pull
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
@@ -55,8 +57,6 @@ def cavity(
         JSON values.
     left_out : list of (str, str)
     """
-    from reconstruction.normal_integration import integrate_map
-
     if not valid.any():
         return {}, [("cavity", "no wrinkle normal is valid")]
     found = integrate_map(wrinkles.decode(slopes), valid=valid)
@@ -225,8 +225,6 @@ def micro_normals(
     left_out : list of (str, str)
         Sites whose relief is not known.
     """
-    from reconstruction.surface.texture_fill import push_pull
-
     y = NORMAL_Y[delivery.normal_y]
     green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     told: dict[str, Any] = {}

@@ -12,7 +12,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from capture import raw
 from capture.session import Session
+from reconstruction.pipeline.dome.calibrated import calibrated
+from reconstruction.pipeline.dome.images import DomeImages
+from reconstruction.pipeline.evidence import Evidence
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
@@ -83,10 +87,6 @@ def _write(
     session: Session, folder: Path, camera: str | None, calibration: str | Path | None
 ) -> list[tuple[str, str]]:
     import tifffile
-
-    from reconstruction.pipeline.dome.calibrated import calibrated
-    from reconstruction.pipeline.dome.images import DomeImages
-    from reconstruction.pipeline.evidence import Evidence
 
     evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
     images = DomeImages(session)
@@ -185,8 +185,6 @@ def _capture(images: Any, light: int) -> int:
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:
     """Return a picture that came with a light list, which need not say its exposure."""
-    from capture import raw
-
     record = next(one for one in session.frames("olat", light=light) if one.camera == view)
     frame = session.read(record)
     time = float(record.settings.get("exposure_s", 0.0)) * float(record.settings.get("iso", 100.0))

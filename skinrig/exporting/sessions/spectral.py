@@ -17,7 +17,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from model import color_table, spectra
 from model.skin import SkinAppearance
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.arrays import Float64Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import Delivery
@@ -112,15 +114,11 @@ def band_means_nm(camera: str, illuminant: str) -> Float64Array:
     >>> band_means_nm("Nikon 5100 (NPL)", "D55").round(0).tolist()
     [596.0, 529.0, 473.0]
     """
-    from model import spectra
-
     weights = spectra.camera_sensitivity(camera) * spectra.illuminant(illuminant)[:, None]
     return np.asarray(spectra.WAVELENGTH_NM @ weights / weights.sum(axis=0))
 
 
 def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
-    from model import color_table, spectra
-    from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:

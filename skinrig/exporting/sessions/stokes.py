@@ -21,7 +21,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
+from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.gradient.images import GradientImages
+from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
+from reconstruction.pipeline.sensor_noise import SensorNoise
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
@@ -116,9 +121,6 @@ def _write(
     with_errors: bool,
     calibration: str | Path | None,
 ) -> list[tuple[str, str]]:
-    from reconstruction.pipeline.evidence import Evidence
-    from reconstruction.pipeline.gradient.images import GradientImages
-    from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 
     evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
     shots = session.frames("gradient")
@@ -204,8 +206,6 @@ def _write(
 
 
 def _noise(evidence: Any, camera: str) -> Any:
-    from capture.calibration.sensor import SensorCalibration
-    from reconstruction.pipeline.sensor_noise import SensorNoise
 
     serial = evidence.session.rig.view(camera).serial
     found = evidence.load("sensor", [serial], "the frames are as noisy as they say of themselves")

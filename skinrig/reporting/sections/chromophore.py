@@ -7,7 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from model import color_table
 from model.skin import SkinAppearance, SkinMap
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction import chromophores
+from reconstruction.chromophores import model_error
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
@@ -188,10 +192,6 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Bloc
 
 
 def _plots_of_table(camera: str, illuminant: str) -> list[str]:
-    from model import color_table
-    from model.tissue_optics.layers import ANISOTROPY_SKIN
-    from reconstruction import chromophores
-    from reconstruction.chromophores import model_error
 
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
     plots = []

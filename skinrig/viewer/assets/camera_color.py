@@ -14,6 +14,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from capture.calibration import store
+from capture.calibration.color import matrix as color
+from capture.session import Session, SessionError
+from model import color_table, spectra
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import Float64Array
 
 if TYPE_CHECKING:
@@ -87,8 +92,6 @@ def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
 
 
 def _calibrated(folder: Path) -> CameraColor:
-    from capture.calibration import store
-    from capture.calibration.color import matrix as color
 
     found = store.load(folder, COLOR_KIND)
     cameras = [
@@ -111,10 +114,6 @@ def _calibrated(folder: Path) -> CameraColor:
 
 def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:
     """Return a matrix between colors of skin, where a session beside names sensor and light."""
-    from capture.session import Session, SessionError
-    from model import color_table, spectra
-    from model.tissue_optics.layers import ANISOTROPY_SKIN
-
     name: Any = appearance.parameters.get("session")
     if not isinstance(name, str):
         return None

@@ -11,11 +11,13 @@ from model.facial_color import HemoglobinRig
 from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.viewer.assets import camera_color
 from skinrig.viewer.assets.camera_color import CameraColor
 from skinrig.viewer.assets.face_color import RIG_PX, FaceColor
+from skinrig.viewer.assets.placed_color import placed
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -89,8 +91,6 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
         raise ValueError("source: got no subject, expected one to stand for what was not measured")
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and FACIAL_COLOR in parts_of(dynamic):
-        from skinrig.viewer.assets.placed_color import placed
-
         return placed(source, subject)
     if measured or source.skin is None:
         return simulated(subject, FineSkin(subject, subject.size))
@@ -99,8 +99,6 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
 
 def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
     """Return the chromophores of a simulated person, with a rig of all of its states."""
-    from rigsim.subject.perfusion import STATE_NAMES
-
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),
         {name: person.hemoglobin(name) for name in STATE_NAMES if name != NEUTRAL},

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from model import store
+from reconstruction.correspondence import landmark_table
 from skinrig.viewer.scene import SceneError, SceneSource
 
 
@@ -17,8 +18,6 @@ def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tu
     SceneError
         There is no table, and no simulation's truth beside the folder.
     """
-    from reconstruction.correspondence import landmark_table
-
     if source.landmarks is not None:
         return landmark_table.read(source.landmarks)
     name = (part.get("truth") or {}).get("neutral")

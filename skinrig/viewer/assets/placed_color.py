@@ -9,10 +9,12 @@ import numpy as np
 from model.facial_color.coarse_maps import fitting
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
+from rigsim.geometry.atlas import unwrap
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import placing
 from skinrig.viewer.assets.face_color import RIG_PX, FaceColor
+from skinrig.viewer.assets.image_landmarks import picture_landmarks
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 
@@ -40,9 +42,6 @@ def placed(source: SceneSource, subject: SimulatedSubject) -> FaceColor:
     skinrig.viewer.assets.placing.PlacingError
         The landmarks do not.
     """
-    from rigsim.geometry.atlas import unwrap
-    from skinrig.viewer.assets.image_landmarks import picture_landmarks
-
     appearance = source.appearances["dynamic"]
     rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
     marks = picture_landmarks(source, parts_of(appearance)[FACIAL_COLOR])

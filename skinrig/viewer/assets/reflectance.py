@@ -21,6 +21,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.editing import surface_mixtures
 from skinrig.viewer.assets import compact_brdf, gaussian_profiles
 from skinrig.viewer.assets.compact_brdf import LOBES_PER_LOOKUP, CompactBrdf
 from skinrig.viewer.assets.gaussian_profiles import GaussianProfile
@@ -91,8 +92,6 @@ def assemble(source: SceneSource, found: PageLobes) -> Assets:
 
 def lobes_of(source: SceneSource) -> PageLobes:
     """Return the lobes of a face, or of the mean of a population."""
-    from skinrig.editing import surface_mixtures
-
     for kind in FITTED_KINDS:
         appearance = source.appearances.get(kind)
         if appearance is not None and skin_reflectance.BASIS_FILE in appearance.files:

@@ -15,6 +15,10 @@ from model.texture_resampling import resampled
 from model.wrinkles import Layer, decode, encode, mask_textures
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import as_table
+from reconstruction.wrinkles.fit import fit
+from reconstruction.wrinkles.zones import amplitudes, fit_zones
+from rigsim.subject import make_subject
+from rigsim.subject.expressions import EXPRESSION_STRENGTHS
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -67,11 +71,6 @@ def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     size : int
         Texels a side of the normals that are fitted and of the wrinkle map.
     """
-    from reconstruction.wrinkles.fit import fit
-    from reconstruction.wrinkles.zones import amplitudes, fit_zones
-    from rigsim.subject import make_subject
-    from rigsim.subject.expressions import EXPRESSION_STRENGTHS
-
     rest = subject if subject.rest is None else subject.rest
     if rest.size != size:
         rest = make_subject(rest.preset, seed=rest.seed, size=size, mesh=rest.mesh)

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.mesh import build_mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.viewer.holes import closing as hole_closing
 from skinrig.viewer.holes.closing import Patch
@@ -124,9 +126,6 @@ def closed(mesh: Mesh) -> ClosedMesh:
     mesh
         Without blend shapes.
     """
-    from rigsim.geometry.atlas import unwrap
-    from rigsim.geometry.mesh import build_mesh
-
     patches = hole_closing.patches(mesh.vertices_mm, mesh.faces)
     if not patches or mesh.shapes:
         return ClosedMesh(mesh, (), ())

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
+from model.microstructure.mesh_strain import strain
 from skinrig.arrays import Float64Array
 from skinrig.viewer.microstructure import relief_growth
 from skinrig.viewer.microstructure.micro_relief import (
@@ -215,8 +216,6 @@ def with_displacement(
 
 def px_per_mm(mesh: ViewerMesh) -> Float64Array:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
-    from model.microstructure.mesh_strain import strain
-
     rest = mesh.positions.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)
     if not found.valid.any():

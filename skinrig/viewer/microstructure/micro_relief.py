@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from model.microstructure import FOREHEAD, KernelTable
+from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
 from skinrig.arrays import BoolArray, Float32Array
 
 if TYPE_CHECKING:
@@ -45,8 +47,6 @@ class MicroRelief:
 
 def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
     """Return the first site's relief of `skinrig fit microstructure`; None without that part."""
-    from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
-
     part = parts_of(appearance).get(MICROSTRUCTURE)
     if part is None:
         return None
@@ -64,8 +64,6 @@ def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
 
 def simulated_relief(seed: int, *, site: str = "forehead", pixel_um: float = 15.0) -> MicroRelief:
     """Return relief of the simulated skin of a site, `PATCH_PX` a side."""
-    from rigsim.skin_patch.microrelief import make_micro_skin
-
     skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
 
