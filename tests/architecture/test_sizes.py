@@ -57,7 +57,6 @@ LONG_FUNCTIONS = {
     "skinrig/benchmarks/probe/subsurface.py:batches": 90,
     "skinrig/benchmarks/probe/subsurface.py:tiers": 106,
     "skinrig/benchmarks/probe/translucency.py:sites": 84,
-    "skinrig/benchmarks/simulation/gradient_render.py:render": 90,
     "skinrig/commands/export.py:export": 134,
     "skinrig/commands/rendering.py:render": 157,
     "skinrig/commands/showing.py:view": 81,

@@ -150,7 +150,7 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
             raise KeyboardInterrupt
 
     monkeypatch.setattr(
-        "rigsim.world.serve.serve", lambda *args, **settings: Served(addresses=addresses)
+        "skinrig.simulating.serving.serve", lambda *args, **settings: Served(addresses=addresses)
     )
     monkeypatch.setattr("skinrig.simulating.serving._flash_scene", lambda *args: None)
     assert main(["serve", "flash", "--json"]) == errors.EXIT_INTERRUPTED
