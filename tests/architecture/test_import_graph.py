@@ -10,9 +10,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from fixtures.product_code import PACKAGES, ROOT, modules, tree_of
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 MAX_MODULES = 15
 MAX_MODULES_OF = {"skinrig/commands": 17}
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
@@ -93,9 +92,8 @@ def test_a_crowded_folder_would_be_found(tmp_path):
 def relative_imports(root):
     return [
         f"{path.relative_to(root)}:{node.lineno}"
-        for package in PACKAGES
-        for path in sorted((root / package).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        for path in modules(*PACKAGES, root=root)
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.ImportFrom) and node.level
     ]
 

@@ -1,10 +1,9 @@
 """Modules and functions stay small enough to be read: bounds, and what exceeds them today."""
 
 import ast
-from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+from fixtures.product_code import PACKAGES, ROOT, functions, modules, text_of
+
 MAX_LINES = 450
 MAX_FUNCTION_LINES = 80
 MAX_PARAMETERS = 12
@@ -85,15 +84,11 @@ MANY_PARAMETERS = {
 """What a bound does not fit yet, with its present size, which may only fall."""
 
 
-def parsed(root):
-    for package in PACKAGES:
-        for path in sorted((root / package).rglob("*.py")):
-            text = path.read_text("utf-8")
-            yield path.relative_to(root).as_posix(), text, ast.parse(text)
-
-
 def long_modules(root):
-    counts = {name: len(text.splitlines()) for name, text, _ in parsed(root)}
+    counts = {
+        path.relative_to(root).as_posix(): len(text_of(path).splitlines())
+        for path in modules(*PACKAGES, root=root)
+    }
     return {name: count for name, count in counts.items() if count > MAX_LINES}
 
 
@@ -119,10 +114,9 @@ def parameters_of(function):
 
 def large_functions(root, size, bound):
     return {
-        f"{name}:{node.name}": size(node)
-        for name, _, tree in parsed(root)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef) and not is_compiled(node) and size(node) > bound
+        f"{name}:{function.name}": size(function)
+        for name, function in functions(root)
+        if size(function) > bound and not is_compiled(function)
     }
 
 

@@ -7,11 +7,10 @@ and a list that names a function that is gone, or one that is driven after all, 
 
 import ast
 from functools import lru_cache
-from pathlib import Path
 
 import pytest
+from fixtures.product_code import ROOT, modules, tree_of
 
-ROOT = Path(__file__).parents[2]
 PACKAGES = ("model", "reconstruction")
 
 FILES = "reads or writes files; tests/unit and tests/faults damage them"
@@ -187,10 +186,9 @@ NOT_DRIVEN = {
 
 def product_modules():
     """Dotted name and syntax tree of each module of the packages."""
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            yield name.removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
+    for path in modules(*PACKAGES):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        yield name.removesuffix(".__init__"), tree_of(path)
 
 
 @lru_cache(maxsize=1)
@@ -236,7 +234,7 @@ def modules_of(tree):
 
 def driven_by(path):
     """Functions that tests under `@given` in one file name."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     names = modules_of(tree)
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     tables = {

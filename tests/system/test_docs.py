@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from fixtures.product_code import PACKAGES, modules, tree_of
 
 from capture.devices import wire
 from rigsim.boxes.controller import Controller
@@ -24,7 +25,6 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 GUIDES = [ROOT / "README.md", *PAGES]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`([^`]+)`")
-PACKAGES = ("capture", "reconstruction", "rigsim", "model", "skinrig")
 
 
 def named(paths):
@@ -343,8 +343,8 @@ def test_the_limits_of_the_domes_light_are_those_of_its_rig_file():
 def source_texts():
     """Every text in the source, with whatever is filled in left as a gap."""
     texts = []
-    for path in (p for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for path in modules(*PACKAGES):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.JoinedStr):
                 parts = (v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
                 texts.append("".join(map(str, parts)))

@@ -94,8 +94,11 @@ def test_no_two_shots_of_skin_in_a_caliper_that_is_taped_anew_share_their_noise(
 
 
 def test_a_server_that_goes_on_does_not_give_the_noise_of_its_first_shots_again():
-    """Frames of no scene are noise alone, drawn by the number of the shot."""
-    rig = load_rig("flash").resized(16)
+    """Frames of no scene are noise alone, drawn by the number of the shot.
+
+    The camera of the gradient rig reads out in milliseconds; one with a flash takes five seconds.
+    """
+    rig = load_rig("gradient").resized(16)
 
     def shots(count, **made):
         with serve(rig, seed=5, **made) as served:
