@@ -16,9 +16,6 @@ from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from rigsim import render
 from skinrig.extremes.expectations import (
-    WHY_INTEGERS,
-    WHY_SINGLE_PRECISION,
-    Case,
     Real,
     Unexpected,
     as_real,
@@ -29,21 +26,13 @@ from skinrig.extremes.expectations import (
     rising,
     within,
 )
+from skinrig.extremes.inputs import ring
 
 NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 
 
-def _ring(count: int, tilt_rad: float):  # type: ignore[no-untyped-def]
-    turn = np.arange(count) * (2.0 * np.pi / count)
-    across = math.sin(tilt_rad)
-    return np.stack(
-        [across * np.cos(turn), across * np.sin(turn), np.full(count, math.cos(tilt_rad))], -1
-    )
-
-
 def _no_numbers_in_light(real: Real) -> str:
-
-    lights = _ring(8, 0.6)
+    lights = ring(8, 0.6)
     for bad in NON_FINITE_VALUES:
         seen = as_real(np.tile(lights[:, 2:, None], (1, 2, 2)), real)
         seen[3, 0, 1] = bad
@@ -57,7 +46,6 @@ def _no_numbers_in_light(real: Real) -> str:
 
 
 def _no_numbers_in_normals(real: Real) -> str:
-
     y, x = np.mgrid[0:12, 0:12]
     normals = np.stack([-0.3 + 0.0 * x, 0.1 + 0.0 * y, np.ones((12, 12))], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -72,7 +60,6 @@ def _no_numbers_in_normals(real: Real) -> str:
 
 
 def _no_numbers_in_statistics(real: Real) -> str:
-
     plain = as_real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)), real)
     told = []
     for bad in NON_FINITE_VALUES:
@@ -93,7 +80,6 @@ def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
 
 
 def _no_numbers_in_media(real: Real) -> str:
-
     def stack(value: float) -> object:
         return tissue_optics.layer_stack_reflectance(
             as_real([value], real), as_real([1.0], real), as_real([math.inf], real)
@@ -112,7 +98,6 @@ def _no_numbers_in_media(real: Real) -> str:
 
 
 def _single_pixels(real: Real) -> str:
-
     near(normal_integration.integrate(as_real([[[0.0, 0.6, 0.8]]], real)), [[0.0]])
     one = as_real(np.full((1, 1, 3), 0.5), real)
     masked(polarization.separate(one, 0.4 * one).valid, share=(1.0, 1.0))
@@ -124,7 +109,6 @@ def _single_pixels(real: Real) -> str:
 
 
 def _eight_thousand(_: Real) -> str:
-
     shape = (4320, 7680)
     dn = np.empty((2, *shape), np.uint16)
     dn[0], dn[1] = 9000, 2634
@@ -143,7 +127,6 @@ def _eight_thousand(_: Real) -> str:
 
 
 def _missed_range(_: Real) -> str:
-
     # rows: below the noise of all, saturated in all, in all but the shortest, in none
     dn = np.array(
         [[512, 16383, 16383, 9000], [512, 16383, 16383, 2634], [512, 16383, 3000, 1042]], np.uint16
@@ -160,8 +143,7 @@ def _missed_range(_: Real) -> str:
 
 
 def _mirror_and_chalk(real: Real) -> str:
-
-    lights = np.concatenate([_ring(24, 0.6), _ring(12, 0.3)])
+    lights = np.concatenate([ring(24, 0.6), ring(12, 0.3)])
     seen = np.zeros((36, 1, 3))
     seen[5, 0, 0] = 1.0  # a mirror: one light of all is seen in it
     seen[:, 0, 1] = lights[:, 2]  # chalk
@@ -177,7 +159,6 @@ def _mirror_and_chalk(real: Real) -> str:
 
 
 def _conditions(real: Real) -> str:
-
     rng = np.random.default_rng(0)
     one = rng.random(20)
     told, worst = [], []
@@ -196,7 +177,6 @@ def _conditions(real: Real) -> str:
 
 
 def _light_in_renderer(_: Real) -> str:
-
     def scene(emitter: dict[str, object]) -> dict[str, object]:
         film = {"type": "hdrfilm", "width": 4, "height": 4}
         return {
@@ -222,90 +202,3 @@ def _light_in_renderer(_: Real) -> str:
             "light",
         )
     return f"RenderError naming light, for {len(emitters)} lights"
-
-
-CASES = (
-    Case(
-        "no numbers in light",
-        "photometric stereo",
-        "NaN and infinities, in one light and in all",
-        "NaN spreads through sums",
-        "the others' normal; the pixel without any masked",
-        _no_numbers_in_light,
-    ),
-    Case(
-        "mirror, chalk and varnish",
-        "photometric stereo",
-        "a pixel that shows one light of 36",
-        "a highlight passes for shape",
-        "the mirror masked, chalk and varnish within 0.1 degrees",
-        _mirror_and_chalk,
-    ),
-    Case(
-        "no numbers in normals",
-        "normal integration",
-        "a NaN and an infinity",
-        "one hole spoils the whole height",
-        "the plane beside the holes",
-        _no_numbers_in_normals,
-    ),
-    Case(
-        "no numbers in a map",
-        "local statistics",
-        "a NaN, an infinity",
-        "running sums keep a NaN for ever",
-        "means of the others",
-        _no_numbers_in_statistics,
-    ),
-    Case(
-        "no numbers in a medium",
-        "dipole",
-        "NaN and infinities for each coefficient",
-        "NaN without a mask",
-        "ValueError naming the argument",
-        _no_numbers_in_media,
-    ),
-    Case(
-        "single pixels",
-        "pictures",
-        "1 x 1",
-        "differences of neighbors that do not exist",
-        "values of that pixel",
-        _single_pixels,
-    ),
-    Case(
-        "8K pictures",
-        "hdr",
-        "7680 x 4320, two exposures",
-        "indices and memory",
-        "the values of a small picture",
-        _eight_thousand,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "brackets that miss the range",
-        "hdr",
-        "darker than all noise, brighter than the shortest",
-        "0/0 of weights",
-        "darkness within its error; saturated pixels masked",
-        _missed_range,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "conditions 1 to 1e12",
-        "non-negative mixtures",
-        "six materials ever more alike",
-        "a Gram matrix squares the condition",
-        "samples again within 1e-6, shares bounded",
-        _conditions,
-    ),
-    Case(
-        "light that no lamp gives",
-        "renderer",
-        "negative, NaN, infinite",
-        "the renderer draws it without a word",
-        "RenderError naming the light",
-        _light_in_renderer,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-)

@@ -8,9 +8,11 @@ clamp fails the case.
 
 from __future__ import annotations
 
+import csv
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module, resources
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,10 @@ import numpy as np
 from skinrig.extremes.expectations import Case, Real, Unexpected
 
 SCHEMA = "skinrig.extremes.cases/1"
+
+CASES_TABLE = resources.files("skinrig").joinpath("data/extremes.csv")
+"""Name, stage, extreme, danger and expectation of each case, with module and function of its trial;
+`one_precision` says why one run stands for both, where a trial has no precision to choose."""
 
 INPUT_PRECISIONS: Mapping[str, Real] = {"float32": np.float32, "float64": np.float64}
 """What the inputs of each case are given in."""
@@ -46,33 +52,14 @@ class Result:
 
 
 def all_cases() -> tuple[Case, ...]:
-    """Return every case, in the order of the light: transport, pictures, surface, motion."""
-    from skinrig.extremes import (
-        arrays,
-        domains,
-        interior,
-        motion,
-        photons,
-        reflectance,
-        rendering,
-        transport,
-    )
-    from skinrig.extremes import images as pictures
-    from skinrig.extremes import surface as extremes_surface
+    """Return every case, in the order of the light: transport, images, surface, motion."""
+    rows = csv.DictReader(CASES_TABLE.read_text(encoding="utf-8").splitlines())
+    return tuple(_case(**row) for row in rows)
 
-    groups = (
-        transport,
-        photons,
-        rendering,
-        pictures,
-        extremes_surface,
-        reflectance,
-        interior,
-        motion,
-        arrays,
-        domains,
-    )
-    return tuple(case for group in groups for case in group.CASES)
+
+def _case(*, run: str, **words: str) -> Case:
+    module, function = run.split(".")
+    return Case(run=getattr(import_module(f"skinrig.extremes.{module}"), function), **words)
 
 
 def try_case(case: Case) -> Result:
@@ -145,6 +132,3 @@ def to_document(results: Iterable[Result]) -> dict[str, Any]:
         for result in results
     ]
     return {"schema": SCHEMA, "cases": rows, "passed": all(row["passed"] for row in rows)}
-
-
-# what cases say of their results

@@ -9,25 +9,15 @@ from model import fresnel, microstructure, photon_table
 from model.texture_statistics import masks as texture_masks
 from model.tissue_optics import adding_doubling, layered_diffusion
 from reconstruction import photometric_stereo as stereo
-from skinrig.extremes.expectations import (
-    Case,
-    Real,
-    Unexpected,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-)
+from skinrig.extremes.expectations import Real, Unexpected, as_real, clean, masked, near, refused
 from skinrig.extremes.expectations import within as within_bounds
+from skinrig.extremes.inputs import ring, sheet_faces, stretched_sheet
 
 INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
 
 def _far_lights(real: Real) -> str:
-
-    turn = np.arange(8) * (np.pi / 4)
-    way = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(8, np.sqrt(0.75))], -1)
+    way = ring(8, np.pi / 6)
     normal = np.array([0.1, -0.2, np.sqrt(0.95)])
     lit = as_real((way @ normal)[:, None, None], real)
     infinite = stereo.estimate_normals(lit, way)
@@ -47,10 +37,8 @@ def _far_lights(real: Real) -> str:
 
 
 def _one_photon(real: Real) -> str:
-
     rng = np.random.default_rng(9)
-    turn = np.arange(24) * (np.pi / 12)
-    way = np.stack([0.6 * np.cos(turn), 0.6 * np.sin(turn), np.full(24, 0.8)], -1)
+    way = ring(24, np.arcsin(0.6))
 
     def seen(photons: float) -> stereo.NormalMaps:
         electrons = rng.poisson(photons, (24, 1, 1, 2000)) + rng.standard_normal((24, 1, 1, 2000))
@@ -77,30 +65,15 @@ def _one_photon(real: Real) -> str:
 
 
 def _one_turned_triangle(real: Real) -> str:
-
-    u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
-    flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
-    cell = np.arange(81).reshape(9, 9)
-    a, b, c, d = (
-        cell[:-1, :-1].ravel(),
-        cell[:-1, 1:].ravel(),
-        cell[1:, 1:].ravel(),
-        cell[1:, :-1].ravel(),
-    )
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    flat, moved, uv = (as_real(part, real) for part in stretched_sheet((1.1, 1.0, 1.0)))
+    faces = sheet_faces(9)
     faces[20] = faces[20][::-1]
-    found = microstructure.strain(
-        as_real(flat, real),
-        as_real(flat * [1.1, 1.0, 1.0], real),
-        faces,
-        as_real(np.stack([u.ravel(), v.ravel()], -1), real),
-    )
+    found = microstructure.strain(flat, moved, faces, uv)
     masked(found.valid, share=(1.0, 1.0))
     return near(found.r_s, np.full(81, 1.1), relative=1e-5)
 
 
 def _profile_beyond_numbers(real: Real) -> str:
-
     ends = as_real([1e-18, 1e18] if real is np.float32 else [1e-50, 1e50], real)
     slopes = photon_table.derivatives(ends, real(0.02), real(1.0))
     clean(np.stack(slopes), np.ones((3, 2), bool), what="profile and slopes")
@@ -115,7 +88,6 @@ def _profile_beyond_numbers(real: Real) -> str:
 
 
 def _layers_of_no_medium(real: Real) -> str:
-
     told = 0
     for solver in (adding_doubling, layered_diffusion):
         for place, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
@@ -132,7 +104,6 @@ def _layers_of_no_medium(real: Real) -> str:
 
 
 def _nothing_to_continue(real: Real) -> str:
-
     image = as_real(np.full((7, 5, 3), 0.4), real)
     refused(lambda: texture_masks.fill_smoothly(image, np.zeros((7, 5), bool)), ValueError, "valid")
     one = np.zeros((7, 5), bool)
@@ -142,7 +113,6 @@ def _nothing_to_continue(real: Real) -> str:
 
 
 def _index_of_nothing(real: Real) -> str:
-
     averages = (fresnel.normal_reflectance, fresnel.boundary_factor, fresnel.diffuse_internal)
     for average in averages:
         for bad in (np.nan, np.inf, 0.0, -1.0):
@@ -153,63 +123,3 @@ def _index_of_nothing(real: Real) -> str:
             raise Unexpected(f"eta {eta:g}: expected a reflectance from 0 to 1")
     matched = [float(fresnel.reflectance(real(c), 1.0)) for c in (0.0, 1e-3, 1.0)]
     return within_bounds(matched, 0.0, 1e-12, what="matched: reflectance")
-
-
-CASES = (
-    Case(
-        "light at infinity",
-        "photometric stereo",
-        "no distance, 1 km, and infinity as a place",
-        "infinity over infinity in the falloff",
-        "the same normals; PhotometricStereoError",
-        _far_lights,
-    ),
-    Case(
-        "one photon per pixel",
-        "photometric stereo",
-        "1 photon, 1 electron of noise",
-        "chance passes for shape",
-        "at most 5 % given a normal; of 100 photons all, 68 % held",
-        _one_photon,
-    ),
-    Case(
-        "one triangle turned over",
-        "strain",
-        "one of 128 wound the other way",
-        "its stretch changes sign among its neighbors'",
-        "the stretch of all, 1.1",
-        _one_turned_triangle,
-    ),
-    Case(
-        "photon table beyond numbers",
-        "photon table",
-        "r of 1e-50 and 1e50 mm (float32: 1e-18 and 1e18); NaN, infinity, negative",
-        "squares over- and underflow",
-        "finite, none far away; ValueError naming the argument",
-        _profile_beyond_numbers,
-    ),
-    Case(
-        "layers of no medium",
-        "layers",
-        "NaN and negative coefficients and thicknesses",
-        "NaN through every layer without a mask",
-        "ValueError naming the argument",
-        _layers_of_no_medium,
-    ),
-    Case(
-        "texture with nothing valid",
-        "texture fill",
-        "an empty mask; NaN around one texel",
-        "levels halved for ever",
-        "ValueError naming valid; the one color everywhere",
-        _nothing_to_continue,
-    ),
-    Case(
-        "index of nothing",
-        "fresnel",
-        "eta NaN, 0, negative, infinite, and the largest number",
-        "its square overflows, 0/0 where media match",
-        "ValueError naming eta; from 0 to 1",
-        _index_of_nothing,
-    ),
-)

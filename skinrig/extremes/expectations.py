@@ -38,13 +38,6 @@ class Case:
     have."""
 
 
-WHY_INTEGERS = "pictures of a sensor are integers"
-
-
-WHY_SINGLE_PRECISION = "rays are cast in the renderer's own single precision"
-"""Of cases whose inputs have one precision."""
-
-
 def near(
     got: ArrayLike, expected: ArrayLike, *, relative: float = 0.0, absolute: float = 0.0
 ) -> str:

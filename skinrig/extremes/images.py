@@ -11,8 +11,6 @@ from capture import hdr
 from model import color_table
 from reconstruction import chromophores, polarization
 from skinrig.extremes.expectations import (
-    WHY_INTEGERS,
-    Case,
     Real,
     Unexpected,
     as_real,
@@ -60,7 +58,6 @@ def _below_black(_: Real) -> str:
 
 
 def _full_scale(_: Real) -> str:
-
     dn = np.full((1, 2, 2), 65534, np.uint16)
     radiance, _variance, valid = hdr.merge(
         dn, [2.0], gain=0.5, read_noise=3.0, black=0.0, white=65535.0
@@ -89,20 +86,17 @@ def _one_electron(_: Real) -> str:
 
 
 def _not_polarized(real: Real) -> str:
-
     same = as_real(np.full((2, 2, 3), 0.3), real)
     found = polarization.separate(same, same)
     return near(found.specular, np.zeros((2, 2, 3)), absolute=1e-6)
 
 
 def _useless_polarizer(real: Real) -> str:
-
     same = as_real(np.full((2, 2, 3), 0.3), real)
     return refused(lambda: polarization.separate(same, same, extinction=1.0), ValueError, "1")
 
 
 def _not_a_number(real: Real) -> str:
-
     one, other = (as_real(np.full((2, 2, 3), v), real) for v in (0.5, 0.2))
     one[0, 0] = np.nan
     other[1, 1] = np.inf
@@ -117,14 +111,12 @@ def _table() -> ColorTable:
 
 
 def _black_pixels(real: Real) -> str:
-
     found = chromophores.invert(as_real(np.zeros((4, 3)), real), _table())
     clean(found.melanin, found.valid, what="melanin")
     return masked(found.valid)
 
 
 def _odd_colors(real: Real) -> str:
-
     no_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
     rgb = as_real(np.array(no_skin), real)
     variance = as_real(np.full((5, 3), 1e-6), real)
@@ -135,7 +127,6 @@ def _odd_colors(real: Real) -> str:
 
 
 def _pigment_corners(real: Real) -> str:
-
     table = _table()
     c_m, c_hd = np.array([0.0, 0.0, 0.5, 0.5]), np.array([0.0, 0.32, 0.0, 0.32])
     found = chromophores.invert(as_real(table.lookup(c_m, c_hd), real), table, shading="known")
@@ -150,7 +141,6 @@ def _pigment_corners(real: Real) -> str:
 
 
 def _tiny_light(real: Real) -> str:
-
     table = _table()
     rgb = table.lookup(np.array([0.03]), np.array([0.05]))
     found = chromophores.invert(as_real(1e-5 * rgb, real), table)
@@ -159,123 +149,7 @@ def _tiny_light(real: Real) -> str:
 
 
 def _no_pixel(real: Real) -> str:
-
     found = chromophores.invert(as_real(np.zeros((0, 3)), real), _table())
     if found.melanin.shape != (0,):
         raise Unexpected(f"got shape {found.melanin.shape}, expected (0,)")
     return "an empty map"
-
-
-CASES = (
-    Case(
-        "brackets that all saturate",
-        "hdr",
-        "every frame at white",
-        "0/0 of weights",
-        "not valid",
-        _all_saturated,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "black frames",
-        "hdr",
-        "every frame at black",
-        "weights without light",
-        "radiance 0",
-        _all_black,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "negative after the darks",
-        "hdr",
-        "noise around black",
-        "clamping biases the mean",
-        "negative values kept, mean 0 (z, 6e-5 false alarms)",
-        _below_black,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "16-bit full scale",
-        "hdr",
-        "65,534 of 65,535",
-        "overflow of integers",
-        "valid, exact",
-        _full_scale,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "one pixel",
-        "hdr",
-        "1 x 1 frames",
-        "loops over rows",
-        "a value",
-        _one_by_one,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "one electron a second",
-        "hdr",
-        "light far below the read noise",
-        "weights that follow the noise",
-        "mean unbiased (z, 6e-5 false alarms)",
-        _one_electron,
-        one_precision=WHY_INTEGERS,
-    ),
-    Case(
-        "skin without gloss",
-        "polarization",
-        "parallel equals crossed",
-        "difference of equals",
-        "no specular light",
-        _not_polarized,
-    ),
-    Case(
-        "polarizer without effect",
-        "polarization",
-        "extinction 1 : 1",
-        "division by zero",
-        "ValueError",
-        _useless_polarizer,
-    ),
-    Case(
-        "no numbers in pictures",
-        "polarization",
-        "NaN and infinity in two pixels",
-        "NaN spreads",
-        "those two masked",
-        _not_a_number,
-    ),
-    Case("black pixels", "chromophores", "color 0", "logarithm of 0", "not valid", _black_pixels),
-    Case(
-        "colors of no skin",
-        "chromophores",
-        "blue, green, negative, NaN, infinity",
-        "Newton leaves the table",
-        "not valid",
-        _odd_colors,
-    ),
-    Case(
-        "corners of the color table",
-        "chromophores",
-        "C_m 0 and 0.5, C_hd 0 and 0.32",
-        "cube-root axes have infinite slope",
-        "truth within 0.002; hemoglobin under C_m 0.5 within 3 large standard errors",
-        _pigment_corners,
-    ),
-    Case(
-        "very little light",
-        "chromophores",
-        "shading of 1e-5",
-        "float32 squares underflow",
-        "the same melanin",
-        _tiny_light,
-    ),
-    Case(
-        "no pixel at all",
-        "chromophores",
-        "shape (0, 3)",
-        "reductions over nothing",
-        "an empty map",
-        _no_pixel,
-    ),
-)

@@ -9,7 +9,6 @@ import numpy as np
 from model.dipole.gather import GatherError, exitance
 from model.dipole.maps import DipoleMaps
 from skinrig.extremes.expectations import (
-    Case,
     Real,
     Unexpected,
     as_real,
@@ -19,8 +18,6 @@ from skinrig.extremes.expectations import (
     rising,
     within,
 )
-
-STAGE_NAME = "light inside skin"
 
 
 def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
@@ -32,7 +29,6 @@ def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignor
 
 
 def _even(real: Real) -> str:
-
     place, area = _patch(real)
     light = as_real(np.full((len(area), 3), 3.0), real)
     told = []
@@ -45,7 +41,6 @@ def _even(real: Real) -> str:
 
 
 def _coarse(real: Real) -> str:
-
     place, area = _patch(real, step_mm=5.0)
     light = as_real(1.0 + np.sin(place.astype(np.float64)), real)
     got = exitance(place, area, light, place, 0.5, 0.01, entered_at=light)
@@ -53,7 +48,6 @@ def _coarse(real: Real) -> str:
 
 
 def _above_one(real: Real) -> str:
-
     found = DipoleMaps.of(as_real([[[1.2, 1.0, 0.5]]], real), as_real(2.0, real), eta=1.4)
     if found.outlier.tolist() != [[[True, False, False]]]:
         raise Unexpected(f"outlier: got {found.outlier.tolist()}, expected the first alone")
@@ -64,7 +58,6 @@ def _above_one(real: Real) -> str:
 
 
 def _inverse(real: Real) -> str:
-
     lost = np.geomspace(1e-9 if real is np.float64 else 1e-6, 0.999999, 60)
     found = DipoleMaps.of((1.0 - as_real(lost, real))[:, None], [1.0], eta=1.4)
     masked(found.valid, share=(1.0, 1.0))
@@ -72,7 +65,6 @@ def _inverse(real: Real) -> str:
 
 
 def _single(real: Real) -> str:
-
     one = as_real([[1.0, 2.0, 3.0]], real)
     return near(
         exitance(one, as_real([0.1], real), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]], relative=1e-6
@@ -80,7 +72,6 @@ def _single(real: Real) -> str:
 
 
 def _empty(real: Real) -> str:
-
     shape = (2, 2, 3)
     found = DipoleMaps.of(
         as_real(np.full(shape, 0.5), real),
@@ -94,7 +85,6 @@ def _empty(real: Real) -> str:
 
 
 def _folded(real: Real) -> str:
-
     place, area = _patch(real)
     both = np.concatenate([place, place + as_real([0.0, 0.0, 1e-3], real)])
     light = np.zeros((len(both), 3), real)
@@ -104,77 +94,8 @@ def _folded(real: Real) -> str:
 
 
 def _opaque(real: Real) -> str:
-
     place, area = _patch(real)
     light = as_real(np.ones((len(area), 3)), real)
     return refused(
         lambda: exitance(place, area, light, place, 0.5, 0.0), GatherError, "translucency_mm"
     )
-
-
-CASES = (
-    Case(
-        "even light on any medium",
-        STAGE_NAME,
-        "R_d 0 to 1, 1/sigma_tr 0.01 to 100 mm",
-        "peaks finer than texels, tails beyond the face",
-        "R_d times what entered",
-        _even,
-    ),
-    Case(
-        "texels far wider than light spreads",
-        STAGE_NAME,
-        "5 mm apart, 1/sigma_tr 0.01 mm",
-        "a dipole between its samples: all light lost",
-        "the local term, all light kept",
-        _coarse,
-    ),
-    Case(
-        "albedo above one",
-        STAGE_NAME,
-        "R_d 1.2",
-        "no reduced albedo",
-        "a named outlier, masked",
-        _above_one,
-    ),
-    Case(
-        "albedo near one and near none",
-        STAGE_NAME,
-        "R_d 1e-6 to 1 - 1e-9",
-        "an infinite slope at alpha' = 1",
-        "1 - alpha' falls as R_d rises",
-        _inverse,
-    ),
-    Case(
-        "a single texel",
-        STAGE_NAME,
-        "one source, one exit point at the same place",
-        "a singular distance",
-        "R_d times what entered",
-        _single,
-    ),
-    Case(
-        "nothing valid",
-        STAGE_NAME,
-        "an empty mask, no source",
-        "empty sums",
-        "nothing valid, nothing leaves",
-        _empty,
-    ),
-    Case(
-        "skin on skin",
-        STAGE_NAME,
-        "a fold 1 um wide, one side dark",
-        "light counted twice",
-        "between none and the brightest",
-        _folded,
-    ),
-    Case(
-        "translucency of zero",
-        STAGE_NAME,
-        "1/sigma_tr = 0",
-        "division by it",
-        "GatherError naming translucency_mm",
-        _opaque,
-    ),
-)

@@ -8,9 +8,8 @@ import numpy as np
 
 from model import tissue_optics
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
-from skinrig.extremes.expectations import Case, Real, Unexpected, as_real, near, within
+from skinrig.extremes.expectations import Real, Unexpected, as_real, near, within
 
-STAGE_NAME = "Monte Carlo"
 Matter = tuple[float, float, float, float]
 """Thickness, sigma_a, sigma_s (mm, 1/mm) and g."""
 
@@ -95,72 +94,3 @@ def _no_boundary(real: Real) -> str:
 
 def _strong_boundary(real: Real) -> str:
     return _z_of_layers(real, (math.inf, 0.05, 1.5, 0.0), eta=1.6)
-
-
-EXPECTED_AGREEMENT = "the layers' reflectance (z of both errors, 6e-5 false alarms)"
-CASES = (
-    Case(
-        "photons that nothing absorbs",
-        STAGE_NAME,
-        "sigma_a 0, 1e-30 and 1e-12",
-        "roulette and weights of walks without an end",
-        "all light comes back or goes through",
-        _nothing_absorbed,
-    ),
-    Case(
-        "photons that are absorbed at once",
-        STAGE_NAME,
-        "sigma_a 1000, sigma_s' 1",
-        "weights that underflow",
-        "the surface's reflection, and hardly more",
-        _all_absorbed,
-    ),
-    Case(
-        "single-scattering albedo to 1",
-        STAGE_NAME,
-        "sigma_a 1e-5, sigma_s' 1, 20 mm",
-        "walks cut short lose light",
-        EXPECTED_AGREEMENT,
-        _albedo_to_one,
-    ),
-    Case(
-        "film on the skin",
-        STAGE_NAME,
-        "0.1 nm of sigma_a 50",
-        "steps longer than the layer",
-        "bare skin's reflectance (z, 6e-5 false alarms)",
-        _thin,
-    ),
-    Case(
-        "dark layer on a light one",
-        STAGE_NAME,
-        "sigma_a 60 over 0.05 per mm",
-        "steps that cross a stiff boundary",
-        EXPECTED_AGREEMENT,
-        _stiff,
-    ),
-    Case(
-        "light layer on a dark one",
-        STAGE_NAME,
-        "sigma_a 0.001 over 60 per mm",
-        "steps that cross a stiff boundary",
-        EXPECTED_AGREEMENT,
-        _stiff_below,
-    ),
-    Case(
-        "walks without a surface",
-        STAGE_NAME,
-        "eta 1",
-        "Fresnel's 0/0",
-        EXPECTED_AGREEMENT,
-        _no_boundary,
-    ),
-    Case(
-        "walks under a strong surface",
-        STAGE_NAME,
-        "eta 1.6",
-        "many total reflections",
-        EXPECTED_AGREEMENT,
-        _strong_boundary,
-    ),
-)

@@ -7,7 +7,7 @@ import numpy as np
 from model import dipole, merl
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
-from skinrig.extremes.expectations import Case, Real, as_real, masked, near, refused, rising, within
+from skinrig.extremes.expectations import Real, as_real, masked, near, refused, rising, within
 
 
 def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]
@@ -25,7 +25,6 @@ def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: i
 
 
 def _dark_surface(real: Real) -> str:
-
     found = brdf_basis.fit_weights(
         _samples(lambda light, view: np.zeros(light.shape[:-1]), real), brdf_tables.default()
     )
@@ -33,7 +32,6 @@ def _dark_surface(real: Real) -> str:
 
 
 def _negative_surface(real: Real) -> str:
-
     found = brdf_basis.fit_weights(
         _samples(lambda light, view: np.full(light.shape[:-1], -0.01), real), brdf_tables.default()
     )
@@ -41,7 +39,6 @@ def _negative_surface(real: Real) -> str:
 
 
 def _twins(real: Real) -> str:
-
     basis = brdf_tables.default()
     one = basis.mixed(np.eye(basis.size)[[20]])
     two = basis.mixed(np.eye(basis.size)[[20, 20]])
@@ -56,7 +53,6 @@ def _twins(real: Real) -> str:
 
 
 def _ill_conditioned(real: Real) -> str:
-
     basis = brdf_tables.default()
 
     def glossy(light, view):  # type: ignore[no-untyped-def]
@@ -74,7 +70,6 @@ def _ill_conditioned(real: Real) -> str:
 
 
 def _no_samples(real: Real) -> str:
-
     samples = _samples(lambda light, view: np.full(light.shape[:-1], np.nan), real)
     found = brdf_basis.fit_weights(samples, brdf_tables.default())
     within(found.weights, 0.0, 0.0, what="weights")
@@ -82,13 +77,11 @@ def _no_samples(real: Real) -> str:
 
 
 def _rank_above_data(real: Real) -> str:
-
     weights = as_real(np.random.default_rng(1).random((3, 59)), real)
     return refused(lambda: brdf_basis.reduce(weights, 10), ValueError, "rank")
 
 
 def _zero_rows(real: Real) -> str:
-
     weights = np.random.default_rng(1).random((40, 12))
     weights[:20] = 0.0
     shares, mix, error = brdf_basis.reduce(as_real(weights, real), 4)
@@ -97,14 +90,12 @@ def _zero_rows(real: Real) -> str:
 
 
 def _duplicated_rows(real: Real) -> str:
-
     one = np.random.default_rng(1).random(12)
     _, _, error = brdf_basis.reduce(as_real(np.tile(one, (30, 1)), real), 3)
     return within(error, 0.0, 1e-3, what="error")
 
 
 def _merl_bins(real: Real) -> str:
-
     half = real(0.5) * real(np.pi)
     first, last = merl.bins(real(0.0), real(0.0), real(0.0)), merl.bins(half, half, real(np.pi))
     refused(lambda: merl.bins(real(1.7), real(0.0), real(0.0)), ValueError, "theta_h")
@@ -113,7 +104,6 @@ def _merl_bins(real: Real) -> str:
 
 
 def _conditions(real: Real) -> str:
-
     # sigma_t' = sigma_tr / sqrt(3 (1 - alpha')): sixteen decades of 1 - alpha'
     deficit = as_real(np.logspace(-15, 0, 16), real)
     sigma_a, sigma_s = dipole.coefficients(deficit, as_real(np.ones(16), real))
@@ -123,7 +113,6 @@ def _conditions(real: Real) -> str:
 
 
 def _mirror_like(real: Real) -> str:
-
     basis = brdf_tables.default(0.0)
     up = as_real([0.0, 0.0, 1.0], real)
     lobe = basis.names.index("ggx 0.05 eta 1.4")
@@ -132,95 +121,3 @@ def _mirror_like(real: Real) -> str:
     # D = 1 / (pi a^2), G = 1 at the peak: F0 / (4 pi a^2)
     peak = (0.4 / 2.4) ** 2 / (4 * np.pi * 0.05**2)
     return near(basis.evaluate(up, up, up)[lobe], peak, relative=0.01)
-
-
-CASES = (
-    Case(
-        "surface that reflects nothing",
-        "lobe weights",
-        "all samples 0",
-        "cube roots of 0",
-        "weights 0",
-        _dark_surface,
-    ),
-    Case(
-        "surface below zero",
-        "lobe weights",
-        "all samples negative",
-        "noise fitted by lobes",
-        "weights 0",
-        _negative_surface,
-    ),
-    Case(
-        "two equal lobes",
-        "lobe weights",
-        "a duplicated basis",
-        "a singular Gram matrix",
-        "their sum is that of one",
-        _twins,
-    ),
-    Case(
-        "59 lobes alike",
-        "lobe weights",
-        "condition 1e8 and more",
-        "weights without meaning",
-        "the samples again, whatever the weights",
-        _ill_conditioned,
-    ),
-    Case(
-        "no sample at all",
-        "lobe weights",
-        "all NaN",
-        "an empty system",
-        "weights 0, not valid",
-        _no_samples,
-    ),
-    Case(
-        "rank above the data",
-        "NMF",
-        "rank 10 of 3 rows",
-        "factors of nothing",
-        "ValueError naming rank",
-        _rank_above_data,
-    ),
-    Case(
-        "rows of zeros",
-        "NMF",
-        "half of all points",
-        "division by their sum",
-        "they stay 0",
-        _zero_rows,
-    ),
-    Case(
-        "equal rows",
-        "NMF",
-        "rank 1 data, rank 3 asked",
-        "factors that vanish",
-        "error 0",
-        _duplicated_rows,
-    ),
-    Case(
-        "corners of a table",
-        "MERL",
-        "angles 0 and 90 degrees, and beyond",
-        "an index one too far",
-        "first and last bin; ValueError beyond",
-        _merl_bins,
-    ),
-    Case(
-        "sixteen decades of absorption",
-        "dipole",
-        "1 - alpha' from 1e-15 to 1",
-        "condition 1e15 of alpha'",
-        "sigma_tr again within 1e-5",
-        _conditions,
-    ),
-    Case(
-        "mirror-like lobe",
-        "lobe tables",
-        "roughness 0.05 at its peak, and light from below",
-        "a peak between nodes",
-        "its closed form; 0 below the horizon",
-        _mirror_like,
-    ),
-)

@@ -16,16 +16,8 @@ from rigsim.light import surface_brdf
 from rigsim.render import Caster, visibility
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.extremes.expectations import (
-    WHY_SINGLE_PRECISION,
-    Case,
-    Real,
-    Unexpected,
-    as_real,
-    near,
-    refused,
-    within,
-)
+from skinrig.extremes.expectations import Real, Unexpected, as_real, near, refused, within
+from skinrig.extremes.inputs import sheet_faces
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor
@@ -36,16 +28,8 @@ def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float
     across = (np.arange(side) - (side - 1) / 2) * pitch_mm
     x, y = np.meshgrid(across, across)
     points = np.stack([x, y, height_mm(x, y)], -1).reshape(-1, 3) + np.asarray(offset_mm)
-    cell = np.arange(side * side).reshape(side, side)
-    a, b, c, d = (
-        cell[:-1, :-1].ravel(),
-        cell[:-1, 1:].ravel(),
-        cell[1:, 1:].ravel(),
-        cell[1:, :-1].ravel(),
-    )
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     uv = np.stack([(x / across[-1] + 1) / 2, (y / across[-1] + 1) / 2], -1).reshape(-1, 2)
-    return build_mesh(points, faces, uv)
+    return build_mesh(points, sheet_faces(side), uv)
 
 
 def _seen(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
@@ -107,7 +91,6 @@ def _light_behind(_: Real) -> str:
 
 
 def _zero_triangles(real: Real) -> str:
-
     points = as_real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]), real)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
     normals = vertex_normals(points, faces)
@@ -117,7 +100,6 @@ def _zero_triangles(real: Real) -> str:
 
 
 def _wrong_unit(real: Real) -> str:
-
     points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
     return refused(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
@@ -140,7 +122,6 @@ def _tilted(degrees: float) -> Float64Array:
 
 
 def _grazing(real: Real) -> str:
-
     values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
     cosine = math.cos(math.radians(89.9))
     within(values[-1] * cosine, 0.0, 1e3, what="radiance")
@@ -159,7 +140,6 @@ def _grazing(real: Real) -> str:
 
 
 def _roughness_ends(real: Real) -> str:
-
     sharp = microfacet.brdf(
         real(1.0), real(1.0), real(1.0), real(1.0), roughness=0.01, eta=1.4, kind="ggx"
     )
@@ -175,7 +155,6 @@ def _roughness_ends(real: Real) -> str:
 
 
 def _furnace(real: Real) -> str:
-
     rng = np.random.default_rng(7)
     count = 200_000
     u, v = rng.random(count), rng.random(count)
@@ -196,7 +175,6 @@ def _chip() -> Sensor:
 
 
 def _bad_light(real: Real) -> str:
-
     def exposed(value: float) -> object:
         light = as_real(np.full((2, 2, 3), value), real)
         return sensor.expose(light, sensor=_chip(), rng=np.random.default_rng(0))
@@ -207,7 +185,6 @@ def _bad_light(real: Real) -> str:
 
 
 def _very_bright(real: Real) -> str:
-
     chip = _chip()
     dn = sensor.expose(
         as_real(np.full((4, 4, 3), 1e9), real), sensor=chip, rng=np.random.default_rng(0)
@@ -216,7 +193,6 @@ def _very_bright(real: Real) -> str:
 
 
 def _negative_environment(_: Real) -> str:
-
     scene = {
         "type": "scene",
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
@@ -226,126 +202,3 @@ def _negative_environment(_: Real) -> str:
     return refused(
         lambda: render.radiance(scene, kind="rgb", samples=1), render.RenderError, "light.radiance"
     )
-
-
-CASES = (
-    Case(
-        "shadow far from the origin",
-        "ray casting",
-        "300 mm off",
-        "offsets of rays grow with the distance from the origin",
-        "the same shadow",
-        _shadow_off_origin,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "shadow of furrows far from the origin",
-        "ray casting",
-        "60 um deep, 1000 mm off",
-        "offsets of rays wider than the relief",
-        "the same shadows",
-        _fine_shadow_off_origin,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "light along a plane",
-        "ray casting",
-        "0.1 degrees above it",
-        "a flat sheet shadows itself",
-        "all lit",
-        _no_self_shadow,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "light on the skin",
-        "ray casting",
-        "1 mm away",
-        "rays shorter than their offset",
-        "all lit",
-        _light_on_skin,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "light on skin far from the origin",
-        "ray casting",
-        "0.1 mm away, 1000 mm off",
-        "offsets as long as the ray",
-        "all lit",
-        _light_near_far_skin,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "light behind the skin",
-        "ray casting",
-        "a closed horizon",
-        "light leaks through",
-        "nothing lit",
-        _light_behind,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-    Case(
-        "triangles without area",
-        "mesh",
-        "three points in a line",
-        "normal 0/0",
-        "unit normals, and rays that hit the others",
-        _zero_triangles,
-    ),
-    Case(
-        "mesh in metres",
-        "mesh",
-        "an extent of 0.1",
-        "offsets larger than the face",
-        "MeshError saying millimetres",
-        _wrong_unit,
-    ),
-    Case(
-        "light and view at 89.9 degrees",
-        "surface reflection",
-        "cosines of 0.0017",
-        "1/(4 cos cos)",
-        "finite, the same both ways, no more than a mirror",
-        _grazing,
-    ),
-    Case(
-        "roughness 0.01 and 1",
-        "microfacets",
-        "a mirror and chalk",
-        "overflow of 1/alpha^4",
-        "closed forms",
-        _roughness_ends,
-    ),
-    Case(
-        "white furnace",
-        "surface reflection",
-        "R_d 1 under films of oil",
-        "lobes that add up to more than all light",
-        "0.7 to 1 (1 % for the random directions)",
-        _furnace,
-    ),
-    Case(
-        "light that is none",
-        "sensor",
-        "negative, NaN, infinite",
-        "noise of a negative mean",
-        "SensorError",
-        _bad_light,
-    ),
-    Case(
-        "a billion times full scale",
-        "sensor",
-        "light 1e9",
-        "Poisson numbers overflow",
-        "white",
-        _very_bright,
-    ),
-    Case(
-        "negative environment",
-        "renderer",
-        "radiance -1",
-        "the renderer makes a negative picture without a word",
-        "RenderError",
-        _negative_environment,
-        one_precision=WHY_SINGLE_PRECISION,
-    ),
-)

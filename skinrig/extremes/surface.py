@@ -13,7 +13,6 @@ from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import (
-    Case,
     Real,
     Unexpected,
     as_real,
@@ -23,16 +22,9 @@ from skinrig.extremes.expectations import (
     refused,
     within,
 )
+from skinrig.extremes.inputs import ring
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
-
-
-def _ring(count: int, tilt_rad: float) -> Float64Array:
-    turn = np.arange(count) * (2.0 * np.pi / count)
-    side = np.sin(tilt_rad)
-    return np.stack(
-        [side * np.cos(turn), side * np.sin(turn), np.full(count, np.cos(tilt_rad))], -1
-    )
 
 
 def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
@@ -45,7 +37,6 @@ def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]
 
 
 def _coplanar(real: Real) -> str:
-
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
@@ -56,7 +47,6 @@ def _coplanar(real: Real) -> str:
 
 
 def _collinear(real: Real) -> str:
-
     lights = np.repeat(UP_NORMAL[None], 5, axis=0)
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
@@ -67,16 +57,14 @@ def _collinear(real: Real) -> str:
 
 
 def _all_shadowed(real: Real) -> str:
-
-    lights = _ring(8, 0.6)
+    lights = ring(8, 0.6)
     found = stereo.estimate_normals(as_real(np.zeros((8, 3, 3)), real), lights)
     clean(found.normals, found.valid, what="normals")
     return masked(found.valid)
 
 
 def _two_lights_left(real: Real) -> str:
-
-    lights = _ring(8, 0.6)
+    lights = ring(8, 0.6)
     seen = np.zeros((8, 1, 1), bool)
     seen[:2] = True
     found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=seen)
@@ -84,7 +72,6 @@ def _two_lights_left(real: Real) -> str:
 
 
 def _nearly_coplanar(real: Real) -> str:
-
     lights = np.array(
         [
             [np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)]
@@ -111,8 +98,7 @@ def _nearly_coplanar(real: Real) -> str:
 
 
 def _grazing(real: Real) -> str:
-
-    lights = _ring(12, np.radians(89.9))
+    lights = ring(12, np.radians(89.9))
     found = stereo.estimate_normals(
         _lit(np.vstack([lights, UP_NORMAL]), UP_NORMAL, real), np.vstack([lights, UP_NORMAL])
     )
@@ -124,8 +110,7 @@ def _grazing(real: Real) -> str:
 
 
 def _near_light(real: Real) -> str:
-
-    places = 1.0 * _ring(8, 0.6)  # a millimetre from the skin
+    places = 1.0 * ring(8, 0.6)  # a millimetre from the skin
     away = np.linalg.norm(places, axis=-1)
     lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
     found = stereo.estimate_normals(
@@ -139,12 +124,11 @@ def _near_light(real: Real) -> str:
 
 
 def _far_light(real: Real) -> str:
-
-    places = 1e7 * _ring(8, 0.6)
-    lit = np.clip(_ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
+    places = 1e7 * ring(8, 0.6)
+    lit = np.clip(ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
         as_real(1e14 * lit[:, None, None], real),
-        _ring(8, 0.6),
+        ring(8, 0.6),
         light_positions_mm=places,
         points_mm=np.zeros((1, 1, 3)),
         light_intensity=np.full(8, 1e14),
@@ -154,8 +138,7 @@ def _far_light(real: Real) -> str:
 
 
 def _scales(real: Real) -> str:
-
-    lights = _ring(8, 0.6)
+    lights = ring(8, 0.6)
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     off = []
     for scale in (1e-12, 1e12):
@@ -166,7 +149,6 @@ def _scales(real: Real) -> str:
 
 
 def _cliff(real: Real) -> str:
-
     slope = np.zeros((24, 24))
     slope[:, 12] = 20.0  # a wall of 87 degrees
     normals = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], -1)
@@ -178,7 +160,6 @@ def _cliff(real: Real) -> str:
 
 
 def _horizontal_normals(real: Real) -> str:
-
     normals = np.zeros((8, 8, 3))
     normals[..., 2] = 1.0
     normals[4, 4] = (1.0, 0.0, 0.0)
@@ -190,7 +171,6 @@ def _horizontal_normals(real: Real) -> str:
 
 
 def _islands(real: Real) -> str:
-
     normals = np.zeros((16, 16, 3))
     normals[..., 2] = 1.0
     valid = np.zeros((16, 16), bool)
@@ -200,7 +180,6 @@ def _islands(real: Real) -> str:
 
 
 def _empty_mask(real: Real) -> str:
-
     normals = np.zeros((4, 4, 3))
     normals[..., 2] = 1.0
     return refused(
@@ -211,14 +190,12 @@ def _empty_mask(real: Real) -> str:
 
 
 def _flat_height(real: Real) -> str:
-
     shares = normal_histogram.histogram(as_real(np.zeros((64, 64)), real), pixel=10.0)
     near(shares.sum(), 1.0, absolute=1e-9)
     return near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
 
 
 def _steep_height(real: Real) -> str:
-
     rows = np.arange(64.0)[:, None] * np.ones((1, 64))
     shares = normal_histogram.histogram(as_real(1e6 * rows, real), pixel=1.0)
     near(shares.sum(), 1.0, absolute=1e-9)
@@ -227,14 +204,12 @@ def _steep_height(real: Real) -> str:
 
 
 def _one_point(real: Real) -> str:
-
     return refused(
         lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0), ValueError
     )
 
 
 def _relief_without_relief(real: Real) -> str:
-
     flat = as_real(np.zeros((64, 64)), real)
     target = normal_histogram.histogram(flat, pixel=10.0)
     try:
@@ -245,8 +220,7 @@ def _relief_without_relief(real: Real) -> str:
 
 
 def _no_diffuse(real: Real) -> str:
-
-    lights = np.vstack([_ring(20, 0.5), _ring(20, 0.9)])
+    lights = np.vstack([ring(20, 0.5), ring(20, 0.9)])
     views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(
@@ -261,159 +235,9 @@ def _no_diffuse(real: Real) -> str:
 
 
 def _nothing_to_fill(real: Real) -> str:
-
     empty = texture_fill.push_pull(as_real(np.zeros((9, 7, 3)), real), np.zeros((9, 7)))
     one = np.zeros((9, 7))
     one[4, 3] = 1.0
     filled = texture_fill.push_pull(as_real(np.full((9, 7, 3), 0.4), real), one)
     clean(empty.values, np.ones((9, 7), bool), what="empty texture")
     return near(filled.values, np.full((9, 7, 3), 0.4), relative=1e-5)
-
-
-CASES = (
-    Case(
-        "lights in a plane",
-        "photometric stereo",
-        "nine directions of one plane",
-        "a matrix of rank 2",
-        "PhotometricStereoError naming the direction that is not seen",
-        _coplanar,
-    ),
-    Case(
-        "one direction only",
-        "photometric stereo",
-        "five equal lights",
-        "a matrix of rank 1",
-        "PhotometricStereoError naming both directions that are not seen",
-        _collinear,
-    ),
-    Case(
-        "lights almost in a plane",
-        "photometric stereo",
-        "0.06 degrees out of it, noise 0.1 %",
-        "condition 1e3 and more",
-        "masked, refused, or an error within 4 stated ones",
-        _nearly_coplanar,
-    ),
-    Case(
-        "every light in shadow",
-        "photometric stereo",
-        "no light at all",
-        "0/0 of the normal",
-        "not valid",
-        _all_shadowed,
-    ),
-    Case(
-        "two lights left",
-        "photometric stereo",
-        "six of eight in shadow",
-        "fewer than unknowns",
-        "not valid",
-        _two_lights_left,
-    ),
-    Case(
-        "light at 89.9 degrees",
-        "photometric stereo",
-        "cosine 0.0017",
-        "division by a cosine",
-        "masked, or within 0.1 degrees",
-        _grazing,
-    ),
-    Case(
-        "light at 1 mm",
-        "photometric stereo",
-        "inverse squares near the skin",
-        "direction differs over the face",
-        "within 0.05 degrees",
-        _near_light,
-    ),
-    Case(
-        "light at 10 km",
-        "photometric stereo",
-        "inverse squares far away",
-        "float32 of squared distances",
-        "within 0.05 degrees",
-        _far_light,
-    ),
-    Case(
-        "units of intensity",
-        "photometric stereo",
-        "1e-12 and 1e12",
-        "thresholds with a unit",
-        "within 0.05 degrees",
-        _scales,
-    ),
-    Case(
-        "a wall",
-        "normal integration",
-        "slope 20 in one column",
-        "one gradient rules all",
-        "a step of about its height, flat beside it",
-        _cliff,
-    ),
-    Case(
-        "a normal on the horizon",
-        "normal integration",
-        "n_z = 0",
-        "infinite slope",
-        "refused, or height finite",
-        _horizontal_normals,
-    ),
-    Case(
-        "islands",
-        "normal integration",
-        "three parts, one of a single pixel",
-        "a constant is free for each",
-        "each flat at 0",
-        _islands,
-    ),
-    Case(
-        "empty mask",
-        "normal integration",
-        "no pixel is valid",
-        "an empty system",
-        "IntegrationError naming valid",
-        _empty_mask,
-    ),
-    Case(
-        "no relief",
-        "normal histogram",
-        "height 0",
-        "all in one bucket",
-        "sum 1, at the middle",
-        _flat_height,
-    ),
-    Case(
-        "cliffs",
-        "normal histogram",
-        "slope 1e6",
-        "normals beyond the last bucket",
-        "sum 1, at the edge",
-        _steep_height,
-    ),
-    Case("one height", "normal histogram", "1 x 1", "no slope exists", "ValueError", _one_point),
-    Case(
-        "kernel of no relief",
-        "kernel fit",
-        "flat skin to flat skin",
-        "every kernel fits the same",
-        "refused, or not valid",
-        _relief_without_relief,
-    ),
-    Case(
-        "no light from inside",
-        "diffuse albedo",
-        "all samples 0",
-        "minimum over nothing",
-        "R_d 0 or masked",
-        _no_diffuse,
-    ),
-    Case(
-        "texture of one texel",
-        "texture fill",
-        "nothing, and one known texel",
-        "division by no weight",
-        "finite; the one value everywhere",
-        _nothing_to_fill,
-    ),
-)

@@ -10,8 +10,8 @@ from model import dipole, photon_table, tissue_optics
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from skinrig.arrays import Float64Array
 from skinrig.extremes.expectations import (
-    Case,
     Real,
     Unexpected,
     as_real,
@@ -24,8 +24,16 @@ from skinrig.extremes.expectations import (
 )
 
 
-def _albedo_near_one(real: Real) -> str:
+def _layers(
+    real: Real, *layers: tuple[float, float, float], eta: float = 1.4, directions: int | None = None
+) -> Float64Array:
+    """Return the reflectance of layers by sigma_a and sigma_s', 1/mm, and thickness, mm."""
+    return tissue_optics.layer_stack_reflectance(
+        *(as_real(part, real) for part in zip(*layers, strict=True)), eta=eta, directions=directions
+    )
 
+
+def _albedo_near_one(real: Real) -> str:
     deficit = np.logspace(-15, -1, 57)
     lost = dipole.absorbed_fraction(as_real(deficit, real), 1.4)
     said = rising(lost, what="1 - R_d")
@@ -45,13 +53,11 @@ def _least_step(real: Real) -> float:
 
 
 def _reflectance_ends(real: Real) -> str:
-
     r_d = np.concatenate([np.logspace(-6, -1, 21), 1.0 - np.logspace(-1.2, _least_step(real), 21)])
     return rising(-dipole.invert_to_deficit(as_real(r_d, real), 1.4), what="alpha' - 1")
 
 
 def _all_light_back(real: Real) -> str:
-
     return near(
         [dipole.total_reflectance(real(1.0), eta) for eta in (1.0, 1.3, 1.4, 1.6)],
         [1.0] * 4,
@@ -60,7 +66,6 @@ def _all_light_back(real: Real) -> str:
 
 
 def _more_than_all(real: Real) -> str:
-
     return refused(
         lambda: dipole.invert_total_reflectance(real(1.02), 1.4),
         dipole.ReflectanceOutlierError,
@@ -69,7 +74,6 @@ def _more_than_all(real: Real) -> str:
 
 
 def _no_absorption(real: Real) -> str:
-
     r = as_real([0.1, 1.0, 10.0], real)
     clear = dipole.reflectance(r, real(0.0), real(1.0), 1.4)
     faint = dipole.reflectance(r, real(1e-12), real(1.0), 1.4)
@@ -77,10 +81,7 @@ def _no_absorption(real: Real) -> str:
 
 
 def _black_medium(real: Real) -> str:
-
-    inside = tissue_optics.layer_stack_reflectance(
-        as_real([1e3], real), as_real([1.0], real), as_real([math.inf], real)
-    )
+    inside = _layers(real, (1e3, 1.0, math.inf))
     said = within(inside, 0.0, 2e-3, what="R_d of layers")
     value = dipole.reflectance(
         as_real([0.0, 0.01, 0.1, 1.0, 10.0], real), real(1e3), real(1.0), 1.4
@@ -93,7 +94,6 @@ def _black_medium(real: Real) -> str:
 
 
 def _radius_ends(real: Real) -> str:
-
     r = as_real([0.0, 1e-9, 1e-3, 1e2, 1e4], real)
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
     two = diffusion.reflectance(r, real(0.02), real(1.0), 1.4)
@@ -110,22 +110,13 @@ def _radius_ends(real: Real) -> str:
 
 
 def _index_ends(real: Real) -> str:
-
-    found = [
-        float(
-            tissue_optics.layer_stack_reflectance(
-                as_real([0.01], real), as_real([1.0], real), as_real([math.inf], real), eta=eta
-            )
-        )
-        for eta in (1.0, 1.6)
-    ]
+    found = [float(_layers(real, (0.01, 1.0, math.inf), eta=eta)) for eta in (1.0, 1.6)]
     if not found[0] > found[1]:
         raise Unexpected(f"got {found}, expected less light to leave a denser medium")
     return within(found, 0.3, 0.9, what="R_d at eta 1 and 1.6")
 
 
 def _index_not_physical(real: Real) -> str:
-
     eta = float(real(0.9))
     return refused(
         lambda: tissue_optics.layer_stack_reflectance([0.01], [1.0], [math.inf], eta=eta),
@@ -135,54 +126,32 @@ def _index_not_physical(real: Real) -> str:
 
 
 def _thin_layer(real: Real) -> str:
-
-    bare = tissue_optics.layer_stack_reflectance(
-        as_real([0.02], real), as_real([1.5], real), as_real([math.inf], real)
-    )
-    covered = tissue_optics.layer_stack_reflectance(
-        as_real([5.0, 0.02], real), as_real([1.5, 1.5], real), as_real([1e-9, math.inf], real)
-    )
+    bare = _layers(real, (0.02, 1.5, math.inf))
+    covered = _layers(real, (5.0, 1.5, 1e-9), (0.02, 1.5, math.inf))
     return near(covered, bare, relative=1e-6)
 
 
 def _no_layer_at_all(real: Real) -> str:
-
-    clear = tissue_optics.layer_stack_reflectance(
-        as_real([0.0], real), as_real([0.0], real), as_real([1.0], real)
-    )
+    clear = _layers(real, (0.0, 0.0, 1.0))
     surface = ((1.4 - 1.0) / (1.4 + 1.0)) ** 2
     # a pane of glass: what its back reflects, through its front, to and fro
     return near(clear, surface * (1.0 - surface) ** 2 / (1.0 - surface**2), relative=1e-6)
 
 
 def _stiff_layers(real: Real) -> str:
-
-    fine = tissue_optics.layer_stack_reflectance(
-        as_real([60.0, 0.05], real),
-        as_real([7.0, 3.5], real),
-        as_real([0.25, math.inf], real),
-        directions=16,
-    )
-    finer = tissue_optics.layer_stack_reflectance(
-        as_real([60.0, 0.05], real),
-        as_real([7.0, 3.5], real),
-        as_real([0.25, math.inf], real),
-        directions=32,
+    fine, finer = (
+        _layers(real, (60.0, 7.0, 0.25), (0.05, 3.5, math.inf), directions=n) for n in (16, 32)
     )
     return near(fine, finer, relative=0.01)
 
 
 def _conserving_layers(real: Real) -> str:
-
-    white = tissue_optics.layer_stack_reflectance(
-        as_real([0.0, 0.0], real), as_real([5.0, 1.0], real), as_real([0.25, math.inf], real)
-    )
+    white = _layers(real, (0.0, 5.0, 0.25), (0.0, 1.0, math.inf))
     entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # what the surface does not reflect at once
     return near(white, entered, absolute=2e-3)
 
 
 def _pigment_ends(real: Real) -> str:
-
     wavelength = as_real([400.0, 500.0, 600.0, 700.0], real)
     c_m, c_hd = as_real([0.0, 0.5], real)[:, None, None], as_real([0.0, 0.32], real)[:, None]
     value = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
@@ -192,7 +161,6 @@ def _pigment_ends(real: Real) -> str:
 
 
 def _pigment_beyond(real: Real) -> str:
-
     return refused(
         lambda: tissue_optics.two_layer_reflectance(real(500.0), real(-0.01), real(0.05)),
         ValueError,
@@ -201,7 +169,6 @@ def _pigment_beyond(real: Real) -> str:
 
 
 def _table_far(real: Real) -> str:
-
     refused(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
     r = as_real([1e-4, 0.5, 20.0, 1e3], real)
     value = photon_table.reflectance(r, real(0.05), real(1.0))
@@ -210,7 +177,6 @@ def _table_far(real: Real) -> str:
 
 
 def _profile_flat(real: Real) -> str:
-
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(r, as_real(np.full((1, 28), 1e-3), real))
     clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
@@ -218,7 +184,6 @@ def _profile_flat(real: Real) -> str:
 
 
 def _profile_dark(real: Real) -> str:
-
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(
         r, as_real(np.zeros((1, 28)), real), variance=as_real(np.full((1, 28), 1e-12), real)
@@ -228,7 +193,6 @@ def _profile_dark(real: Real) -> str:
 
 
 def _profile_broken(real: Real) -> str:
-
     r = np.linspace(1.0, 15.0, 28)
     truth = photon_table.reflectance(r, 0.08, 1.2)
     profile = as_real(np.stack([truth, truth]), real)
@@ -240,171 +204,6 @@ def _profile_broken(real: Real) -> str:
 
 
 def _one_photon(real: Real) -> str:
-
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
     found = transport(stack, photons=1, rng=np.random.default_rng(0))
     return within(found.reflectance, 0.0, 1.0, what="share reflected")
-
-
-CASES = (
-    Case(
-        "reduced albedo to 1",
-        "dipole",
-        "1 - alpha' from 1e-1 down to 1e-15",
-        "R_d has infinite slope at 1: digits are lost",
-        "1 - R_d rises; inverse to rounding",
-        _albedo_near_one,
-    ),
-    Case(
-        "reflectance from 1e-6 to 1 - 1e-9",
-        "dipole",
-        "both ends of R_d at once",
-        "the inverse of eq. (5) stalls or jumps",
-        "alpha' rises with R_d",
-        _reflectance_ends,
-    ),
-    Case(
-        "no loss at all",
-        "dipole",
-        "alpha' = 1 for eta from 1 to 1.6",
-        "0/0 in the boundary's term",
-        "R_d = 1 for every eta",
-        _all_light_back,
-    ),
-    Case(
-        "more light than fell",
-        "dipole",
-        "R_d = 1.02",
-        "a root that does not exist",
-        "ReflectanceOutlierError naming the value",
-        _more_than_all,
-    ),
-    Case(
-        "absorption to zero",
-        "dipole",
-        "sigma_a = 0 and 1e-12",
-        "sigma_tr = 0 under a root",
-        "both profiles agree",
-        _no_absorption,
-    ),
-    Case(
-        "absorption far above scattering",
-        "layers",
-        "sigma_a = 1000, sigma_s' = 1",
-        "exponentials under- and overflow",
-        "R_d below 0.002, finite",
-        _black_medium,
-    ),
-    Case(
-        "distance to zero and infinity",
-        "dipole",
-        "r = 0, 1e-9, 100, 10,000 and 1e30 mm",
-        "1/r and e^-r",
-        "finite, smooth at 0, none far away; infinity refused",
-        _radius_ends,
-    ),
-    Case(
-        "index 1 and 1.6",
-        "layers",
-        "no boundary, and a strong one",
-        "Fresnel's averages",
-        "less light leaves the denser medium",
-        _index_ends,
-    ),
-    Case(
-        "index below 1",
-        "layers",
-        "eta = 0.9",
-        "total reflection outside",
-        "ValueError",
-        _index_not_physical,
-    ),
-    Case(
-        "layer thinner than a mean free path",
-        "layers",
-        "1e-9 mm over an infinite layer",
-        "doubling from an empty start",
-        "the lower layer alone",
-        _thin_layer,
-    ),
-    Case(
-        "empty layer",
-        "layers",
-        "no absorption, no scattering",
-        "0/0 in the albedo",
-        "a pane's back surface, in closed form",
-        _no_layer_at_all,
-    ),
-    Case(
-        "blue light in the darkest skin",
-        "layers",
-        "sigma_a 60 over 0.05 per mm",
-        "stiff absorption across a boundary",
-        "1 % of twice as many directions",
-        _stiff_layers,
-    ),
-    Case(
-        "white skin without end",
-        "layers",
-        "sigma_a = 0, infinite depth",
-        "doubling never converges",
-        "all that entered comes back",
-        _conserving_layers,
-    ),
-    Case(
-        "pigment at its ends",
-        "two-layer skin",
-        "C_m 0 and 0.5, C_hd 0 and 0.32",
-        "absorption over four decades",
-        "darker with each pigment, in (0, 1)",
-        _pigment_ends,
-    ),
-    Case(
-        "negative pigment",
-        "two-layer skin",
-        "C_m = -0.01",
-        "gain instead of loss",
-        "ValueError naming c_m",
-        _pigment_beyond,
-    ),
-    Case(
-        "photon table beyond its rings",
-        "photon table",
-        "r = 0, 1e-4 and 1000 mm",
-        "a pole at 0, extrapolation off the table",
-        "ValueError at 0, else finite and falling",
-        _table_far,
-    ),
-    Case(
-        "profile without decay",
-        "subsurface fit",
-        "28 equal readings",
-        "sigma_tr runs to zero",
-        "not valid, no NaN",
-        _profile_flat,
-    ),
-    Case(
-        "profile of darkness",
-        "subsurface fit",
-        "28 zeros",
-        "logarithm of 0",
-        "not valid, no NaN",
-        _profile_dark,
-    ),
-    Case(
-        "profile with a dead fibre",
-        "subsurface fit",
-        "one NaN of 28, masked",
-        "NaN spreads through sums",
-        "the fit of the other 27",
-        _profile_broken,
-    ),
-    Case(
-        "one photon",
-        "Monte Carlo",
-        "a single path",
-        "no spread to take an error from",
-        "a share from 0 to 1",
-        _one_photon,
-    ),
-)

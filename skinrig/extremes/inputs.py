@@ -1,0 +1,43 @@
+"""What several groups of cases hand over: rings of lights, sheets of triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinrig.arrays import Float64Array, Int64Array
+
+
+def ring(count: int, tilt_rad: float) -> Float64Array:
+    """Return directions (count, 3) at a tilt from +z, evenly around it.
+
+    Examples
+    --------
+    >>> ring(3, 0.5)[:, 2].round(3).tolist()
+    [0.878, 0.878, 0.878]
+    """
+    turn = np.arange(count) * (2.0 * np.pi / count)
+    across = np.sin(tilt_rad)
+    return np.stack(
+        [across * np.cos(turn), across * np.sin(turn), np.full(count, np.cos(tilt_rad))], -1
+    )
+
+
+def sheet_faces(side: int) -> Int64Array:
+    """Return the triangles (2 (side - 1)^2, 3) of a square sheet of side x side points.
+
+    Examples
+    --------
+    >>> sheet_faces(2).tolist()
+    [[0, 1, 3], [0, 3, 2]]
+    """
+    cell = np.arange(side * side).reshape(side, side)
+    a, b = cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel()
+    c, d = cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
+    return np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+
+
+def stretched_sheet(factors: tuple[float, float, float]) -> tuple[Float64Array, ...]:
+    """Return points (81, 3) of a flat sheet of 40 mm, the same times factors, and UV (81, 2)."""
+    u, v = (part.ravel() for part in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
+    flat = np.stack([40 * u, 40 * v, 0 * u], -1)
+    return flat, flat * factors, np.stack([u, v], -1)
