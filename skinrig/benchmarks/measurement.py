@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import time
 import tracemalloc
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain
-from typing import Any, Generic, Literal, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from skinrig.benchmarks import resident_memory
 
 Made = TypeVar("Made")
+Knob = str | int | float | bool
+Knobs = dict[str, Knob]
 
 LIMIT_CORES = 2
 """Cores of limits in seconds; processor time does not count other programs on them."""
@@ -152,7 +153,7 @@ def _allocated_mb(call: Callable[[], Any]) -> float:
 class Point:
     """One setting of a stage's effort knobs."""
 
-    knobs: Mapping[str, str | int | float | bool]
+    knobs: Mapping[str, Knob]
     """What was set; the report labels the point with it."""
     timing: Timing
     error: float
@@ -161,8 +162,21 @@ class Point:
     """68 % interval of ``error``."""
     cramer_rao_bound: float | None = None
     """Least error that any unbiased estimator could have, same unit; None: not known."""
-    also: Mapping[str, str | int | float | bool] = field(default_factory=dict)
+    also: Mapping[str, Knob] = field(default_factory=dict)
     """What else was measured at this setting; no knob."""
+
+    @classmethod
+    def of(
+        cls,
+        knobs: Mapping[str, Knob],
+        timing: Timing,
+        told: BandError,
+        also: Mapping[str, Knob] | None = None,
+    ) -> Point:
+        """Return the point of an error with interval and bound."""
+        return cls(
+            knobs, timing, told.error, told.error_interval, told.cramer_rao_bound, also or {}
+        )
 
     def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
         """Return variance over the least variance, with its 68 % interval; None without a bound.
@@ -258,85 +272,34 @@ class StageBenchmark:
         return "how far the reference itself may be off, in the error's unit"
 
 
-@dataclass(frozen=True, slots=True)
-class Case(Generic[Made]):
-    """One setting of a stage that :func:`compare` measures."""
-
-    knobs: Mapping[str, str | int | float | bool]
-    call: Callable[[], Made]
-    error: Callable[[Made], BandError]
-    """Takes what the call made; returns its error with interval and bound."""
-    also: Callable[[Made], Mapping[str, str | int | float | bool]] | None = None
-    """Takes the same; returns what else is reported."""
-    repeats: int | None = None
-    """Warm calls; None: as many as of the stage's other cases."""
-    memory: bool | Literal["stage"] | None = "stage"
-    """As of :func:`measure`; "stage": as of the stage's other cases."""
-
-
-def compare(
-    stage: StageBenchmark,
-    ours: Iterable[Case[Any]],
-    peers: Iterable[Case[Any]] = (),
+def measured(
+    knobs: Mapping[str, Knob],
+    call: Callable[[], Made],
+    error: Callable[[Made], BandError],
     *,
+    also: Callable[[Made], Mapping[str, Knob]] | None = None,
     repeats: int = 3,
     memory: bool | None = True,
-    by_band: Callable[[], Mapping[str, BandError]] | None = None,
-    limits: Callable[[Sequence[Point]], Iterable[Limit]] | None = None,
-) -> StageBenchmark:
-    """Measure the cases of a stage in one run: first ours, then its peers.
+) -> Point:
+    """Measure one setting of a stage.
 
     Parameters
     ----------
-    stage
-        Its description, without points.
-    ours, peers
-        Cases in the order in which they are measured; generators make each when it is its turn.
+    knobs
+        What is set.
+    call
+        What is timed.
+    error
+        Takes what the call made; returns its error with interval and bound.
+    also
+        Takes the same; returns what else is reported.
     repeats, memory
-        Of cases without their own, see :func:`measure`.
-    by_band
-        Makes the errors by melanin band, after all cases. None: those of the description.
-    limits
-        Takes the points, ours first, and makes the limits, at the end. None: the description's.
-
-    Returns
-    -------
-    StageBenchmark
-        The description with points, bands and limits.
+        As of :func:`measure`.
 
     Examples
     --------
-    >>> stage = StageBenchmark("sum", "difference", "the closed form")
-    >>> made = compare(
-    ...     stage,
-    ...     [Case({"n": n}, lambda n=n: sum(range(n)), lambda s: BandError(s - 45.0, (0.0, 0.0)))
-    ...      for n in (10, 11)],
-    ...     limits=lambda points: [Limit("difference", points[0].error, 0.0, "<=")],
-    ... )
-    >>> [point.error for point in made.points], made.limits[0].passed
-    ([0.0, 10.0], True)
+    >>> measured({"n": 9}, lambda: sum(range(9)), lambda s: BandError(s - 30.0, (5.0, 7.0))).error
+    6.0
     """
-    points = tuple(_measured(case, repeats, memory) for case in chain(ours, peers))
-    return replace(
-        stage,
-        points=points,
-        by_band=by_band() if by_band else stage.by_band,
-        limits=tuple(limits(points)) if limits else stage.limits,
-    )
-
-
-def _measured(case: Case[Any], repeats: int, memory: bool | None) -> Point:
-    timing, made = measure_and_keep(
-        case.call,
-        repeats=case.repeats or repeats,
-        memory=memory if case.memory == "stage" else case.memory,
-    )
-    found = case.error(made)
-    return Point(
-        case.knobs,
-        timing,
-        found.error,
-        found.error_interval,
-        found.cramer_rao_bound,
-        case.also(made) if case.also else {},
-    )
+    timing, made = measure_and_keep(call, repeats=repeats, memory=memory)
+    return Point.of(knobs, timing, error(made), also(made) if also else None)

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from skinrig.benchmarks.description import descriptions
+
 TIME_SAFETY_FACTOR: Final = 1.25
 """A stage begins if so many times what it should take is left."""
 REPORT_RESERVE_S: Final = 20.0
@@ -78,99 +80,13 @@ def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[t
 
 
 SMALL_S: Final[dict[str, float]] = {
-    "brdf": 2,
-    "brdf-space": 2,
-    "dome-lights": 2,
-    "perfusion-curves": 2,
-    "photon-transport": 2,
-    "subsurface-fit": 2,
-    "texture-fill": 2,
-    "wrinkles": 2,
-    "chromophores": 3,
-    "efficiency": 3,
-    "expression-alignment": 3,
-    "fibre-readings": 3,
-    "microstructure": 3,
-    "render-flash": 3,
-    "texture-matching": 3,
-    "reflectance": 4,
-    "shared-melanin": 4,
-    "head-motion": 6,
-    "normal-integration": 7,
-    "dome-geometry": 8,
-    "render-model": 8,
-    "sphere-lights": 8,
-    "render-dome": 9,
-    "omissions": 10,
-    "editing": 10,
-    "traits": 10,
-    "intervals": 11,
-    "gradient-normals": 13,
-    "probe-session": 14,
-    "render-gradient": 18,
+    name: told["small_s"] for name, told in descriptions().items() if "small_s" in told
 }
 """Processor seconds at small size of the stages that take more than about one."""
 
-MEASURED_S: Final[dict[str, float]] = {
-    "light-order": 1,
-    "wrinkle-weights": 3,
-    "wrinkle-storage": 3,
-    "anisotropy": 5,
-    "translucency": 6,
-    "fibre-readings": 8,
-    "normal-histogram": 9,
-    "subsurface-batch": 10,
-    "diffuse-albedo": 12,
-    "efficiency": 12,
-    "microstructure-passes": 13,
-    "hdr": 15,
-    "brdf": 17,
-    "wrinkles": 18,
-    "wrinkle-sum": 19,
-    "dome-lights": 21,
-    "misalignment": 22,
-    "dome-geometry": 26,
-    "color-table": 26,
-    "shared-melanin": 28,
-    "subsurface-fit": 30,
-    "perfusion-curves": 31,
-    "skin-stretch": 32,
-    "render-gradient": 34,
-    "head-motion": 34,
-    "texture-fill": 35,
-    "lumitexels": 35,
-    "normals": 37,
-    "facial-color": 38,
-    "chromophores": 39,
-    "layered-reflectance": 39,
-    "expression-alignment": 39,
-    "brdf-space": 40,
-    "render-flash": 44,
-    "reflectance": 46,
-    "gradient-normals": 50,
-    "texture-matching": 53,
-    "probe-session": 41,
-    "editing": 42,
-    "render-model": 41,
-    "subsurface-gather": 64,
-    "normal-integration": 65,
-    "render-dome": 70,
-    "sphere-lights": 85,
-    "traits": 90,
-    "microstructure": 100,
-    "photon-transport": 103,
+FULL_S: Final[dict[str, float]] = {
+    name: told["full_s"] for name, told in descriptions().items() if "full_s" in told
 }
 """About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
 the processor seconds of the main thread and half of those of all others, which share two cores.
 What errors by melanin band add to that is estimated from small sizes."""
-
-GUESSED_S: Final[dict[str, float]] = {
-    "displacement-synthesis": 200,
-    "kernel-fit": 300,
-    "omissions": 300,
-    "intervals": 600,
-}
-"""The same, not measured: careful guesses. One that is too low makes a run outlast its budget, one
-that is too high leaves a stage at its small size."""
-
-FULL_S: Final = {**MEASURED_S, **GUESSED_S}

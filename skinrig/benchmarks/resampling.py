@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -46,6 +50,75 @@ def mean_error(values: ArrayLike) -> BandError:
     mean = float(sizes.mean())
     half = float(sizes.std(ddof=1) / np.sqrt(sizes.size)) if sizes.size > 1 else float("nan")
     return BandError(mean, (mean - half, mean + half))
+
+
+def drawn_again(
+    values: ArrayLike,
+    statistic: Callable[..., Any] = np.median,
+    *,
+    draws: int = N_BOOTSTRAP_DRAWS,
+    rng: np.random.Generator | None = None,
+) -> tuple[float, float]:
+    """Return the bootstrap's 68 % interval of a statistic of independent values, (n,).
+
+    Parameters
+    ----------
+    values
+        At least one.
+    statistic
+        Called with draws (draws, n) and ``axis=1``.
+    draws
+        How often n values are drawn.
+    rng
+        Draws them; None: one of seed 0.
+
+    Examples
+    --------
+    >>> drawn_again([2.0, 2.0, 2.0])
+    (2.0, 2.0)
+    """
+    one = np.asarray(values)
+    rng = rng or np.random.default_rng(0)
+    again = statistic(one[rng.integers(0, len(one), (draws, len(one)))], axis=1)
+    low, high = np.quantile(again, [0.16, 0.84])
+    return float(low), float(high)
+
+
+def squares(side: int) -> list[tuple[slice, slice]]:
+    """Return the places of 8 x 8 squares of an image (or more, where 8 is no divisor).
+
+    Examples
+    --------
+    >>> len(squares(64)), squares(64)[1]
+    (64, (slice(0, 8, None), slice(8, 16, None)))
+    """
+    step = max(side // 8, 1)
+    parts = [slice(at, at + step) for at in range(0, side, step)]
+    return list(itertools.product(parts, parts))
+
+
+def rms_of_draws(
+    off: ArrayLike, *, bound: float | None = None, freedom: int | None = None
+) -> BandError:
+    """Return the root mean square of Gaussian errors, whose own relative error is 1/sqrt(2 n).
+
+    Parameters
+    ----------
+    off
+        Errors, any shape.
+    bound
+        Least root mean square that any unbiased estimator could have.
+    freedom
+        How many of the errors are independent; None: all.
+
+    Examples
+    --------
+    >>> rms_of_draws([2.0, -2.0]).error_interval
+    (1.0, 3.0)
+    """
+    sizes = np.asarray(off, np.float64)
+    error = float(np.sqrt(np.mean(sizes**2)))
+    return BandError.around(error, error / float(np.sqrt(2 * (freedom or sizes.size))), bound)
 
 
 def tiled_rms(

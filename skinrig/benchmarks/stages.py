@@ -12,64 +12,13 @@ from typing import Any, Literal
 
 from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
+from skinrig.benchmarks.description import descriptions
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.measurement import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
-STAGES = {
-    "chromophores": "flash_rig.chromophores.inversion",
-    "render-flash": "simulation.flash_render.render",
-    "render-dome": "simulation.dome_render.render",
-    "render-gradient": "simulation.gradient_render.render",
-    "omissions": "simulation.omissions.omissions",
-    "skin-stretch": "simulation.skin_stretch.stretched",
-    "layered-reflectance": "probe.tissue.layered_reflectance",
-    "color-table": "probe.tissue.table",
-    "expression-alignment": "flash_rig.alignment.aligned",
-    "efficiency": "flash_rig.efficiency.efficiency",
-    "intervals": "intervals.coverage_stage.intervals",
-    "misalignment": "flash_rig.alignment.misaligned",
-    "shared-melanin": "flash_rig.shared_melanin.inversion",
-    "facial-color": "flash_rig.facial_color.rig",
-    "diffuse-albedo": "dome.brdf.albedo",
-    "brdf": "dome.brdf.surface",
-    "brdf-space": "dome.brdf_space.space",
-    "reflectance": "dome.reflectance.model",
-    "render-model": "dome.rendering.model",
-    "normals": "dome.photometric.normals",
-    "gradient-normals": "gradient_rig.gradient_normals.normals",
-    "hdr": "dome.hdr.merging",
-    "lumitexels": "dome.surface.lumitexels",
-    "texture-fill": "dome.surface.filling",
-    "head-motion": "dome.motion.motion",
-    "dome-geometry": "dome.calibration.geometry",
-    "dome-lights": "dome.calibration.lights",
-    "light-order": "dome.light_order.light_order",
-    "sphere-lights": "gradient_rig.calibration.sphere_lights",
-    "fibre-readings": "probe.fiber_readings.fibre_readings",
-    "normal-integration": "gradient_rig.integration.integration",
-    "normal-histogram": "gradient_rig.kernels.histograms",
-    "kernel-fit": "gradient_rig.kernels.search",
-    "displacement-synthesis": "gradient_rig.synthesis.growth",
-    "texture-matching": "dome.texture.matching",
-    "editing": "dome.editing.editing",
-    "traits": "dome.traits.traits",
-    "microstructure": "gradient_rig.microstructure.truth",
-    "microstructure-passes": "gradient_rig.microstructure.passes",
-    "perfusion-curves": "flash_rig.perfusion.curves",
-    "probe-session": "probe.session.session",
-    "subsurface-fit": "probe.subsurface.tiers",
-    "subsurface-batch": "probe.subsurface.batches",
-    "subsurface-gather": "probe.subsurface_gather.gathering",
-    "anisotropy": "probe.translucency.directions",
-    "translucency": "probe.translucency.sites",
-    "photon-transport": "probe.transport.photon_transport",
-    "wrinkles": "gradient_rig.wrinkles.fitting",
-    "wrinkle-sum": "gradient_rig.wrinkles.summing",
-    "wrinkle-storage": "gradient_rig.wrinkles.storing",
-    "wrinkle-weights": "gradient_rig.wrinkles.weighing",
-}
+STAGES: dict[str, str] = {name: told["run"] for name, told in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import nnls
@@ -16,24 +17,24 @@ from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
 from reconstruction.diffuse_albedo import estimation as diffuse_albedo
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome import brdf_truth
 from skinrig.benchmarks.measurement import (
     BandError,
-    Limit,
     Point,
     StageBenchmark,
     Timing,
     measure,
+    measure_and_keep,
     once,
 )
+from skinrig.benchmarks.resampling import drawn_again
 
-MAX_ALBEDO_ERROR_PERCENT = 3.0
-MAX_HELD_OUT_ERROR_PERCENT = 5.0
-MIN_SPEEDUP_OVER_NNLS = 10.0
 FIT_CORES = 2
 """Cores that the fit shares its points out to."""
-MAX_RESIDUAL_EXCESS_PERCENT = 0.2
 ETA = 1.3
+METHODS: tuple[diffuse_albedo.Method, ...] = ("envelope", "stable_minimum", "minimum")
+WAYS: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
 BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
     "light": brdf_truth.LIGHT_SKIN_ALBEDO,
     "medium": (0.315, 0.189, 0.133),
@@ -47,68 +48,38 @@ def albedo(*, toy: bool) -> StageBenchmark:
     """Estimate R_d over noise and samples, by the fit and by the paper's minima."""
     rng = np.random.default_rng(0)
     count = 12 if toy else 150
-    points, limits = [], []
+    points = []
+    limits: Findings = {}
     bands: dict[str, BandError] = {}
     for skin, r_d in BAND_ALBEDOS.items():
         for noise in (0.02,) if toy else (0.005, 0.02, 0.08):
             for samples in (60,) if toy else (60, 240, 900):
                 p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
-                for method in ("envelope", "stable_minimum", "minimum"):
-
-                    def run(
-                        p: brdf_truth.Points = p, method: diffuse_albedo.Method = method
-                    ) -> diffuse_albedo.DiffuseAlbedo:
-                        return diffuse_albedo.estimate(
-                            p.f,
-                            p.light,
-                            p.view,
-                            p.normals,
-                            eta=ETA,
-                            variance=p.variance,
-                            valid=p.valid,
-                            method=method,
-                        )
-
-                    timing = measure(run, repeats=1, memory=False)
-                    relative = 100.0 * (run().r_d / p.r_d - 1.0)
+                for method in METHODS:
+                    timing, found = measure_and_keep(
+                        lambda: diffuse_albedo.estimate(
+                            *p.samples, eta=ETA, variance=p.variance, valid=p.valid, method=method
+                        ),
+                        repeats=1,
+                        memory=False,
+                    )
+                    relative = 100.0 * (found.r_d / p.r_d - 1.0)
                     worst = np.median(np.abs(relative), axis=0)
-                    channel = int(np.argmax(worst))
-                    bias = float(np.median(relative[:, channel]))
-                    spread = float(np.std(relative[:, channel]))
-                    knobs = {
-                        "skin": skin,
-                        "noise": noise,
-                        "samples": p.f.shape[1],
-                        "method": method,
-                    }
-                    also = {"bias_percent": round(bias, 2), "spread_percent": round(spread, 2)}
+                    channel = relative[:, int(np.argmax(worst))]
                     # 68 % interval of a median of `count` errors of this spread
-                    half = 1.2533 * float(np.std(np.abs(relative[:, channel]))) / np.sqrt(count)
-                    error = float(worst[channel])
-                    interval = (max(error - half, 0.0), error + half)
-                    points.append(Point(knobs, timing, error, interval, also=also))
+                    half = 1.2533 * float(np.std(np.abs(channel))) / np.sqrt(count)
+                    error = float(worst.max())
+                    told = BandError(error, (max(error - half, 0.0), error + half))
+                    knobs = {"skin": skin, "noise": noise, "samples": p.f.shape[1]}
+                    also = {
+                        "bias_percent": round(float(np.median(channel)), 2),
+                        "spread_percent": round(float(np.std(channel)), 2),
+                    }
+                    points.append(Point.of(knobs | {"method": method}, timing, told, also))
                     if method == "envelope" and noise == 0.02 and (toy or samples == 900):
-                        bands[skin] = BandError(error, interval)
-                        limits.append(
-                            Limit(
-                                f"median error of R_d, worst channel, {skin} skin",
-                                error,
-                                MAX_ALBEDO_ERROR_PERCENT,
-                                "<=",
-                                "%",
-                            )
-                        )
-    return StageBenchmark(
-        "diffuse-albedo",
-        "median error of R_d, worst channel, %",
-        "the R_d that the samples were made of, under a surface in no estimator's family",
-        0.0,
-        tuple(points),
-        tuple(limits),
-        by_band=bands,
-        condition=("skin", "noise"),
-        interval_of="points",
-    )
+                        bands[skin] = told
+                        limits["error", skin] = error
+    return described("diffuse-albedo", points, limits, by_band=bands)
 
 
 def surface(*, toy: bool) -> StageBenchmark:
@@ -119,33 +90,14 @@ def surface(*, toy: bool) -> StageBenchmark:
     points = []
     error = np.nan
     for samples in (100,) if toy else (100, 300, 900):
-        p, out, given, diffuse = _given(BAND_ALBEDOS["light"], count, samples, rng)
-
-        def point(
-            name: str,
-            timing: Timing,
-            lobe: Float64Array,
-            *,
-            rank: int = 0,
-            p: brdf_truth.Points = p,
-            out: BoolArray = out,
-            diffuse: Float64Array = diffuse,
-        ) -> Point:
-            return _judged(name, timing, lobe, p, out, diffuse, rank, rng)
-
-        ways: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
-        for compress in ways:
-
-            def run(
-                compress: Literal["cbrt", "none"] = compress,
-                given: brdf_basis.SurfaceSamples = given,
-                on: BrdfBasis = basis,
-            ) -> brdf_basis.BasisWeights:
-                return brdf_basis.fit_weights(given, on, compress=compress)
-
-            timing = measure(run, repeats=2, memory=False)
-            fit = run()
-            points.append(point(f"basis, {compress}", timing, _lobes(fit.weights, basis, p)))
+        given = _Given.draw(BAND_ALBEDOS["light"], count, samples, rng)
+        for compress in WAYS:
+            timing, fit = measure_and_keep(
+                lambda: brdf_basis.fit_weights(given.samples, basis, compress=compress),
+                repeats=2,
+                memory=False,
+            )
+            points.append(given.point(f"basis, {compress}", timing, given.lobes(fit, basis)))
             if compress == "cbrt":
                 error = points[-1].error
                 full = fit
@@ -153,71 +105,75 @@ def surface(*, toy: bool) -> StageBenchmark:
             if samples < 900 and not toy:
                 continue
             mixed = basis.mixed(brdf_basis.reduce(full, rank, basis=basis)[1])
-            timing = measure(lambda on=mixed: run(on=on), repeats=1, memory=False)  # type: ignore[misc]
-            lobe = _lobes(run("cbrt", on=mixed).weights, mixed, p)
-            points.append(point("NMF, refitted", timing, lobe, rank=rank))
-        points.append(point("GGX", *once(partial(_ggx, p, given))))
-        points.append(point("roots of elements", *once(partial(_rooted, p, given, basis))))
+            timing = measure(
+                lambda: brdf_basis.fit_weights(given.samples, mixed, compress="none"),
+                repeats=1,
+                memory=False,
+            )
+            fit = brdf_basis.fit_weights(given.samples, mixed, compress="cbrt")
+            points.append(given.point("NMF, refitted", timing, given.lobes(fit, mixed), rank=rank))
+        for way, peer in (("GGX", _ggx), ("roots of elements", partial(_rooted, basis=basis))):
+            timing, lobe = once(lambda: peer(given.truth, given.samples))
+            points.append(given.point(way, timing, lobe))
     bands = {}
     for skin, r_d in BAND_ALBEDOS.items():
-        p, out, given, diffuse = _given(r_d, count, 100 if toy else 300, rng)
-        timing, fit = once(partial(brdf_basis.fit_weights, given, basis, compress="cbrt"))
-        told = _judged("", timing, _lobes(fit.weights, basis, p), p, out, diffuse, 0, rng)
-        bands[skin] = BandError(told.error, told.error_interval)
+        given = _Given.draw(r_d, count, 100 if toy else 300, rng)
+        fit = brdf_basis.fit_weights(given.samples, basis, compress="cbrt")
+        bands[skin] = given.error(given.lobes(fit, basis))
     faster, excess = _beside_scipy(basis, toy=toy)
-    limits = (
-        Limit(
-            "median error of all light under lights left out",
-            error,
-            MAX_HELD_OUT_ERROR_PERCENT,
-            "<=",
-            "%",
-        ),
-        Limit(
-            "times faster on 2 cores than a loop of SciPy's nnls, 5,000 x 900 x 59, matrices "
-            "included",
-            faster,
-            MIN_SPEEDUP_OVER_NNLS,
-            ">=",
-        ),
-        Limit(
-            "largest residual above SciPy's", 100.0 * excess, MAX_RESIDUAL_EXCESS_PERCENT, "<=", "%"
-        ),
-    )
-    return StageBenchmark(
-        "brdf",
-        "median error of all light under lights left out, %",
-        "a surface whose slopes fall between an exponential and a Gaussian, in no basis",
-        0.0,
-        tuple(points),
-        limits,
-        left_out=(("SciPy on all 5,000 points", "its time is that of a subset, extrapolated"),),
-        by_band=bands,
-        interval_of="points",
-    )
+    limits = {"error": error, "speed_up": faster, "residual": 100.0 * excess}
+    return described("brdf", points, limits, by_band=bands)
 
 
-def _given(
-    r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
-) -> tuple[brdf_truth.Points, BoolArray, brdf_basis.SurfaceSamples, Float64Array]:
-    """Return points, their samples left out, what is fitted, and the diffuse part taken off."""
-    p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
-    out = _left_out(p, rng)
-    # R_d as it would be known: estimated, from the same samples
-    found = diffuse_albedo.estimate(
-        p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=p.valid & ~out
-    )
-    given = brdf_basis.surface_samples(
-        p.f,
-        p.light,
-        p.view,
-        p.normals,
-        found.r_d,
-        eta=ETA,
-        variance=p.variance,
-        valid=p.valid & ~out,
-    )
-    return p, out, given, _diffuse(p, found.r_d)
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """Points, and what is known of them by samples that leave a fifth of the lights out."""
+
+    truth: brdf_truth.Points
+    left_out: BoolArray
+    samples: brdf_basis.SurfaceSamples
+    diffuse: Float64Array
+    """The diffuse part that is taken off, (P, M)."""
+    rng: np.random.Generator
+
+    @classmethod
+    def draw(
+        cls, r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
+    ) -> _Given:
+        p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
+        out = _left_out(p, rng)
+        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
+        # R_d as it would be known: estimated, from the same samples
+        found = diffuse_albedo.estimate(*p.samples, **known)
+        given = brdf_basis.surface_samples(*p.samples, found.r_d, **known)
+        return cls(p, out, given, _diffuse(p, found.r_d), rng)
+
+    def lobes(self, fit: brdf_basis.BasisWeights, basis: BrdfBasis) -> Float64Array:
+        _, *where = self.truth.samples
+        rows = zip(fit.weights, *where, strict=True)
+        return np.stack([brdf_basis.evaluate(x, basis, *at) for x, *at in rows])
+
+    def error(self, lobe: Float64Array) -> BandError:
+        """Return the median error of all light under the lights left out, %."""
+        at = self.truth.valid & self.left_out
+        true = self.truth.surface + _diffuse(self.truth, self.truth.r_d) + 1e-12
+        relative = 100.0 * np.abs((lobe + self.diffuse) / true - 1.0)
+        # The points are independent of each other, their samples are not.
+        by_point = np.array([np.median(r[a]) for r, a in zip(relative, at, strict=True) if a.any()])
+        return BandError(float(np.median(by_point)), drawn_again(by_point, rng=self.rng))
+
+    def point(self, way: str, timing: Timing, lobe: Float64Array, *, rank: int = 0) -> Point:
+        p = self.truth
+        at = p.valid & self.left_out
+        root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
+        bright = at & (p.surface > 0.5 * _diffuse(p, p.r_d))
+        highlight = np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))
+        knobs = {"way": way, "samples": p.f.shape[1], "points": len(p.f)}
+        also = {
+            "highlight_error_percent": round(float(highlight) * 100.0, 2),
+            "cube_root_rms": round(float(root), 4),
+        }
+        return Point.of(knobs | ({"rank": rank} if rank else {}), timing, self.error(lobe), also)
 
 
 def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> BoolArray:
@@ -229,55 +185,10 @@ def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> BoolArray:
 def _diffuse(p: brdf_truth.Points, r_d: Float64Array) -> Float64Array:
     """Return the green diffuse BRDF by the convention, (P, M)."""
     zero = np.zeros_like(p.f)
-    s = brdf_basis.surface_samples(zero, p.light, p.view, p.normals, r_d, eta=ETA, valid=p.valid)
+    s = brdf_basis.surface_samples(zero, *p.samples[1:], r_d, eta=ETA, valid=p.valid)
     cos_l = np.einsum("pmc,pc->pm", p.light, p.normals)
     mean = -s.value / np.where(cos_l > 0.0, cos_l, 1.0)
     return np.asarray(mean * (r_d[:, 1] / r_d.mean(axis=1))[:, None])
-
-
-def _lobes(weights: Float64Array, basis: BrdfBasis, p: brdf_truth.Points) -> Float64Array:
-    return np.stack(
-        [
-            brdf_basis.evaluate(x, basis, to, at, n)
-            for x, to, at, n in zip(weights, p.light, p.view, p.normals, strict=True)
-        ]
-    )
-
-
-def _judged(
-    name: str,
-    timing: Timing,
-    lobe: Float64Array,
-    p: brdf_truth.Points,
-    out: BoolArray,
-    diffuse: Float64Array,
-    rank: int,
-    rng: np.random.Generator,
-) -> Point:
-    at = p.valid & out
-    true_diffuse = _diffuse(p, p.r_d)
-    relative = 100.0 * np.abs((lobe + diffuse) / (p.surface + true_diffuse + 1e-12) - 1.0)
-    # The points are independent of each other, their samples are not.
-    by_point = np.array([np.median(r[a]) for r, a in zip(relative, at, strict=True) if a.any()])
-    again = rng.choice(by_point, (200, len(by_point)))
-    low, high = np.quantile(np.median(again, axis=1), [0.16, 0.84])
-    root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
-    bright = at & (p.surface > 0.5 * true_diffuse)
-    knobs: dict[str, str | int | float | bool] = {
-        "way": name,
-        "samples": p.f.shape[1],
-        "points": len(p.f),
-    }
-    also = {
-        "highlight_error_percent": round(
-            float(np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))) * 100.0, 2
-        ),
-        "cube_root_rms": round(float(root), 4),
-    }
-    if rank:
-        knobs["rank"] = rank
-    error = float(np.median(by_point))
-    return Point(knobs, timing, error, (float(low), float(high)), also=also)
 
 
 def _cosines(p: brdf_truth.Points, point: int) -> tuple[Float64Array, ...]:
@@ -326,9 +237,7 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     different, copies, subset = (20, 1, 3) if toy else (500, 10, 200)
     p = brdf_truth.dome(different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng)
     p = dataclasses.replace(p, valid=p.valid & (p.light @ p.normals[..., None] > 0.12)[..., 0])
-    s = brdf_basis.surface_samples(
-        p.f, p.light, p.view, p.normals, p.r_d, eta=ETA, variance=p.variance, valid=p.valid
-    )
+    s = brdf_basis.surface_samples(*p.samples, p.r_d, eta=ETA, variance=p.variance, valid=p.valid)
     many = brdf_basis.SurfaceSamples(
         *(
             np.tile(getattr(s, f.name), (copies, *[1] * (getattr(s, f.name).ndim - 1)))

@@ -32,6 +32,11 @@ class Points:
     surface: Float64Array
     """Surface BRDF without noise, (P, M), 1/sr."""
 
+    @property
+    def samples(self) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
+        """Samples, their directions of light and view, and normals, as estimators take them."""
+        return self.f, self.light, self.view, self.normals
+
 
 def dome(
     points: int,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,15 +18,22 @@ from rigsim.as_built.dome import Tolerances, build, image_of
 from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import (
+    Knobs,
+    Point,
+    StageBenchmark,
+    Timing,
+    measure,
+    measure_and_keep,
+)
+from skinrig.benchmarks.resampling import drawn_again
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.targets import TargetScene
 
 CHARUCO_BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
 SPHERE_RADIUS_MM = 50.0
-MAX_REPROJECTION_PX = 0.3
-MAX_LIGHT_DISTANCE_MM = 2.0
 DOME_SEED = 5
 
 
@@ -68,28 +75,9 @@ def geometry(*, toy: bool) -> StageBenchmark:
             projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
         worst = float(max(projected))
 
-        def call(seen: dict[tuple[str, int], Sighting] = seen) -> bundle.Bundle:
-            return bundle.adjust(seen, CHARUCO_BOARD, start)
-
-        points.append(_point({"places": count}, call, np.array(gaps), np.array(variances)))
-    return StageBenchmark(
-        "dome-geometry",
-        "RMS error of a camera's centre along an axis, mm",
-        "the simulated dome as built",
-        0.0,
-        tuple(points),
-        (
-            Limit(
-                "worst camera's mean reprojection of the truth",
-                worst,
-                MAX_REPROJECTION_PX,
-                "<=",
-                "px",
-            ),
-        ),
-        interval_of="cameras",
-        no_bands="a calibration by targets: no skin is in the pictures",
-    )
+        timing = measure(lambda: bundle.adjust(seen, CHARUCO_BOARD, start))
+        points.append(_point({"places": count}, timing, np.array(gaps), np.array(variances)))
+    return described("dome-geometry", points, {"reprojection": worst})
 
 
 def lights(*, toy: bool) -> StageBenchmark:
@@ -114,32 +102,15 @@ def lights(*, toy: bool) -> StageBenchmark:
         rows = [row for row in seen if row.sphere < count]
         some = {number: spheres[number] for number in range(count)}
 
-        def call(
-            rows: Sequence[mirror_lights.Highlights] = rows,
-            some: dict[int, mirror_sphere.SpherePosition] = some,
-        ) -> mirror_lights.LightPositions:
-            return mirror_lights.locate_lights(rows, cameras, some, nominal)
-
-        result = call()
+        timing, result = measure_and_keep(
+            lambda: mirror_lights.locate_lights(rows, cameras, some, nominal)
+        )
         ok = result.valid
         gaps = np.mean((result.position_mm - truth)[ok] ** 2, axis=1)
         last = float(np.median(np.linalg.norm((result.position_mm - truth)[ok], axis=1)))
         variances = np.mean(result.stderr_mm[ok] ** 2, axis=1)
-        points.append(_point({"spheres": count}, call, gaps, variances))
-    return StageBenchmark(
-        "dome-lights",
-        "RMS error of a light's place along an axis, mm",
-        "the simulated dome as built, with its own cameras",
-        0.0,
-        tuple(points),
-        (
-            Limit(
-                "median distance of a light from its place", last, MAX_LIGHT_DISTANCE_MM, "<=", "mm"
-            ),
-        ),
-        interval_of="lights",
-        no_bands="a calibration by targets: no skin is in the pictures",
-    )
+        points.append(_point({"spheres": count}, timing, gaps, variances))
+    return described("dome-lights", points, {"distance": last})
 
 
 def _add_sphere(
@@ -185,20 +156,8 @@ def _frame(
     )
 
 
-def _point(
-    knobs: dict[str, str | int | float | bool],
-    call: Callable[[], Any],
-    squares: Float64Array,
-    variances: Float64Array,
-) -> Point:
+def _point(knobs: Knobs, timing: Timing, squares: Float64Array, variances: Float64Array) -> Point:
     """Return a point with a bootstrap interval of the error and the bound that errors state."""
-    rng = np.random.default_rng(0)
-    again = squares[rng.integers(0, len(squares), (400, len(squares)))].mean(axis=1)
-    low, high = np.sqrt(np.quantile(again, [0.16, 0.84]))
-    return Point(
-        knobs,
-        measure(call, repeats=3),
-        float(np.sqrt(squares.mean())),
-        (float(low), float(high)),
-        float(np.sqrt(variances.mean())),
-    )
+    low, high = np.sqrt(drawn_again(squares, np.mean, draws=400))
+    error, bound = (float(np.sqrt(part.mean())) for part in (squares, variances))
+    return Point(knobs, timing, error, (float(low), float(high)), bound)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population.population import Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import mean_error, squares
 from skinrig.editing import albedo as editing_albedo
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.fitting import traits
-from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
+from skinrig.traits.albedo_vectors import AlbedoSample, AlbedoTraits, VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
 
@@ -24,8 +26,6 @@ TAN_MELANIN_FACTOR: Final = 1.5
 """Factor of melanin."""
 N_EDITED_FACES: Final = 4
 """Faces that are edited; the traits are learned of others."""
-MAX_EDIT_ERROR_PERCENT, MAX_ROUND_TRIP_PERCENT, MAX_ERROR_RATIO_TO_NO_EDIT = 10.0, 2.0, 0.5
-"""Limits, %, %, and of the error over that of no edit."""
 
 
 def editing(*, toy: bool) -> StageBenchmark:
@@ -43,15 +43,14 @@ def editing(*, toy: bool) -> StageBenchmark:
     labels = Labels(tuple(p.name for p in learned), {"tan": np.arange(count) % 2 == 0}, {}, ())
     before = [faces.albedo(p, noise=0.0, rng=rng) for p in edited]
     after = [faces.albedo(_tanned(p), noise=0.0, rng=rng) for p in edited]
-    points, returns, kept = [], [], {}
+    points, kept = [], {}
     bands: dict[str, BandError] = {}
+    usual = editing_albedo.MATCHING_NOISE
     settings: list[tuple[VectorKind, int, float]] = [
-        ("quantiles", 5, editing_albedo.MATCHING_NOISE),
+        ("quantiles", 5, usual),
         ("quantiles", 5, 0.0),
-        ("histograms", 5, editing_albedo.MATCHING_NOISE),
-    ]
-    settings += [
-        ("quantiles", n, editing_albedo.MATCHING_NOISE) for n in ((1,) if toy else (1, 2, 10))
+        ("histograms", 5, usual),
+        *(("quantiles", n, usual) for n in ((1,) if toy else (1, 2, 10))),
     ]
     spaces: dict[str, AlbedoTraits] = {}
     for kind, iterations, noise in settings:
@@ -63,9 +62,9 @@ def editing(*, toy: bool) -> StageBenchmark:
         for one, truth in zip(before, after, strict=True):
             new = call(one.r_d, one.valid, 1.0)
             again = call(new, one.valid, -1.0)
-            good = one.valid & truth.valid
-            errors.append(100 * float(np.median(np.abs(new / truth.r_d - 1)[good])))
-            back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[good] ** 2))))
+            errors.append(float(np.median(_percent_off(new, one, truth))))
+            there = one.valid & truth.valid
+            back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[there] ** 2))))
         timing = measure(
             partial(call, before[0].r_d, before[0].valid, 1.0),
             repeats=1 if toy else 3,
@@ -76,42 +75,18 @@ def editing(*, toy: bool) -> StageBenchmark:
                 name: _on_skin(call, faces, band.melanin, people[0])
                 for name, band in MELANIN_BANDS.items()
             }
-        mean = float(np.mean(errors))
-        off = float(np.std(errors, ddof=1) / np.sqrt(len(errors)))
-        knobs: dict[str, Any] = {"vectors": kind, "iterations": iterations, "noise": noise}
-        points.append(Point(knobs, timing, mean, (mean - off, mean + off)))
-        returns.append(float(np.mean(back)))
-        kept[kind, iterations, noise] = (mean, returns[-1])
+        knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
+        points.append(Point.of(knobs, timing, mean_error(errors)))
+        kept[kind, iterations, noise] = points[-1].error, float(np.mean(back))
     error, returned = kept[settings[0]]
-    none = float(
-        np.mean(
-            [
-                100 * np.median(np.abs(one.r_d / truth.r_d - 1)[one.valid & truth.valid])
-                for one, truth in zip(before, after, strict=True)
-            ]
-        )
-    )
-    same = _edit(
-        spaces["quantiles"], 5, editing_albedo.MATCHING_NOISE, before[0].r_d, before[0].valid, 0.0
-    )
+    pairs = zip(before, after, strict=True)
+    none = float(np.mean([np.median(_percent_off(a.r_d, a, b)) for a, b in pairs]))
+    same = _edit(spaces["quantiles"], 5, usual, before[0].r_d, before[0].valid, 0.0)
     zero = float(np.abs(same / before[0].r_d - 1)[before[0].valid].max())
-    return StageBenchmark(
+    return described(
         "editing",
-        "R_d of an edited face, median relative error, %",
-        "the same face simulated with the trait",
-        0.0,
-        tuple(points),
-        (
-            Limit("tan, error of R_d", error, MAX_EDIT_ERROR_PERCENT, "<=", "%"),
-            Limit(
-                "tan, error over that of no edit", error / none, MAX_ERROR_RATIO_TO_NO_EDIT, "<="
-            ),
-            Limit(
-                "tan and its opposite, what is left", returned, MAX_ROUND_TRIP_PERCENT, "<=", "%"
-            ),
-            Limit("tan of amount 0, largest change", zero, 1e-5, "<="),
-        ),
-        interval_of="faces; by band, regions of one",
+        points,
+        {"error": error, "over_no_edit": error / none, "round_trip": returned, "zero": zero},
         by_band=bands,
     )
 
@@ -127,19 +102,14 @@ def _on_skin(
     good = one.valid & truth.valid
     sizes = 100 * np.abs(new / truth.r_d - 1)
     # neighbors err alike: the face is cut into squares
-    step = max(len(good) // 8, 1)
-    squares = [
-        float(np.median(sizes[i : i + step, j : j + step][at]))
-        for i in range(0, len(good), step)
-        for j in range(0, len(good), step)
-        if (at := good[i : i + step, j : j + step]).any()
-    ]
-    return BandError(float(np.median(sizes[good])), _around(np.median(sizes[good]), squares))
+    medians = [np.median(sizes[at][good[at]]) for at in squares(len(good)) if good[at].any()]
+    half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
+    return BandError.around(float(np.median(sizes[good])), half)
 
 
-def _around(middle: float, squares: list[float]) -> tuple[float, float]:
-    half = 1.2533 * float(np.std(squares)) / np.sqrt(len(squares))
-    return float(middle) - half, float(middle) + half
+def _percent_off(r_d: FloatArray, one: AlbedoSample, truth: AlbedoSample) -> FloatArray:
+    """Return how far an edited R_d is off where both faces are known, %."""
+    return np.asarray(100 * np.abs(r_d / truth.r_d - 1)[one.valid & truth.valid])
 
 
 def _tanned(person: Member) -> Member:

@@ -10,10 +10,16 @@ import numpy as np
 
 from capture import hdr
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Point,
+    StageBenchmark,
+    Timing,
+    measure_and_keep,
+)
 
 GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
-MIN_SPEEDUP_OVER_DEBEVEC = 5.0
 MAX_RATIO_TO_BOUND = 1.05
 N_FRAMES, FULL_SIDE_PX = 23, 1024
 EXPOSURE_RANGE_S = (1e-3, 1.0)
@@ -34,8 +40,9 @@ def merging(*, toy: bool) -> StageBenchmark:
     for count in (2, 3, 5, 9, N_FRAMES):
         times = np.geomspace(*EXPOSURE_RANGE_S, count)
         frames = [_expose(scene, t, rng) for t in times]
-        timing = measure(lambda f=frames, t=times: _merge(f, t), repeats=1 if toy else 3)  # type: ignore[misc]
-        radiance, _, valid = _merge(frames, times)
+        timing, (radiance, _, valid) = measure_and_keep(
+            lambda: _merge(frames, times), repeats=1 if toy else 3
+        )
         bound = _bound(scene, times)
         # near a frame's saturation noise decides whether the frame counts
         settled = valid & ~np.any(
@@ -46,28 +53,13 @@ def merging(*, toy: bool) -> StageBenchmark:
         spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
         least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
         worst = max(worst, error / least)
-        points.append(
-            Point({"frames": count}, timing, error, (error - spread, error + spread), least)
-        )
+        told = BandError.around(error, spread, least)
+        points.append(Point.of({"frames": count}, timing, told))
     ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
-    interval = (error - spread, error + spread)
-    points.append(Point({"frames": N_FRAMES, "way": "beside"}, ours, error, interval, least))
-    size = f"{N_FRAMES} x {side}^2 x 3"
-    name = f"times faster than OpenCV's Debevec on {size} (its fastest {theirs:.3f} s)"
-    return StageBenchmark(
-        "hdr",
-        "RMS relative error of radiance, %",
-        "the radiance the frames were drawn from: shot, read and rounding noise",
-        0.0,
-        tuple(points),
-        (
-            Limit(name, ratio, MIN_SPEEDUP_OVER_DEBEVEC, ">="),
-            Limit("largest error over the Cramér-Rao bound", worst, MAX_RATIO_TO_BOUND, "<="),
-        ),
-        interval_of="pixels",
-        no_bands="radiances over four decades, whoever sends them",
-    )
+    points.append(Point.of({"frames": N_FRAMES, "way": "beside"}, ours, told))
+    limits: Findings = {("speed_up", side, theirs): ratio, "over_bound": worst}
+    return described("hdr", points, limits)
 
 
 def _merge(frames: Frames, times: Float64Array) -> tuple[Float32Array, Float32Array, BoolArray]:

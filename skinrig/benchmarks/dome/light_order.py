@@ -10,10 +10,10 @@ from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure_and_keep
 
 DWELL_S = 1.0 / 12.0
-MIN_FLICKER_REDUCTION = 5.0
 DARK_TIME_FRACTION = 0.3
 """Share of each light's time that is dark where lights do not overlap."""
 
@@ -27,38 +27,26 @@ def light_order(*, toy: bool) -> StageBenchmark:
     orders: dict[str, Callable[[Rig], list[int]]] = dict(LIGHT_ORDERS)
     orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
     for name, order in orders.items():
-        timing, shown = measure(partial(order, rig), repeats=1), order(rig)
+        timing, shown = measure_and_keep(partial(order, rig), repeats=1)
         for gaps in (False, True) if name == "spiral" else (False,):
             found[name, gaps] = _flicker(rig, shown, gaps=gaps)
-            error = 100.0 * found[name, gaps].rms
-            knobs = {"order": name, "gaps": "dark" if gaps else "none"}
-            also = {"flashes a second": found[name, gaps].flashes_per_s}
-            points.append(Point(knobs, timing, error, (error, error), also=also))
+            points.append(
+                Point.of(
+                    {"order": name, "gaps": "dark" if gaps else "none"},
+                    timing,
+                    BandError.around(100.0 * found[name, gaps].rms, 0.0),
+                    {"flashes a second": found[name, gaps].flashes_per_s},
+                )
+            )
     chosen, worst = found["chosen", False], found["spiral", True]
-    return StageBenchmark(
+    return described(
         "light-order",
-        "light of 3 to 65 Hz at open eyes, rms over mean, %",
-        "steady light: 0",
-        0.0,
-        tuple(points),
-        (
-            Limit(
-                "flashes in the worst second",
-                chosen.flashes_per_s,
-                limits.max_flashes_per_s - 0.5,
-                "<=",
-            ),
-            Limit("rms of the chosen order", chosen.rms, limits.max_flicker_rms, "<="),
-            Limit(
-                "times less flicker than a spiral with dark gaps",
-                worst.rms / chosen.rms,
-                MIN_FLICKER_REDUCTION,
-                ">=",
-            ),
-        ),
-        condition=("gaps",),
-        interval_of="nothing: an order's flicker is computed exactly",
-        no_bands="light at the eyes: no skin enters",
+        points,
+        {
+            "flashes": (chosen.flashes_per_s, limits.max_flashes_per_s - 0.5),
+            "rms": (chosen.rms, limits.max_flicker_rms),
+            "reduction": worst.rms / chosen.rms,
+        },
     )
 
 

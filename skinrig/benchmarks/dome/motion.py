@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,7 +17,9 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from rigsim.subject.head_motion import head_motion as drawn
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Case, StageBenchmark, compare
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, StageBenchmark, measured
+from skinrig.benchmarks.resampling import mean_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 TRACKING_EXPOSURE_S = 0.03
@@ -66,27 +68,31 @@ class Drift:
     def error(self, found: head_motion.HeadMotion) -> BandError:
         """Return the mean error over the frames, mm."""
         errors = self.errors_mm(found)
-        half = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
-        return BandError.around(float(errors.mean()), half)
+        return mean_error(errors) if len(errors) > 1 else BandError.around(float(errors[0]), 0.0)
 
     def errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
         """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
         turns = head_motion.rotation_matrix(found.rotation_rad)
-        out = []
-        for (rotation, shift), turn, move in list(
-            zip(self.poses, turns, found.translation_mm, strict=True)
-        )[1:]:
-            gap = self.points_mm @ (turn - rotation).T + (move - shift)
-            out.append(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
-        return np.array(out)
+        moved = zip(self.poses[1:], turns[1:], found.translation_mm[1:], strict=True)
+        return np.array(
+            [
+                _rms_mm(self.points_mm @ (turn - rotation).T + (move - shift))
+                for (rotation, shift), turn, move in moved
+            ]
+        )
 
     def moved_mm(self) -> Float64Array:
         """Return how far the points moved in truth, RMS, (T - 1,)."""
-        out = []
-        for rotation, shift in self.poses[1:]:
-            gap = self.points_mm @ (rotation - np.eye(3)).T + shift
-            out.append(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
-        return np.array(out)
+        return np.array(
+            [
+                _rms_mm(self.points_mm @ (rotation - np.eye(3)).T + shift)
+                for rotation, shift in self.poses[1:]
+            ]
+        )
+
+
+def _rms_mm(gap: Float64Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
 
 
 def simulate(
@@ -160,37 +166,22 @@ def motion(*, toy: bool) -> StageBenchmark:
     texels = 128 if toy else 512
     drift = partial(simulate, width_px=width, views=views, texels=texels)
 
-    def cases() -> Iterator[Case[head_motion.HeadMotion]]:
-        for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
-            seen = drift(drift_mm=drift_mm, times_s=times)
-            moved_mm = round(float(seen.moved_mm().mean()), 3)
-            for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
-                yield Case(
-                    {"drift mm": drift_mm, "tracks": tracks},
-                    partial(seen.estimate, tracks),
-                    seen.error,
-                    also=lambda _, moved_mm=moved_mm: {"moved_mm": moved_mm},  # type: ignore[misc]
-                )
-
-    def by_band() -> dict[str, BandError]:
-        found = {}
-        for name, band in MELANIN_BANDS.items():
-            seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
-            found[name] = seen.error(seen.estimate(100))
-        return found
-
-    return compare(
-        StageBenchmark(
-            "head-motion",
-            "error of the head's place, mm",
-            f"where the simulated head was; {width // 2} pixels across 300 mm, {views} cameras",
-            left_out=(
-                ("Cramér-Rao bound", "shading that stays in space limits tracks, not noise"),
-            ),
-            condition=("drift mm",),
-            interval_of="frames",
-        ),
-        cases(),
-        repeats=1 if toy else 3,
-        by_band=by_band,
-    )
+    points = []
+    for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
+        seen = drift(drift_mm=drift_mm, times_s=times)
+        moved_mm = round(float(seen.moved_mm().mean()), 3)
+        points += [
+            measured(
+                {"drift mm": drift_mm, "tracks": tracks},
+                partial(seen.estimate, tracks),
+                seen.error,
+                also=lambda _: {"moved_mm": moved_mm},
+                repeats=1 if toy else 3,
+            )
+            for tracks in ((30, 60, 120, 200) if toy else (30, 100, 300))
+        ]
+    bands = {}
+    for name, band in MELANIN_BANDS.items():
+        seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
+        bands[name] = seen.error(seen.estimate(100))
+    return described("head-motion", points, by_band=bands, width=width // 2, views=views)

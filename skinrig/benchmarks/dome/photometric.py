@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -11,19 +13,20 @@ from threadpoolctl import threadpool_limits
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
     BandError,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
-    measure,
+    measured,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import drawn_again
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 MAX_FIT_S = 3.0
-MIN_SPEEDUP_OVER_IRLS = 100.0
 SAMPLE_NOISE = 0.005
 """Standard deviation of every sample; a white pixel that faces a light is 1."""
 
@@ -150,73 +153,52 @@ def _mean_bound_deg(scene: Scene, noise: float) -> float:
     return float(np.degrees(np.sqrt(np.pi) / 2 * rms.mean()))
 
 
-def _mean_deg(
-    found: NormalMaps, scene: Scene, rng: np.random.Generator
-) -> tuple[float, tuple[float, float]]:
+def _mean_deg(found: NormalMaps, scene: Scene, noise: float, rng: np.random.Generator) -> BandError:
+    """Return the mean error of normals, degrees, beside the least."""
     seen = scene.inside & found.valid
     error = np.degrees(angular_error_rad(found.normals[seen], scene.normals[seen]))
     some = rng.choice(error, min(error.size, 20_000), replace=False)
-    means = some[rng.integers(0, some.size, (100, some.size))].mean(axis=1)
-    return float(error.mean()), (float(np.quantile(means, 0.16)), float(np.quantile(means, 0.84)))
+    interval = drawn_again(some, np.mean, draws=100, rng=rng)
+    return BandError(float(error.mean()), interval, _mean_bound_deg(scene, noise))
 
 
 def normals(*, toy: bool) -> StageBenchmark:
     """Estimate the normals of a glossy ball: lights, robust steps, noise; then at full size."""
     rng = np.random.default_rng(0)
-    side = 40 if toy else 192
-    points = []
+    points: list[Point] = []
+    ball = partial(glossy_ball, 40 if toy else 192, noise=SAMPLE_NOISE, rng=rng)
 
-    def add(
-        scene: Scene, noise: float, knobs: dict[str, str | int | float], **options: object
-    ) -> None:
-        def run() -> NormalMaps:
-            return estimate_normals(scene.images, scene.lights, **options)  # type: ignore[arg-type]
-
-        timing = measure(run, repeats=1 if toy else 3)
-        error, interval = _mean_deg(run(), scene, rng)
-        bound = _mean_bound_deg(scene, noise)
-        points.append(Point({"noise": noise} | knobs, timing, error, interval, bound))
+    def add(knobs: Knobs, scene: Scene, noise: float = SAMPLE_NOISE, **options: Any) -> None:
+        points.append(
+            measured(
+                {"noise": noise} | knobs,
+                lambda: estimate_normals(scene.images, scene.lights, **options),
+                lambda found: _mean_deg(found, scene, noise, rng),
+                repeats=1 if toy else 3,
+            )
+        )
 
     for lights in (30, 12) if toy else (150, 75, 30, 12):
-        add(
-            glossy_ball(side, lights, noise=SAMPLE_NOISE, rng=rng),
-            SAMPLE_NOISE,
-            {"lights": lights, "fit": "robust"},
-        )
-    dense = glossy_ball(side, 30 if toy else 150, noise=SAMPLE_NOISE, rng=rng)
+        add({"lights": lights, "fit": "robust"}, ball(lights))
+    count = 30 if toy else 150
+    dense = ball(count)
     for steps in (0, 4) if toy else (0, 2, 4, 8):
-        add(
-            dense,
-            SAMPLE_NOISE,
-            {"lights": len(dense.lights), "fit": "robust", "L1 steps": steps},
-            robustness=Robustness(l1_iterations=steps),
-        )
-    add(dense, SAMPLE_NOISE, {"lights": len(dense.lights), "fit": "least squares"}, robust=False)
+        robustness = Robustness(l1_iterations=steps)
+        add({"lights": count, "fit": "robust", "L1 steps": steps}, dense, robustness=robustness)
+    add({"lights": count, "fit": "least squares"}, dense, robust=False)
     for noise in (0.02,) if toy else (0.001, 0.02):
-        scene = glossy_ball(side, len(dense.lights), noise=noise, rng=rng)
-        add(scene, noise, {"lights": len(scene.lights), "fit": "robust"})
+        add({"lights": count, "fit": "robust"}, ball(count, noise=noise), noise)
     bands = {}
     for name, band in MELANIN_BANDS.items():
         # gloss and noise stay as they are: on dark skin there is less of what is fitted
-        green = float(band.reflectance()[1])
-        scene = glossy_ball(side, len(dense.lights), noise=SAMPLE_NOISE, rng=rng, albedo=green)
-        error, interval = _mean_deg(estimate_normals(scene.images, scene.lights), scene, rng)
-        bands[name] = BandError(error, interval, _mean_bound_deg(scene, SAMPLE_NOISE))
-    limits = () if toy else _full_size(rng)
-    return StageBenchmark(
-        "normals",
-        "mean error of normals, degrees",
-        "the ball's own normals; half its samples in shadow or highlight, noise 0.5 % of white",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("noise",),
-        interval_of="pixels",
-        by_band=bands,
-    )
+        scene = ball(count, albedo=float(band.reflectance()[1]))
+        found = estimate_normals(scene.images, scene.lights)
+        bands[name] = _mean_deg(found, scene, SAMPLE_NOISE, rng)
+    limits = {} if toy else _full_size(rng)
+    return described("normals", points, limits, by_band=bands)
 
 
-def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+def _full_size(rng: np.random.Generator) -> Findings:
     """Measure 1024 x 1024 x 150, and the NumPy fit on some of its pixels."""
     side = 1024
     scene = glossy_ball(side, 150, noise=SAMPLE_NOISE, rng=rng)
@@ -234,24 +216,8 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     both = ours.valid & (np.linalg.norm(theirs, axis=1) > 0)
     error = np.degrees(angular_error_rad(ours.normals[both], truth[both])).mean()
     peer_error = np.degrees(angular_error_rad(theirs[both], truth[both])).mean()
-    return (
-        Limit(
-            "processor seconds on each of 2 cores for 1024 x 1024 x 150",
-            ours_s,
-            MAX_FIT_S,
-            "<=",
-            "s",
-        ),
-        Limit(
-            "times less processor time than NumPy IRLS-L1, 300 pixels extrapolated",
-            peer_s / (LIMIT_CORES * ours_s),
-            MIN_SPEEDUP_OVER_IRLS,
-            ">=",
-        ),
-        Limit(
-            "mean error over that of NumPy IRLS-L1, same pixels",
-            float(error / peer_error),
-            1.0,
-            "<=",
-        ),
-    )
+    return {
+        "seconds": ours_s,
+        "speed_up": peer_s / (LIMIT_CORES * ours_s),
+        "over_irls": float(error / peer_error),
+    }

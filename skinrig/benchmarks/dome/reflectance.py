@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,14 +13,15 @@ from model import skin_reflectance
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
-from reconstruction.brdf_basis import SurfaceSamples
 from rigsim.light import surface_brdf
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
+from skinrig.benchmarks.description import described
 from skinrig.benchmarks.dome import texture as bench_texture
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.resampling import drawn_again
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
-from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR, luminance
+from skinrig.rendering.photographs.errors import luminance
 
 LOBE_RANKS: Final = (1, 2, 4, 8, 24)
 USUAL_RANK: Final = 4
@@ -130,70 +131,34 @@ def model(*, toy: bool) -> StageBenchmark:
     for subject in BAND_PRESETS if toy else (*BAND_PRESETS, *EXTREME_PRESETS):
         p = face_points(subject, points=count, samples=samples, rng=rng)
         use = p.seen & ~p.left_out
-        albedo = diffuse_albedo.estimate(
-            p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=use
-        )
-        given = brdf_basis.surface_samples(
-            p.f, p.light, p.view, p.normals, albedo.r_d, eta=ETA, variance=p.variance, valid=use
-        )
+        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
+        albedo = diffuse_albedo.estimate(p.f, p.light, p.view, p.normals, **known)
+        given = brdf_basis.surface_samples(p.f, p.light, p.view, p.normals, albedo.r_d, **known)
         full = brdf_basis.fit_weights(given, materials)
         for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
                 continue
 
-            def run(
-                rank: int = rank,
-                given: SurfaceSamples = given,
-                full: brdf_basis.BasisWeights = full,
-            ) -> tuple[BrdfBasis, Float64Array]:
-                mix = brdf_basis.reduce(full, rank, basis=materials)[1]
-                lobes = materials.mixed(mix)
+            def reduced() -> tuple[BrdfBasis, Float64Array]:
+                lobes = materials.mixed(brdf_basis.reduce(full, rank, basis=materials)[1])
                 return lobes, brdf_basis.fit_weights(given, lobes).weights
 
-            timing = measure(run, repeats=1, memory=not toy)
-            lobes, weights = run()
-            surface, everything = _errors(p, lobes, weights, albedo.r_d)
-            again = np.median(rng.choice(surface, (200, len(surface))), axis=1)
-            low, high = (float(q) for q in np.quantile(again, [0.16, 0.84]))
-            error = float(np.median(surface))
+            timing, made = measure_and_keep(reduced, repeats=1, memory=not toy)
+            surface, everything = _errors(p, *made, albedo.r_d)
+            told = BandError(float(np.median(surface)), drawn_again(surface, rng=rng))
             total = float(np.median(everything))
-            knobs: dict[str, str | int | float | bool] = {
-                "part": "lobes",
-                "rank": rank,
-                "subject": subject,
-                "points": len(surface),
-                "samples": samples,
-            }
+            knobs: Knobs = {"part": "lobes", "rank": rank, "subject": subject}
+            knobs |= {"points": len(surface), "samples": samples}
             also = {"all_light_error_percent": round(total, 3)}
-            points.append(Point(knobs, timing, error, (low, high), also=also))
+            points.append(Point.of(knobs, timing, told, also))
             if rank == USUAL_RANK:
-                for band in (b for b, one in MELANIN_BANDS.items() if one.preset == subject):
-                    bands[band] = BandError(error, (low, high))
+                bands |= {b: told for b, one in MELANIN_BANDS.items() if one.preset == subject}
                 usual.append(total)
     texture = [
         dataclasses.replace(point, knobs={"part": "texture", **point.knobs})
         for point in bench_texture.points(toy=toy)
     ]
-    return StageBenchmark(
-        "reflectance",
-        "error of the surface term under lights left out, % of its sum; of matched textures' "
-        "histograms, spreads of the population",
-        "simulated faces: facets, oil and vellus hair, of which no lobe is made",
-        0.0,
-        (*points, *texture),
-        (
-            Limit(
-                f"median error of all light under lights left out, rank {USUAL_RANK}, worst skin",
-                max(usual),
-                100.0 * MAX_MEDIAN_ERROR,
-                "<=",
-                "%",
-            ),
-        ),
-        by_band=bands,
-        condition=("part", "subject"),
-        interval_of="points",
-    )
+    return described("reflectance", (*points, *texture), {"total": max(usual)}, by_band=bands)
 
 
 def _errors(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,16 +17,16 @@ from rigsim.render import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.arrays import FloatArray
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measured
 from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
-from skinrig.rendering.render import Rendering, Subsurface, render
+from skinrig.rendering.lights import Light
+from skinrig.rendering.render import Rendering, render
 from skinrig.rendering.truth import true_light, true_model
 
-MAX_MEDIAN_ERROR_PERCENT: Final = 1.0
-MAX_SUM_ERROR_PERCENT: Final = 1.0
 VIEW_NAME: Final = "C07"
 LIGHT_INDEX: Final = 62
 REFERENCE_SUBPIXELS: Final = 6
@@ -41,132 +43,89 @@ def model(*, toy: bool) -> StageBenchmark:
     width, size, fine = (48, 128, 3) if toy else (325, 512, REFERENCE_SUBPIXELS)
     rays = (1, 2) if toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
-    face = make_subject("III", seed=5, size=size)
-    # as the model has it
-    direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
-    scene = direct(rig, face)
-    true = direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0]
-    camera = CameraPose.nominal(rig.views[0])
-    light = true_light(scene, LIGHT_INDEX, VIEW_NAME)
-    caster = Caster(face.mesh)
-    points = []
+    seen = _Seen.of("III", rig, size=size, fine=fine)
+    points: list[Point] = []
     binnings = (1, 2) if toy else (1, 2, 4, 8)
-    laid = {
-        k: FittedSurface.of(true_model(scene, VIEW_NAME, binning=k), face.mesh) for k in binnings
-    }
+    laid = {k: seen.laid(binning=k) for k in binnings}
 
-    def shown(
-        on: FittedSurface,
-        way: Subsurface = "local",
-        interior: Interior | None = None,
-        subpixels: int = 2,
-        tolerance: float = 0.01,
-    ) -> Rendering:
-        return render(
-            on.model,
-            on,
-            camera,
-            light,
-            subsurface=way,
-            subpixels=subpixels,
-            caster=caster,
-            interior=interior,
-            tolerance=tolerance,
-        )
+    def add(knobs: Knobs, call: Callable[[], FloatArray], true: FloatArray, repeats: int) -> None:
+        error = partial(_relative, true=true)
+        points.append(measured(knobs, call, error, repeats=repeats, memory=None))
 
-    for subpixels in rays:
-        timing = measure(lambda k=subpixels: shown(laid[1], subpixels=k), repeats=2, memory=None)  # type: ignore[misc]
-        seen = shown(laid[1], subpixels=subpixels)
-        error = _relative(seen.radiance, true)
-        points.append(_point({"vary": "rays", "rays": subpixels**2}, timing, error))
-    for binning in binnings[1:]:
-        timing = measure(lambda k=binning: shown(laid[k]), repeats=2, memory=None)  # type: ignore[misc]
-        error = _relative(shown(laid[binning]).radiance, true)
-        points.append(_point({"vary": "texture", "texels": size // binning}, timing, error))
+    for k in rays:
+        knobs: Knobs = {"vary": "rays", "rays": k**2}
+        add(knobs, lambda: seen.shown(laid[1], subpixels=k).radiance, seen.true, 2)
+    for k in binnings[1:]:
+        knobs = {"vary": "texture", "texels": size // k}
+        add(knobs, lambda: seen.shown(laid[k]).radiance, seen.true, 2)
     skin = laid[1].of_medium(MEAN_SIGMA_TR_PER_MM)
-    interior = Interior.of(skin)
-    best = shown(skin, "dipole", interior, 1, 0.001).diffuse
+    spread = partial(seen.shown, skin, subsurface="dipole", interior=Interior.of(skin), subpixels=1)
+    best = spread(tolerance=0.001).diffuse
     for tolerance in (0.1, 0.01) if toy else (3.0, 1.0, 0.3, 0.1, 0.01):
-        timing = measure(
-            lambda t=tolerance: shown(skin, "dipole", interior, 1, t),  # type: ignore[misc]
-            repeats=1,
-            memory=None,
-        )
-        error = _relative(shown(skin, "dipole", interior, 1, tolerance).diffuse, best)
-        points.append(_point({"vary": "spreading", "tolerance": tolerance}, timing, error))
-    seen = shown(laid[1])
-    lit = seen.lit & seen.covered & (true.mean(axis=-1) > 0.0)
-    gap = np.abs(seen.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
+        knobs = {"vary": "spreading", "tolerance": tolerance}
+        add(knobs, lambda: spread(tolerance=tolerance).diffuse, best, 1)
+    usual, true = seen.shown(laid[1]), seen.true
+    lit = usual.lit & usual.covered & (true.mean(axis=-1) > 0.0)
+    gap = np.abs(usual.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
+    color = np.array(seen.light.intensity)
     two = [
-        dataclasses.replace(light, name=n, intensity=_part(light.intensity, w))
+        dataclasses.replace(seen.light, name=n, intensity=tuple((w * color).tolist()))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render(skin.model, laid[1], camera, two, subpixels=2, caster=caster).radiance
-    bands = {
-        name: _on_skin(band.preset, rig, size=128 if toy else 256, fine=fine)
-        for name, band in MELANIN_BANDS.items()
-    }
-    return StageBenchmark(
+    both = render(skin.model, laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
+    bands = {}
+    for name, band in MELANIN_BANDS.items():
+        other = _Seen.of(band.preset, rig, size=128 if toy else 256, fine=fine)
+        bands[name] = _relative(other.shown(other.laid()).radiance, other.true)
+    return described(
         "render-model",
-        "RMS error over the mean radiance of skin, %",
-        f"the simulator's pictures at {fine**2} rays a pixel; of spreading our own at tolerance "
-        "0.001. Its own error falls at least with the root of the rays from ours with the most",
-        points[len(rays) - 1].error * rays[-1] / fine,
-        tuple(points),
-        (
-            Limit(
-                "median relative error of true maps on lit pixels",
-                100.0 * float(np.median(gap)),
-                MAX_MEDIAN_ERROR_PERCENT,
-                "<=",
-                "%",
-            ),
-            Limit(
-                "two lights of 0.3 and 0.7 beside one of 1",
-                _relative(both, seen.radiance)[0],
-                MAX_SUM_ERROR_PERCENT,
-                "<=",
-                "%",
-            ),
-        ),
-        left_out=(
-            ("a peer that renders these maps", "no renderer at hand reads tabulated mixtures"),
-        ),
-        condition=("vary",),
+        points,
+        {"median": 100.0 * float(np.median(gap)), "sum": _relative(both, usual.radiance).error},
+        reference_error=points[len(rays) - 1].error * rays[-1] / fine,
         by_band=bands,
-        interval_of="tiles of the picture",
+        rays=fine**2,
     )
 
 
-def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
-    """Return the error of a face of a preset's melanin, at 4 rays a pixel."""
-    face = make_subject(preset, seed=5, size=size)
-    # as the model has it
-    direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
-    scene = direct(rig, face)
-    true = direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0]
-    on = FittedSurface.of(true_model(scene, VIEW_NAME), face.mesh)
-    camera = CameraPose.nominal(rig.views[0])
-    light = true_light(scene, LIGHT_INDEX, VIEW_NAME)
-    seen = render(on.model, on, camera, light, subpixels=2, caster=Caster(face.mesh))
-    return BandError(*_relative(seen.radiance, true))
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A face in the dome under one light, as the simulator and as the fitted model show it."""
+
+    scene: DomeScene
+    true: FloatArray
+    camera: CameraPose
+    light: Light
+    caster: Caster
+
+    @classmethod
+    def of(cls, preset: str, rig: Rig, *, size: int, fine: int) -> _Seen:
+        face = make_subject(preset, seed=5, size=size)
+        # as the model has it
+        direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
+        scene = direct(rig, face)
+        return cls(
+            scene,
+            direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0],
+            CameraPose.nominal(rig.views[0]),
+            true_light(scene, LIGHT_INDEX, VIEW_NAME),
+            Caster(face.mesh),
+        )
+
+    def laid(self, **binning: int) -> FittedSurface:
+        """Return the true maps, laid over the face."""
+        return FittedSurface.of(
+            true_model(self.scene, VIEW_NAME, **binning), self.scene.subject.mesh
+        )
+
+    def shown(self, on: FittedSurface, **settings: Any) -> Rendering:
+        """Render with 4 rays a pixel where nothing else is set."""
+        return render(
+            on.model, on, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
+        )
 
 
-def _part(color: tuple[float, float, float], share: float) -> tuple[float, float, float]:
-    return color[0] * share, color[1] * share, color[2] * share
-
-
-def _relative(found: FloatArray, true: FloatArray) -> tuple[float, tuple[float, float]]:
+def _relative(found: FloatArray, true: FloatArray) -> BandError:
     """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 tiles."""
     skin = true.mean(axis=-1) > 0.0
     to_percent = 100.0 / float(true[skin].mean())
-    told = tiled_rms((found.astype(np.float64) - true) * to_percent, skin)
-    return told.error, told.error_interval
-
-
-def _point(
-    knobs: dict[str, str | int | float | bool],
-    timing: Timing,
-    error: tuple[float, tuple[float, float]],
-) -> Point:
-    return Point(knobs, timing, error[0], error[1])
+    return tiled_rms((found.astype(np.float64) - true) * to_percent, skin)

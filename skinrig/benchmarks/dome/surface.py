@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -21,21 +23,12 @@ from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Case,
-    Limit,
-    Point,
-    StageBenchmark,
-    Timing,
-    compare,
-)
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing, measured
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
 
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
-MAX_MEMORY_MB = 400.0
 N_FULL_SAMPLES = 500_000 * 16 * 150
-MAX_HOURS = 1.0
 N_ERROR_BLOCKS = 40
 """Of samples, whose means scatter independently."""
 
@@ -55,74 +48,56 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
     rate = peak = 0.0
     counts = (250, 500) if toy else (2_000, 10_000, 40_000)
     for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
-        where = sphere.vertices[:count]
-        surface = Surface(where, where / SPHERE_RADIUS_MM)
         with tempfile.TemporaryDirectory() as folder:
-            tracemalloc.start()
-            start = time.perf_counter()
-            store = LumitexelStore(
-                surface,
-                cameras=cameras,
-                lights=lights,
-                caster=caster,
-                folder=Path(folder) if kind == "disk" else None,
-                dtype=np.float16 if kind == "disk" else np.float32,
-            )
-            spent = time.perf_counter() - start
-            for view in range(len(cameras)):
-                for light in range(len(names)):
-                    image = _image(seen[view], lights, light)
-                    start = time.perf_counter()
-                    store.add(view, light, image, np.full_like(image, 1e-6))
-                    spent += time.perf_counter() - start
-            errors = []
-            start = time.perf_counter()
-            for _, part in store.chunks(1000):
-                inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
-                errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
-            spent += time.perf_counter() - start
-            peak = tracemalloc.get_traced_memory()[1] / 1e6
-            tracemalloc.stop()
+            table: dict[str, Any] = {"folder": None, "dtype": np.float32}
+            if kind == "disk":
+                table = {"folder": Path(folder), "dtype": np.float16}
+            spent, peak, errors = _gathered(sphere, count, cameras, lights, caster, seen, table)
         off = 100 * np.abs(np.concatenate(errors))
         rate = spent / (count * len(cameras) * len(names))
-        points.append(
-            Point(
-                {"points": count, "tables": kind},
-                Timing(spent, (spent, spent), spent, peak),
-                float(off.mean()),
-                # samples of a point err alike: blocks of points are drawn
-                mean_error(
-                    [part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)]
-                ).error_interval,
-            )
-        )
-    return StageBenchmark(
-        "lumitexels",
-        "mean error of the BRDF samples, %",
-        "a Lambertian sphere in closed form; what is left is bilinear sampling",
-        0.0,
-        tuple(points),
-        (
-            Limit(
-                "memory of the largest gathering with tables on disk",
-                peak,
-                MAX_MEMORY_MB,
-                "<=",
-                "MB",
-            ),
-            Limit(
-                "hours for 500,000 points x 16 x 150 at this rate, images given",
-                rate * N_FULL_SAMPLES / 3600,
-                MAX_HOURS,
-                "<=",
-                "h",
-            ),
-        ),
-        left_out=(("500,000 points x 16 x 150 itself", "takes 7 GB of disk and many minutes"),),
-        condition=("points",),
-        interval_of="samples",
-        no_bands="sampling of pictures, relative to their brightness; one albedo",
+        # samples of a point err alike: blocks of points are drawn
+        blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
+        told = BandError(float(off.mean()), blocks.error_interval)
+        timing = Timing(spent, (spent, spent), spent, peak)
+        points.append(Point.of({"points": count, "tables": kind}, timing, told))
+    return described("lumitexels", points, {"memory": peak, "hours": rate * N_FULL_SAMPLES / 3600})
+
+
+def _gathered(
+    sphere: trimesh.Trimesh,
+    count: int,
+    cameras: Sequence[CameraPose],
+    lights: LightTable,
+    caster: RayCaster,
+    seen: Sequence[Float64Array],
+    table: Mapping[str, Any],
+) -> tuple[float, float, list[FloatArray]]:
+    """Gather some points; return seconds, MB held, and relative errors of the samples."""
+    where = sphere.vertices[:count]
+    tracemalloc.start()
+    start = time.perf_counter()
+    store = LumitexelStore(
+        Surface(where, where / SPHERE_RADIUS_MM),
+        cameras=cameras,
+        lights=lights,
+        caster=caster,
+        **table,
     )
+    spent = time.perf_counter() - start
+    for view, light in itertools.product(range(len(cameras)), range(len(lights.position_mm))):
+        image = _image(seen[view], lights, light)
+        start = time.perf_counter()
+        store.add(view, light, image, np.full_like(image, 1e-6))
+        spent += time.perf_counter() - start
+    errors = []
+    start = time.perf_counter()
+    for _, part in store.chunks(1000):
+        inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
+        errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
+    spent += time.perf_counter() - start
+    peak = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    return spent, peak, errors
 
 
 def filling(*, toy: bool) -> StageBenchmark:
@@ -135,31 +110,24 @@ def filling(*, toy: bool) -> StageBenchmark:
         axis=-1,
     ).astype(np.float32)
 
-    def cases() -> Iterator[Case[FloatArray]]:
-        for share in (0.05, 0.15, 0.35, 0.75):
-            weight = (rng.random((side, side)) < share).astype(np.float32)
-            weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
+    def error(filled: FloatArray, unknown: BoolArray) -> BandError:
+        off = 100 * (filled - truth) / truth.std()
+        return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
 
-            def error(filled: FloatArray, unknown: BoolArray = weight == 0) -> BandError:
-                off = 100 * (filled - truth) / truth.std()
-                return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
-
-            for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
-                knobs: dict[str, str | float] = {"known": share, "way": way, "side": side}
-                yield Case(knobs, partial(fill, truth, weight), error)
-
-    return compare(
-        StageBenchmark(
-            "texture-fill",
-            "RMS error of filled texels, % of the texture's deviation",
-            "the smooth texture the texels were taken from",
-            condition=("known",),
-            interval_of="tiles of the texture",
-            no_bands="filling of any map: errors go with its values",
-        ),
-        cases(),
-        repeats=1 if toy else 3,
-    )
+    points = []
+    for share in (0.05, 0.15, 0.35, 0.75):
+        weight = (rng.random((side, side)) < share).astype(np.float32)
+        weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
+        for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
+            points.append(
+                measured(
+                    {"known": share, "way": way, "side": side},
+                    partial(fill, truth, weight),
+                    lambda filled: error(filled, weight == 0),
+                    repeats=1 if toy else 3,
+                )
+            )
+    return described("texture-fill", points)
 
 
 def _push_pull(values: Float32Array, weight: Float32Array) -> FloatArray:

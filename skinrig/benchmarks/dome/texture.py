@@ -14,12 +14,11 @@ from model.texture_statistics import describe, match, steerable_pyramid
 from model.texture_statistics.histograms import distance
 from model.texture_statistics.space import TextureSpace
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import mean_error
 
 MIN_SPEEDUP_OVER_PYRTOOLS = 10.0
-MAX_DISTANCE_RATIO = 1.05
-MAX_RESPONSE_DIFFERENCE = 2e-6
-"""Of the image's largest value: float32 against float64."""
 FULL_SIDE_PX, FULL_ITERATIONS = 1024, 4
 PEER_NAME = "pyrtools and scikit-image"
 N_SOURCES = 3
@@ -62,20 +61,19 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
     return (_SKIN_COLOR * np.exp(-density)).astype(np.float32)
 
 
-def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> tuple[float, Any]:
+def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> BandError:
     """Return the mean distance of images from a vector, and its interval over the images."""
     wanted = space.histograms(target)
     off = [
         float(distance(space.histograms(describe(i, space=space)), wanted, space.edges).mean())
         for i in images
     ]
-    mean, stderr = float(np.mean(off)), float(np.std(off, ddof=1) / np.sqrt(len(off)))
-    return mean, (mean - stderr, mean + stderr)
+    return mean_error(off)
 
 
 def _point(
     side: int,
-    knobs: dict[str, str | int | float | bool],
+    knobs: Knobs,
     *,
     repeats: int,
     levels: int = steerable_pyramid.LEVELS,
@@ -103,8 +101,8 @@ def _point(
         ).image
 
     timing = measure(lambda: run(sources[0]), repeats=repeats)
-    error, interval = _error([run(s) for s in sources], describe(target, space=full), full)
-    return Point({"side": side, **knobs}, timing, error, interval)
+    told = _error([run(s) for s in sources], describe(target, space=full), full)
+    return Point.of({"side": side, **knobs}, timing, told)
 
 
 def points(toy: bool) -> tuple[Point, ...]:
@@ -126,33 +124,19 @@ def matching(*, toy: bool) -> StageBenchmark:
     """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
     side, repeats = (48, 1) if toy else (256, 3)
     found = list(points(toy))
-    found.append(
-        _point(
-            side,
-            {"levels": 7, "iterations": 5, "precision": "float64"},
-            repeats=repeats,
-            dtype=np.float64,
-        )
-    )
-    found.append(
-        _point(
-            side, {"levels": 7, "iterations": 5, "start": "noise"}, repeats=repeats, start="noise"
-        )
-    )
-    for other in (32,) if toy else (128, 512):
-        found.append(_point(other, {"levels": 7, "iterations": 5}, repeats=repeats))
-    limits, left_out = ((), ()) if toy else against_peer()
-    return StageBenchmark(
+    usual: Knobs = {"levels": 7, "iterations": 5}
+    found += [
+        _point(side, usual | {"precision": "float64"}, repeats=repeats, dtype=np.float64),
+        _point(side, usual | {"start": "noise"}, repeats=repeats, start="noise"),
+    ]
+    found += [_point(other, usual, repeats=repeats) for other in ((32,) if toy else (128, 512))]
+    limits, left_out = ({}, ()) if toy else against_peer()
+    return described(
         "texture-matching",
-        "mean distance of 93 histograms, spreads of the population",
-        "the histograms of the target; reference error: of another texture made as it was",
-        _same_texture(side),
         tuple(found),
         limits,
-        left_out,
-        condition=("side", "start"),
-        interval_of="textures",
-        no_bands="histograms relative to their own spread; melanin scales them alike",
+        reference_error=_same_texture(side),
+        left_out=left_out,
     )
 
 
@@ -162,7 +146,7 @@ def _same_texture(side: int) -> float:
     textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
     plain = 0.9 * skin_texture(side, spots=0.0, rng=rng)
     space = TextureSpace.fit([*textures, plain])
-    return _error(textures[1:], describe(textures[0], space=space), space)[0]
+    return _error(textures[1:], describe(textures[0], space=space), space).error
 
 
 def peer_iterations(
@@ -212,13 +196,13 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def against_peer(side: int = FULL_SIDE_PX) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
+def against_peer(side: int = FULL_SIDE_PX) -> tuple[Findings, tuple[tuple[str, str], ...]]:
     """Match one channel by turns with the peer; return limits, or what is left out and why."""
     try:
         peer_responses(np.zeros((512, 512)))
     except ImportError as error:
         why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
-        return (), ((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why),)
+        return {}, ((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why),)
     rng = np.random.default_rng(0)
     target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
     source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
@@ -238,30 +222,19 @@ def against_peer(side: int = FULL_SIDE_PX) -> tuple[tuple[Limit, ...], tuple[tup
     wall, busy = np.median(ratios, axis=0)
     wanted = space.histograms(vector)
     off = [
-        float(
-            distance(
-                space.histograms(describe(image.astype(np.float32), space=space)),
-                wanted,
-                space.edges,
-            ).mean()
-        )
-        for image in (own, peer)
+        float(distance(space.histograms(describe(i, space=space)), wanted, space.edges).mean())
+        for i in (own.astype(np.float32), peer.astype(np.float32))
     ]
     apart = [
         float(np.abs(a - b).max() / source.max())
         for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
     ]
-    what = f"an iteration at {side} x {side}, one channel"
-    limits = (
-        Limit(
-            f"{what}: times as fast as {PEER_NAME}", float(wall), MIN_SPEEDUP_OVER_PYRTOOLS, ">="
-        ),
-        Limit(f"{what}: the same of processor time", float(busy), MIN_SPEEDUP_OVER_PYRTOOLS, ">="),
-        Limit(
-            "distance from the target over the peer's", off[0] / off[1], MAX_DISTANCE_RATIO, "<="
-        ),
-        Limit("responses less the peer's, of the image", max(apart), MAX_RESPONSE_DIFFERENCE, "<="),
-    )
+    limits: Findings = {
+        ("speed_up", side): float(wall),
+        ("processor", side): float(busy),
+        "distance": off[0] / off[1],
+        "responses": max(apart),
+    }
     return limits, ()
 
 

@@ -18,8 +18,9 @@ from reconstruction.correspondence import common_regions
 from rigsim.population.population import Member, shifted, table_1
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.measurement import Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
 from skinrig.traits import truth as trait_truth
@@ -27,10 +28,6 @@ from skinrig.traits.albedo_vectors import VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
 
-MIN_COSINE_TO_TRUTH = 0.95
-MAX_ROUND_TRIP_RATIO = 0.1
-MAX_FALSE_ALARM_RATE = 0.1
-"""Share of traits without any truth that p < 0.05 may let pass: of 200, 5 % and 3.2 deviations."""
 N_GROUP_DRAWS = 12
 """Random choices of so many people, whose scatter is the error's."""
 N_LABEL_SHUFFLES = 200
@@ -48,23 +45,10 @@ def traits(*, toy: bool) -> StageBenchmark:
     some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if toy else 40])]
     points, limits = _surface(some, toy=toy)
     more, bounds = _albedo(some, toy=toy)
-    return StageBenchmark(
-        "traits",
-        "1 - cosine to the true trait",
-        "the same people simulated without noise, with the trait and without",
-        0.0,
-        (*points, *more),
-        (*limits, *bounds),
-        left_out=(
-            ("the time to fit lobes and to draw faces", "that of learning alone is measured"),
-        ),
-        condition=("trait", "noise"),
-        interval_of="random choices of people",
-        no_bands="one vector is learned of people of all skins together",
-    )
+    return described("traits", (*points, *more), limits | bounds)
 
 
-def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
+def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findings]:
     basis = brdf_tables.default()
     strength = basis.strength()
     metric = basis.kinship() * np.outer(strength, strength)
@@ -87,7 +71,8 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
     def judged(space: TraitSpace) -> float:
         return truth.cosine(space.trait("trait").vector, basis)
 
-    found, limits = [], []
+    found: list[Point] = []
+    limits: Findings = {}
     rng = np.random.default_rng(3)
     most = 4 if toy else 20
     seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
@@ -106,11 +91,9 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[
                 fit = partial(_fitted, means, label, kind, metric, basis)
                 found.append(_drawn(fit, label, group, knobs, judged))
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
-    limits.append(
-        Limit("cosine of lotion with the truth", judged(space), MIN_COSINE_TO_TRUTH, ">=")
-    )
-    limits.append(_false_alarms("lobes", means, metric, toy=toy))
-    limits += _returned(means[~label], space, metric)
+    limits["lotion"] = judged(space)
+    limits.update(_false_alarms("lobes", means, metric, toy=toy))
+    limits |= _returned(means[~label], space, metric)
     return found, limits
 
 
@@ -181,7 +164,7 @@ def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp
 
 def _false_alarms(
     what: str, samples: Float64Array, metric: Float64Array | None, *, toy: bool
-) -> Limit:
+) -> Findings:
     """Return how often shuffled labels pass for a trait."""
     rng = np.random.default_rng(6)
     passed = []
@@ -189,15 +172,10 @@ def _false_alarms(
         label = rng.permutation(np.arange(len(samples)) < len(samples) // 3)
         space = TraitSpace.fit(samples, {"none": label}, components=1, metric=metric)
         passed.append(space.trait("none").confidence.p_value < 0.05)
-    return Limit(
-        f"shuffled labels of {what} that give a trait at p < 0.05",
-        float(np.mean(passed)),
-        MAX_FALSE_ALARM_RATE,
-        "<=",
-    )
+    return {("false_alarms", what): float(np.mean(passed))}
 
 
-def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> list[Limit]:
+def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> Findings:
     """Edit the lobes of faces without the trait, and back again."""
     size = float(reduced_spaces.lengths(space.trait("trait").vector, metric))
     rng = np.random.default_rng(7)
@@ -215,24 +193,14 @@ def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> l
         back.append(reduced_spaces.lengths(gap, metric) / (0.6 * size))
         miss = there.weights @ there.mix - weights @ mix - 0.6 * space.trait("trait").vector
         off.append(reduced_spaces.lengths(miss, metric) / (0.6 * size))
-    return [
-        Limit("largest change of a weight by an edit of amount 0", worst_zero, 1e-12, "<="),
-        Limit(
-            "+0.6 lotion, then -0.6: RMS distance from the source over that of the edit",
-            float(np.sqrt(np.mean(np.square(back)))),
-            MAX_ROUND_TRIP_RATIO,
-            "<=",
-        ),
-        Limit(
-            "+0.6 lotion, texel by texel: RMS distance from what was asked over the edit",
-            float(np.sqrt(np.mean(np.square(off)))),
-            MAX_ROUND_TRIP_RATIO,
-            "<=",
-        ),
-    ]
+    return {
+        "zero": worst_zero,
+        "back": float(np.sqrt(np.mean(np.square(back)))),
+        "off": float(np.sqrt(np.mean(np.square(off)))),
+    }
 
 
-def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[Limit]]:
+def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findings]:
     tanned = shifted(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
     faces = CommonFaces.of(people, size=64 if toy else 128, common=48 if toy else 80)
@@ -242,7 +210,8 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
     after = shifted(
         people, "tan", melanin=TAN_MELANIN_FACTOR, share=1.0, rng=np.random.default_rng(1)
     )
-    points, limits = [], []
+    points: list[Point] = []
+    limits: Findings = {}
     for noise in (0.01,) if toy else (0.01, 0.1):
         maps = [
             faces.albedo(p, noise=noise, rng=np.random.default_rng([8, k]))
@@ -309,15 +278,8 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], list[L
             )
             # Plain histograms are measured, and miss it: their points say by how much
             if noise == 0.01 and kind == "quantiles":
-                limits.append(
-                    Limit(
-                        f"cosine of tan with the truth, {kind}, {len(seen)} people seen twice",
-                        1.0 - points[-1].error,
-                        MIN_COSINE_TO_TRUTH,
-                        ">=",
-                    )
-                )
-                limits.append(_false_alarms("albedo", rows, None, toy=toy))
+                limits["tan", kind, str(len(seen))] = 1.0 - points[-1].error
+                limits.update(_false_alarms("albedo", rows, None, toy=toy))
     return points, limits
 
 

@@ -15,7 +15,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Points = dict[str, tuple[float, float]]
@@ -252,54 +253,22 @@ def aligned(*, toy: bool) -> StageBenchmark:
     bands = {
         name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
     }
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
         before = run(24, 2, still)
         false_motion = np.linalg.norm(before.source_px - still.source_px, axis=-1)[before.valid]
         by_setting = {(p.knobs["landmarks"], p.knobs["rounds"]): p.error for p in points}
-        limits = (
-            Limit(
-                "px (median) of motion seen where blood alone changed",
-                float(np.median(false_motion)),
-                0.1,
-                "<=",
-                "px",
+        limits = {
+            "false_motion": float(np.median(false_motion)),
+            "covered": float(covered or 0.0),
+            "by_flow": by_setting[24, 0] / by_setting[24, 2],
+            "seconds": next(
+                p.timing.seconds
+                for p in points
+                if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)
             ),
-            Limit(
-                "share of pixels within twice the stated error, 24 landmarks",
-                float(covered or 0.0),
-                0.95,
-                ">=",
-            ),
-            Limit(
-                "times smaller error by dense flow than by 24 landmarks alone",
-                by_setting[24, 0] / by_setting[24, 2],
-                3.0,
-                ">=",
-            ),
-            Limit(
-                "seconds on 512 x 512, 24 landmarks",
-                next(
-                    p.timing.seconds
-                    for p in points
-                    if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)
-                ),
-                10.0,
-                "<=",
-                "s",
-            ),
-        )
-    return StageBenchmark(
-        "expression-alignment",
-        "root mean square error of a pixel's place, px",
-        f"the smooth displacement of {side / 50:.3g} px that moved the picture",
-        0.0,
-        tuple(points),
-        limits,
-        by_band=bands,
-        left_out=(("Cramér-Rao bound", "deformation within the flow's windows limits, not noise"),),
-        interval_of="patches of the face",
-    )
+        }
+    return described("expression-alignment", points, limits, by_band=bands, moved_px=side / 50)
 
 
 def _on_skin(preset: str, side: int) -> BandError:
@@ -363,33 +332,18 @@ def misaligned(*, toy: bool) -> StageBenchmark:
                 error = (call() - truth)[mask] / size
                 error = error[np.isfinite(error)]
                 errors[f"{way} {radius:g} {state}", off_px] = _rms(error)
-                knobs: dict[str, str | float] = {"state": state, "way": way, "off_px": off_px}
+                knobs: Knobs = {"state": state, "way": way, "off_px": off_px}
                 if radius:
                     knobs["radius_px"] = radius
                 points.append(Point(knobs, timing, _rms(error), _rms_interval(error, side)))
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
-        limits = tuple(
-            Limit(
-                f"times larger error of interpolation than of blending, {state}, 2 px off",
-                errors[f"interpolated 0 {state}", 2.0] / errors[f"blended 16 {state}", 2.0],
-                2.0,
-                ">=",
-            )
+        limits = {
+            ("ratio", state): errors[f"interpolated 0 {state}", 2.0]
+            / errors[f"blended 16 {state}", 2.0]
             for state in ("exercise", "smile")
-        )
-    return StageBenchmark(
-        "misalignment",
-        "root mean square error over that of the state's change",
-        "blood of the state by dilated vessels, on the unmoved face",
-        0.0,
-        tuple(points),
-        limits,
-        left_out=(("a bound", "what eq. (6) leaves out of dilated vessels is its error at 0 px"),),
-        condition=("state", "off_px"),
-        interval_of="patches of the face",
-        no_bands="maps of blood alone: melanin does not enter",
-    )
+        }
+    return described("misalignment", points, limits)
 
 
 def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:

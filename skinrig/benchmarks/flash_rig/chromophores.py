@@ -11,14 +11,14 @@ from model import color_table, metrics
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 CHANNEL_NOISE = 0.01
 MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
-MAX_INVERSION_S = 0.5
 MIN_SPEEDUP_OVER_LEAST_SQUARES = 1000.0
 
 
@@ -35,7 +35,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
     picture = noisy.reshape(side, side, 3)
     variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
     points = []
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     for shading in ("known", "free"):
         for size in (16, 128) if toy else (16, 32, 64, 128):
             coarse = color_table.build(
@@ -60,31 +60,9 @@ def inversion(*, toy: bool) -> StageBenchmark:
         if shading == "free":
             peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
-            limits = (
-                Limit(
-                    f"seconds for {side} x {side}, free shading",
-                    timing.seconds,
-                    MAX_INVERSION_S,
-                    "<=",
-                    "s",
-                ),
-                Limit(
-                    "times faster than SciPy's least squares",
-                    peer_s / ours_s,
-                    MIN_SPEEDUP_OVER_LEAST_SQUARES,
-                    ">=",
-                ),
-            )
-    return StageBenchmark(
-        "chromophores",
-        "median error of melanin, %",
-        "the chromophores that the picture was made of, 1 % noise a channel",
-        0.0,
-        tuple(points),
-        limits,
-        by_band=_by_band(table, 500 if toy else 20_000, rng),
-        condition=("shading",),
-        interval_of="pixels",
+            limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
+    return described(
+        "chromophores", points, limits, by_band=_by_band(table, 500 if toy else 20_000, rng)
     )
 
 

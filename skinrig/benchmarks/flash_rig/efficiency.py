@@ -20,7 +20,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 
@@ -66,7 +67,7 @@ def efficiency(*, toy: bool) -> StageBenchmark:
     """Measure mean squared errors over Cramér-Rao bounds."""
     draws = 500 if toy else 20_000
     points: list[Point] = []
-    limits: list[Limit] = []
+    limits: Findings = {}
     left_out: list[tuple[str, str]] = []
     worst: dict[str, BandError] = {}
     for name, made in _ESTIMATOR_TRIALS.items():
@@ -76,7 +77,7 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             squared = trial.squared_errors()
             ratio = float(squared.mean()) / trial.bound
             spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
-            knobs: dict[str, str | float] = {
+            knobs: Knobs = {
                 "estimator": name,
                 "subject": subject,
                 "noise_percent": round(100 * trial.noise, 2),
@@ -92,29 +93,10 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             ratio = float(np.mean([one for one, _ in told]))
             spread = float(np.sqrt(np.sum([s**2 for _, s in told]))) / len(told)
             # what so many draws leave open of the ratio counts for the estimator
-            limits.append(
-                Limit(
-                    f"{name}, {band} skin: mean squared error over the bound",
-                    ratio - 2.0 * spread,
-                    MAX_RATIO_TO_BOUND,
-                    "<=",
-                )
-            )
+            limits["ratio", name, band] = ratio - 2.0 * spread
             if band not in worst or ratio > worst[band].error:
                 worst[band] = BandError(ratio, (ratio - spread, ratio + spread), 1.0)
-    return StageBenchmark(
-        "efficiency",
-        "mean squared error over Cramér-Rao bound",
-        "data of the estimator's own model with noise of known variance",
-        0.0,
-        tuple(points),
-        tuple(limits),
-        tuple(left_out),
-        by_band=worst,
-        squared=True,
-        condition=("estimator", "subject", "noise_percent"),
-        interval_of="draws of noise; by band, of the worst estimator there",
-    )
+    return described("efficiency", points, limits, left_out=tuple(left_out), by_band=worst)
 
 
 def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:

@@ -12,7 +12,8 @@ from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure, processor_seconds
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, measure, processor_seconds
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -37,9 +38,7 @@ def rig(*, toy: bool) -> StageBenchmark:
     truths = {name: face.hemoglobin(name) for name in names}
 
     def point(
-        knobs: dict[str, str | int | float],
-        predict: Callable[[str], FloatArray],
-        call: Callable[[], object] | None = None,
+        knobs: Knobs, predict: Callable[[str], FloatArray], call: Callable[[], object] | None = None
     ) -> Point:
         knobs = {"misaligned_px": 0} | knobs
         timing = measure(call or (lambda: predict(names[0])), repeats=1 if toy else 3, memory=False)
@@ -115,21 +114,11 @@ def rig(*, toy: bool) -> StageBenchmark:
                 ),
             )
         )
-    limits = () if toy else (*_round_trip(neutral, covered), *_digits(rng), *_speed(rng))
-    return StageBenchmark(
-        "facial-color",
-        "rms error, % of that of the neutral map kept, median of states",
-        "states of a simulated face whose vessels dilated by compartments, unmoved and noise-free",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("misaligned_px",),
-        interval_of="states",
-        no_bands="maps of blood alone: melanin does not enter",
-    )
+    limits = {} if toy else _round_trip(neutral, covered) | _digits(rng) | _speed(rng)
+    return described("facial-color", points, limits)
 
 
-def _round_trip(neutral: Float32Array, covered: BoolArray) -> tuple[Limit, ...]:
+def _round_trip(neutral: Float32Array, covered: BoolArray) -> Findings:
     """Fit maps that eq. (6) made and make them again."""
     exact = neutral.astype(np.float64)
     states = {"first": 1.3 * exact + 0.004, "second": 0.7 * exact - 0.001}
@@ -138,12 +127,10 @@ def _round_trip(neutral: Float32Array, covered: BoolArray) -> tuple[Limit, ...]:
     expected = 0.8 * states["first"] + 0.5 * states["second"] - 0.3 * exact
     found = made.evaluate(weights, limits=(-1.0, 1.0))
     error = np.abs(found.hemoglobin - expected)[found.valid]
-    return (
-        Limit("error of states that eq. (6) made, stored at 256", float(error.max()), 1e-12, "<="),
-    )
+    return {"round_trip": float(error.max())}
 
 
-def _digits(rng: np.random.Generator) -> tuple[Limit, ...]:
+def _digits(rng: np.random.Generator) -> Findings:
     """Compare deviations of a nearly constant map with two passes in extended precision."""
     side, radius = 256, 32
     exact = 0.3 + 1e-5 * rng.standard_normal((side, side))
@@ -154,16 +141,15 @@ def _digits(rng: np.random.Generator) -> tuple[Limit, ...]:
         inside = (y - row) ** 2 + (x - column) ** 2 <= radius**2
         values = exact[inside].astype(np.longdouble)
         truth.append(float(np.sqrt(np.mean((values - values.mean()) ** 2))))
-    limits = []
+    limits: Findings = {}
     for kind, bound in (("float64", 1e-5), ("float32", 1e-3)):
         found = disc_statistics.measure(exact.astype(kind), radius).deviation[tuple(places.T)]
         worst = float(np.abs(found / truth - 1.0).max())
-        name = f"relative error of sigma, mean 0.3, deviation 1e-5, {kind}"
-        limits.append(Limit(name, worst, bound, "<="))
-    return tuple(limits)
+        limits["digits", kind] = worst, bound
+    return limits
 
 
-def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
+def _speed(rng: np.random.Generator) -> Findings:
     """Time mean and deviation of 2048 x 2048 in discs beside three libraries.
 
     The libraries are spared the border: dividing by the part of a disc within the map would be a
@@ -172,7 +158,7 @@ def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
     """
     white = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
     h = np.asarray(0.03 + 0.02 * ndimage.gaussian_filter(white, 2.0), np.float32)
-    limits = []
+    limits: Findings = {}
     for radius in DISC_RADII_PX:
         kernel = disc(radius)
         crop = np.ascontiguousarray(h[: CROP_SIDES_PX[radius], : CROP_SIDES_PX[radius]])
@@ -190,28 +176,12 @@ def _speed(rng: np.random.Generator) -> tuple[Limit, ...]:
         convolve_s = processor_seconds(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
-        limits += [
-            Limit(
-                f"times faster ({ours_s:.3f} s) than scipy.ndimage.convolve, r = {radius}, a "
-                f"crop of {CROP_SIDES_PX[radius]} x {CROP_SIDES_PX[radius]} scaled by pixels",
-                convolve_s / ours_s,
-                100.0,
-                ">=",
-            ),
-            Limit(
-                f"times faster than cv2.filter2D ({opencv_s:.3f} s), r = {radius}",
-                opencv_s / ours_s,
-                1.0,
-                ">=",
-            ),
-            Limit(
-                f"times faster than scipy.fft ({fft_s:.3f} s), r = {radius}",
-                fft_s / ours_s,
-                1.0,
-                ">=",
-            ),
-        ]
-    return tuple(limits)
+        limits |= {
+            ("convolve", radius, ours_s, CROP_SIDES_PX[radius]): convolve_s / ours_s,
+            ("opencv", radius, opencv_s): opencv_s / ours_s,
+            ("fft", radius, fft_s): fft_s / ours_s,
+        }
+    return limits
 
 
 def disc(radius_px: int) -> Float32Array:

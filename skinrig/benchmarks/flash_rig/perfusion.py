@@ -18,7 +18,8 @@ from reconstruction.facial_color.perfusion_curves import TRANSITION_FALSE_ALARM_
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing, measure
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0
@@ -141,17 +142,8 @@ def curves(*, toy: bool) -> StageBenchmark:
                 )
             )
     bands = {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
-    limits = () if toy else _limits(runs, errors, trains)
-    return StageBenchmark(
-        "perfusion-curves",
-        "root mean square error of a time constant of 2 s, s",
-        "the simulated course of five places in noise",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="runs",
-        by_band=bands,
-    )
+    limits = {} if toy else _limits(runs, errors, trains)
+    return described("perfusion-curves", points, limits, by_band=bands)
 
 
 def noise_by_band() -> dict[str, float]:
@@ -198,9 +190,7 @@ def _on_skin(noisier: float, runs: int) -> BandError:
     return BandError(error, (error - spread, error + spread), noisier * train.bound_s())
 
 
-def _limits(
-    runs: int, errors: dict[tuple[str, int], float], trains: list[Train]
-) -> tuple[Limit, ...]:
+def _limits(runs: int, errors: dict[tuple[str, int], float], trains: list[Train]) -> Findings:
     rig = load_rig("flash")
     half, quarter = (phases(multiplexed_plan(rig, shot_period_s=s)) for s in ("5.5", "10.25"))
     rng = np.random.default_rng(1)
@@ -222,38 +212,13 @@ def _limits(
     beyond = 3 * float(
         np.sqrt(TRANSITION_FALSE_ALARM_RATE * (1 - TRANSITION_FALSE_ALARM_RATE) / runs)
     )
-    return (
-        Limit("phases met by 22 captures every 5.5 s", half.distinct, 20, ">="),
-        Limit("phases met by 44 captures every 10.25 s", quarter.distinct, 40, ">="),
-        Limit(
-            "largest bound of a course of 0.01 s, sampled every 0.5 s",
-            max(fit.interval_s[1] for fit in quick),
-            0.5,
-            "<=",
-            "s",
-        ),
-        Limit(
-            "rate of transitions seen where there is none",
-            alarms / runs,
-            TRANSITION_FALSE_ALARM_RATE + beyond,
-            "<=",
-        ),
-        Limit(
-            "part of 95 % intervals that hold the time constant", held / runs, 0.95 - beyond, ">="
-        ),
-        Limit(
-            "error over the Cramér-Rao bound, 44 captures",
-            errors["five places", 44] / bound_s,
-            1.0 + 3 / float(np.sqrt(2 * runs)),
-            "<=",
-        ),
-        Limit(
-            "error over that of scipy's fit of the best place, 44 captures",
-            errors["five places", 44] / errors["best place, scipy", 44],
-            1.0,
-            "<=",
-        ),
-        Limit(
-            "processor seconds of a fit of five places, 44 captures", spent_s, MAX_FIT_S, "<=", "s"
-        ),
-    )
+    return {
+        "phases_22": half.distinct,
+        "phases_44": quarter.distinct,
+        "quick": max(fit.interval_s[1] for fit in quick),
+        "alarms": (alarms / runs, TRANSITION_FALSE_ALARM_RATE + beyond),
+        "held": (held / runs, 0.95 - beyond),
+        "over_bound": (errors["five places", 44] / bound_s, 1.0 + 3 / float(np.sqrt(2 * runs))),
+        "over_scipy": errors["five places", 44] / errors["best place, scipy", 44],
+        "seconds": spent_s,
+    }

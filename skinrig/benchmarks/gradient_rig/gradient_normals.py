@@ -21,10 +21,11 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
     BandError,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
     measure,
@@ -42,12 +43,6 @@ PATTERN_NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
 ANALYZER_DEG = {"parallel": 0.0, "crossed": 90.0}
 RELIEF_BLUR_PX = 8.0
 """Of the relief's texels, by which skin is smoothed that stands for a smooth relief."""
-MAX_CLEAN_ERROR_DEG, MAX_NOISY_ERROR_DEG, MAX_PATTERNS_S, MAX_SLOWDOWN_TO_FORMULA = (
-    0.3,
-    1.5,
-    3.0,
-    8.0,
-)
 IGNORED_BORDER_PX = 6
 """Border that is not judged: the lens brings in what is beyond it."""
 
@@ -168,7 +163,7 @@ def normals(*, toy: bool) -> StageBenchmark:
     points: list[Point] = []
     told = {"lights": patch.lights, **patch.geometry}
 
-    def add(knobs: dict[str, str | int | float], images: Images, **options: Any) -> float:
+    def add(knobs: Knobs, images: Images, **options: Any) -> float:
         def run() -> NormalMaps:
             return from_patterns(images, **options)
 
@@ -211,18 +206,8 @@ def normals(*, toy: bool) -> StageBenchmark:
     add({"patterns": "16", "noise": "none"}, patch.images, **told)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
     bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
-    limits = () if toy else _limits(worst, rng)
-    return StageBenchmark(
-        "gradient-normals",
-        "mean error of specular normals, degrees",
-        "the relief's slopes as lens and pixels average them; noise of the rig's sensor, 30 ms",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("noise",),
-        interval_of="blocks of pixels",
-        by_band=bands,
-    )
+    limits = {} if toy else _limits(worst, rng)
+    return described("gradient-normals", points, limits, by_band=bands)
 
 
 def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
@@ -248,7 +233,7 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
     return BandError(*_judged(found.normals, found.valid, patch.seen))
 
 
-def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
+def _limits(worst: float, rng: np.random.Generator) -> Findings:
     smooth = skin_patch(128, smooth=True)
     found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
     against = {
@@ -263,35 +248,9 @@ def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:
     ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
         peer_s = processor_seconds(lambda: vectors_alone(big))
-    return (
-        *(
-            Limit(
-                f"mean error without noise on smooth relief, {name}",
-                error,
-                MAX_CLEAN_ERROR_DEG,
-                "<=",
-                "degrees",
-            )
-            for name, error in against.items()
-        ),
-        Limit(
-            "mean error at the demo's noise, lens' resolution",
-            worst,
-            MAX_NOISY_ERROR_DEG,
-            "<=",
-            "degrees",
-        ),
-        Limit(
-            "processor seconds on each of 2 cores for 2048 x 2048 x 16",
-            ours_s,
-            MAX_PATTERNS_S,
-            "<=",
-            "s",
-        ),
-        Limit(
-            "times the processor time of the formula alone in NumPy",
-            LIMIT_CORES * ours_s / peer_s,
-            MAX_SLOWDOWN_TO_FORMULA,
-            "<=",
-        ),
-    )
+    return {
+        **{("clean", name): error for name, error in against.items()},
+        "noisy": worst,
+        "seconds": ours_s,
+        "slowdown": LIMIT_CORES * ours_s / peer_s,
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -16,26 +16,23 @@ from reconstruction.normal_integration.discontinuities import integrate_broken
 from reconstruction.normal_integration.height_errors import expected_rms
 from reconstruction.normal_integration.height_filters import high_pass
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
     BandError,
-    Case,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
-    compare,
+    measured,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import drawn_again, squares
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
 NORMAL_NOISE_RAD = np.radians(1.5)
 """Root mean square angle of the normals' noise."""
 RELIEF_RMS_UM = 12.0
-MAX_INTEGRATION_S = 1.5
-MAX_BILATERAL_S = 1.0
-MAX_RELATIVE_RESIDUAL = 1e-5
-MAX_RELATIVE_RMS = 0.05
 
 
 def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
@@ -121,13 +118,13 @@ def integration(*, toy: bool) -> StageBenchmark:
     whole = np.ones((side, side), bool)
     disc = _disc(side)
 
-    def case(
+    def point(
         method: str,
         call: Callable[[Float64Array], FloatArray],
         normals: Float64Array,
         valid: BoolArray,
         **effort: float,
-    ) -> Case[FloatArray]:
+    ) -> Point:
         bound = None
         if normals is noisy:
             slope = NORMAL_NOISE_RAD / np.sqrt(2.0)
@@ -135,63 +132,48 @@ def integration(*, toy: bool) -> StageBenchmark:
 
         def error(height: FloatArray) -> BandError:
             off = _high_passed(height - truth, valid)
-            tiles = [float(np.mean(t[m] ** 2)) for t, m in _tiles(off, valid) if m.any()]
-            means = np.mean(rng.choice(tiles, (200, len(tiles))), axis=1)
-            low, high = np.sqrt(np.quantile(means, [0.16, 0.84]))
+            places = [at for at in squares(len(off)) if valid[at].any()]
+            tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in places]
+            low, high = np.sqrt(drawn_again(tiles, np.mean, rng=rng))
             rms = float(np.sqrt(np.mean(off[valid] ** 2)))
             return BandError(rms, (min(float(low), rms), max(float(high), rms)), bound)
 
-        noise, mask = (
-            "1.5 deg" if normals is noisy else "none",
-            "none" if valid is whole else "disc",
-        )
-        knobs: dict[str, str | float] = {"noise": noise, "method": method, "mask": mask, **effort}
-        return Case(knobs, lambda: call(normals), error)
+        about: Knobs = {
+            "noise": "1.5 deg" if normals is noisy else "none",
+            "method": method,
+            "mask": "none" if valid is whole else "disc",
+        }
+        repeats = 1 if toy else 3
+        return measured(about | effort, lambda: call(normals), error, repeats=repeats)
 
     def ours(valid: BoolArray, **options: object) -> Callable[[Float64Array], NDArray]:
         return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
 
-    def cases() -> Iterator[Case[FloatArray]]:
-        for normals in (clean, noisy):
-            for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
-                solve = ours(disc, settings=Settings(tolerance=tolerance))
-                yield case("multigrid", solve, normals, disc, tolerance=tolerance)
-            yield case("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2)
-            yield case("cosines", ours(whole), normals, whole)
-            by_fourier = partial(frankot_chellappa, pixel=PIXEL_UM)
-            yield case("Frankot-Chellappa", by_fourier, normals, whole)
-        denoised = ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0)
-        yield case("multigrid", denoised, noisy, disc, denoise=1)
-        bilateral = partial(integrate_broken, pixel=PIXEL_UM, valid=disc)
-        yield case("bilateral", lambda n: bilateral(n).height, noisy, disc)
-
-    def limits(_: Sequence[Point]) -> tuple[Limit, ...]:
-        error = _high_passed(integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, disc)
-        return (
-            Limit(
-                "RMS error over RMS relief after high-pass, noise of 1.5 degrees",
-                float(np.std(error[disc]) / np.std(_high_passed(truth, disc)[disc])),
-                MAX_RELATIVE_RMS,
-                "<=",
-            ),
-            *_full_size(rng),
-        )
-
+    points = []
+    for normals in (clean, noisy):
+        for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
+            solve = ours(disc, settings=Settings(tolerance=tolerance))
+            points.append(point("multigrid", solve, normals, disc, tolerance=tolerance))
+        by_fourier = partial(frankot_chellappa, pixel=PIXEL_UM)
+        points += [
+            point("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2),
+            point("cosines", ours(whole), normals, whole),
+            point("Frankot-Chellappa", by_fourier, normals, whole),
+        ]
+    denoised = ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0)
+    bilateral = partial(integrate_broken, pixel=PIXEL_UM, valid=disc)
     direct = partial(sparse_direct, valid=disc, pixel=PIXEL_UM)
-    return compare(
-        StageBenchmark(
-            "normal-integration",
-            "RMS error of height after a high-pass of 1 mm, um",
-            f"the relief itself ({RELIEF_RMS_UM:g} um RMS), whose normals are exact",
-            condition=("noise", "mask"),
-            interval_of="tiles of the relief",
-            no_bands="shape alone: no color of skin enters",
-        ),
-        cases(),
-        [case("sparse direct", direct, clean, disc)],
-        repeats=1 if toy else 3,
-        limits=None if toy else limits,
-    )
+    points += [
+        point("multigrid", denoised, noisy, disc, denoise=1),
+        point("bilateral", lambda n: bilateral(n).height, noisy, disc),
+        point("sparse direct", direct, clean, disc),
+    ]
+    if toy:
+        return described("normal-integration", points)
+    error = _high_passed(integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, disc)
+    size = np.std(_high_passed(truth, disc)[disc])
+    limits: Findings = {"relative_rms": float(np.std(error[disc]) / size)}
+    return described("normal-integration", points, limits | _full_size(rng))
 
 
 def _high_passed(height: FloatArray, valid: BoolArray) -> FloatArray:
@@ -204,17 +186,7 @@ def _disc(side: int) -> BoolArray:
     return np.asarray((x * x + y * y < (0.47 * side) ** 2) & ~holes)
 
 
-def _tiles(error: FloatArray, valid: BoolArray) -> list[tuple[FloatArray, BoolArray]]:
-    step = max(1, len(error) // 8)
-    places = range(0, len(error), step)
-    return [
-        (error[i : i + step, j : j + step], valid[i : i + step, j : j + step])
-        for i in places
-        for j in places
-    ]
-
-
-def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+def _full_size(rng: np.random.Generator) -> Findings:
     """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
     _, normals = relief(2048, rng=rng)
     noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
@@ -234,37 +206,10 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     begin = time.process_time()
     theirs = sparse_direct(flat, part, pixel=PIXEL_UM)
     peer_s = time.process_time() - begin
-    return (
-        Limit(
-            "processor seconds on each of 2 cores, 2048 x 2048 with a mask",
-            spent_s / LIMIT_CORES,
-            MAX_INTEGRATION_S,
-            "<=",
-            "s",
-        ),
-        Limit(
-            "relative residual of the same, in float64",
-            found.convergence.residual,
-            MAX_RELATIVE_RESIDUAL,
-            "<=",
-        ),
-        Limit(
-            "processor seconds on each of 2 cores, bilateral, 1024 x 1024",
-            broken_s / LIMIT_CORES,
-            MAX_BILATERAL_S,
-            "<=",
-            "s",
-        ),
-        Limit(
-            "times less processor time than SuperLU, 512 x 512 with a mask",
-            peer_s / ours_s,
-            1.0,
-            ">=",
-        ),
-        Limit(
-            "largest difference to SuperLU over the RMS height",
-            float(np.abs(mine - theirs)[part].max() / np.std(theirs[part])),
-            1e-3,
-            "<=",
-        ),
-    )
+    return {
+        "seconds": spent_s / LIMIT_CORES,
+        "residual": found.convergence.residual,
+        "bilateral_s": broken_s / LIMIT_CORES,
+        "speed_up": peer_s / ours_s,
+        "difference": float(np.abs(mine - theirs)[part].max() / np.std(theirs[part])),
+    }

@@ -18,22 +18,21 @@ from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
     BandError,
-    Case,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
-    compare,
     measure,
+    measured,
     processor_seconds,
 )
 from skinrig.benchmarks.resampling import mean_error
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
-MAX_SEARCH_S = 15.0
 MIN_SPEEDUP_OVER_NUMPY = 100.0
 FULL_SIDE_PX = 2000
 N_PEER_CANDIDATES = 3
@@ -137,26 +136,22 @@ def search(*, toy: bool) -> StageBenchmark:
         there = buckets.distances((whole.along, whole.across), change, np.array([found.alpha]))
         return BandError.around(float(there[0]) - best.distance, 0.0)
 
-    def knobs(way: str, part: int, first: int, thin: int) -> dict[str, str | int | float]:
-        only = {"first sample": first} if way == "hierarchical" else {}
-        return {"search": way, "side": part, "every": thin, **only}
-
-    return compare(
-        StageBenchmark(
-            "kernel-fit",
-            "distance above that of the exhaustive search on all pixels",
-            "the exhaustive search of 59,899 kernels on all pixels; strained relief of no kernel",
-            interval_of="nothing: one search on one relief, distances computed exactly",
-            no_bands="shape alone: no color of skin enters",
-        ),
-        [Case(knobs(*way), partial(fit, *way), error) for way in ways],
-        repeats=1,
-        memory=False,
-        limits=None if toy else lambda _: _full_size(rng),
-    )
+    points = []
+    for way, part, first, thin in ways:
+        only: Knobs = {"first sample": first} if way == "hierarchical" else {}
+        points.append(
+            measured(
+                {"search": way, "side": part, "every": thin, **only},
+                lambda: fit(way, part, first, thin),
+                error,
+                repeats=1,
+                memory=False,
+            )
+        )
+    return described("kernel-fit", points, {} if toy else _full_size(rng))
 
 
-def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
+def _full_size(rng: np.random.Generator) -> Findings:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
     height = relief(FULL_SIDE_PX, rng=rng)
     target = normal_histogram.histogram(
@@ -196,36 +191,14 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
 
         default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES)
     found = run()
-    return (
-        Limit(
-            "processor seconds on each of 2 cores, default search, 2000 x 2000, no kernel",
-            default_s[0],
-            MAX_SEARCH_S,
-            "<=",
-            "s",
-        ),
-        Limit("the same, relief made by a kernel", default_s[1], MAX_SEARCH_S, "<=", "s"),
-        Limit(
-            "steps of alpha from the kernel that made the relief",
-            abs(found.alpha + 0.63) / 0.01,
-            1e-6,
-            "<=",
-        ),
-        Limit(
-            "um of sigma from the kernel that made the relief",
-            abs(found.sigma_um - 17.5),
-            1e-9,
-            "<=",
-            "um",
-        ),
-        Limit(
-            "times faster on 2 cores than NumPy on its one, exhaustive, 3 of 59,899 candidates",
-            peer_s / (ours_s / LIMIT_CORES),
-            MIN_SPEEDUP_OVER_NUMPY,
-            ">=",
-        ),
-        Limit("difference of distances from NumPy's", mismatch, 1e-3, "<="),
-    )
+    return {
+        "seconds": default_s[0],
+        "seconds_kernel": default_s[1],
+        "alpha": abs(found.alpha + 0.63) / 0.01,
+        "sigma": abs(found.sigma_um - 17.5),
+        "speed_up": peer_s / (ours_s / LIMIT_CORES),
+        "difference": mismatch,
+    }
 
 
 def histograms(*, toy: bool) -> StageBenchmark:
@@ -244,20 +217,17 @@ def histograms(*, toy: bool) -> StageBenchmark:
                 for columns in (slice(part), slice(-part, None))
             ]
 
-            def run(
-                height: Float64Array = patches[0], bins: int = bins
-            ) -> normal_statistics.NormalStatistics:
-                return normal_statistics.measure(height, pixel=PIXEL_UM, bins=bins)
-
-            timing = measure(run, repeats=1 if toy else 3, memory=part == side)
+            measure_patch = partial(normal_statistics.measure, pixel=PIXEL_UM, bins=bins)
+            timing = measure(
+                lambda: measure_patch(patches[0]), repeats=1 if toy else 3, memory=part == side
+            )
             off = mean_error(
                 [
-                    normal_histogram.distance(run(patch).histogram, truth.histogram)
+                    normal_histogram.distance(measure_patch(patch).histogram, truth.histogram)
                     for patch in patches
                 ]
             )
-            knobs: dict[str, str | int | float] = {"side": part, "bins": bins}
-            points.append(Point(knobs, timing, off.error, off.error_interval))
+            points.append(Point.of({"side": part, "bins": bins}, timing, off))
     height = truth_map[:side, :side]
     dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
     edges = np.linspace(-1.0, 1.0, 65)
@@ -272,23 +242,13 @@ def histograms(*, toy: bool) -> StageBenchmark:
 
     repeats = 1 if toy else 3
     times = _spent(theirs, repeats) / max(_spent(ours, repeats), 1e-9)
-    limits = (
-        Limit("times less processor time than numpy.histogram2d, same slopes", times, 3.0, ">="),
-        Limit(
-            "distance from numpy.histogram2d's histogram",
-            normal_histogram.distance(ours(), theirs()),
-            1e-5,
-            "<=",
-        ),
-    )
-    return StageBenchmark(
+    limits = {"speed_up": times, "distance": normal_histogram.distance(ours(), theirs())}
+    return described(
         "normal-histogram",
-        "distance to the histogram of a larger patch, 0...2",
-        f"the histogram of {truth_side} x {truth_side} pixels that hold the patch",
-        float(normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)),
-        tuple(points),
-        () if toy else limits,
-        condition=("bins",),
-        interval_of="patches of that size",
-        no_bands="shape alone: no color of skin enters",
+        points,
+        {} if toy else limits,
+        reference_error=float(
+            normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)
+        ),
+        truth_side=truth_side,
     )

@@ -31,9 +31,10 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     LIMIT_CORES,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
     measure,
@@ -54,17 +55,12 @@ JAW_CONDITIONS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
 """Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
 width, and where it does not, both passes act."""
 MIN_SPEEDUP_OVER_NUMPY = 5.0
-MAX_RATIO_TO_STATIC = 0.6
-"""The fitted kernels' error is at most so much of the error of a relief that does not change."""
 FULL_SIDE_PX = 4096
 PEER_ROWS = 256
 """Rows of the full map that the straightforward convolution is timed on."""
 TILED_SIDE_PX = 16_384
-MAX_TILED_MB = 6000.0
 GRADUAL_CHANGE_PER_SIGMA = 0.02
 """Turn of axes, rad, and relative change of sigma, within one sigma, that are called gradual."""
-MAX_GRADUAL_ERROR_PERCENT = 2.0
-"""Percent of the change that two passes may be off there."""
 N_WAVES = 60
 
 
@@ -207,7 +203,7 @@ def truth(*, toy: bool) -> StageBenchmark:
             timing = measure(run, repeats=1, memory=False)
             error, spread, wrong = _judged(made, skins, settled)
             errors[name, across, sampling], variances[name, across, sampling] = error, wrong
-            knobs: dict[str, str | int | float] = {
+            knobs: Knobs = {
                 "kernels": name,
                 "jaws_deg": angle,
                 "across": across,
@@ -220,46 +216,16 @@ def truth(*, toy: bool) -> StageBenchmark:
     def left(of: dict[tuple[str, str, str], float], across: str) -> float:
         return of["fitted", across, "cubic"] / of["none", across, "cubic"]
 
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
-        limits = (
-            Limit(
-                "fitted kernels' distance of normals over the static relief's, width kept",
-                left(errors, "none"),
-                MAX_RATIO_TO_STATIC,
-                "<=",
-            ),
-            Limit(
-                "their error of slopes' variance along the jaws over the static relief's",
-                left(variances, "none"),
-                MAX_RATIO_TO_STATIC,
-                "<=",
-            ),
-            Limit(
-                "the same distance where the width changes by volume",
-                left(errors, "volume"),
-                1.0,
-                "<=",
-            ),
-            Limit(
-                "the same error where the width changes by volume",
-                left(variances, "volume"),
-                1.0,
-                "<=",
-            ),
-            *_full_size(),
-        )
-    return StageBenchmark(
-        "microstructure",
-        "distance of normals from those of settled skin, 0...2 (eq. 7)",
-        "a stiff layer on soft tissue at rest; jaws between 0.8 and 1.2",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("jaws_deg", "across"),
-        interval_of="patches of skin",
-        no_bands="shape alone: no color of skin enters",
-    )
+        limits = {
+            "normals": left(errors, "none"),
+            "variance": left(variances, "none"),
+            "normals_volume": left(errors, "volume"),
+            "variance_volume": left(variances, "volume"),
+            **_full_size(),
+        }
+    return described("microstructure", points, limits)
 
 
 def varying_fields(
@@ -315,7 +281,7 @@ def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Fl
     return height
 
 
-def _full_size() -> tuple[Limit, ...]:
+def _full_size() -> Findings:
     """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
     rng = np.random.default_rng(0)
     height = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
@@ -335,38 +301,15 @@ def _full_size() -> tuple[Limit, ...]:
     del fields, height
     raster_s = processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
     tile_s, peak_mb = _tiles_of_16k()
-    return (
-        Limit(
-            "times faster on 2 cores than NumPy on its one, 4096 x 4096, cubic samples",
-            peer_s / own["cubic"],
-            MIN_SPEEDUP_OVER_NUMPY,
-            ">=",
-        ),
-        Limit(
-            "the same, bilinear samples as NumPy's",
-            peer_s / own["linear"],
-            MIN_SPEEDUP_OVER_NUMPY,
-            ">=",
-        ),
-        Limit(
-            "largest difference from NumPy's, bilinear, of heights about 1",
-            float(mismatch),
-            1e-3,
-            "<=",
-        ),
-        Limit(
-            "processor seconds on each of 2 cores, 4096 x 4096, cubic",
-            own["cubic"],
-            10.0,
-            "<=",
-            "s",
-        ),
-        Limit("the same, strain of 18,432 triangles filled into it", raster_s, 3.0, "<=", "s"),
-        Limit(
-            "the same for 16,384 x 16,384 in tiles of 2048, by two of 64", tile_s, 200.0, "<=", "s"
-        ),
-        Limit("arrays held for that", peak_mb, MAX_TILED_MB, "<=", "MB"),
-    )
+    return {
+        "speed_up": peer_s / own["cubic"],
+        "speed_up_linear": peer_s / own["linear"],
+        "difference": float(mismatch),
+        "seconds": own["cubic"],
+        "strain_s": raster_s,
+        "tiles_s": tile_s,
+        "tiles_mb": peak_mb,
+    }
 
 
 def _rasterized(side: int) -> Callable[[], object]:
@@ -536,39 +479,11 @@ def passes(*, toy: bool) -> StageBenchmark:
                         (mean - spread, mean + spread),
                     )
                 )
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
-        limits = (
-            Limit(
-                "error where nothing varies, sigma 3 px",
-                errors[3.0, "cubic", 0.0, 0.0],
-                1.0,
-                "<=",
-                "%",
-            ),
-            Limit(
-                "error where axes turn gradually, sigma 3 px",
-                errors[3.0, "cubic", GRADUAL_CHANGE_PER_SIGMA, 0.0],
-                MAX_GRADUAL_ERROR_PERCENT,
-                "<=",
-                "%",
-            ),
-            Limit(
-                "error where sigma grows gradually, sigma 3 px",
-                errors[3.0, "cubic", 0.0, GRADUAL_CHANGE_PER_SIGMA],
-                MAX_GRADUAL_ERROR_PERCENT,
-                "<=",
-                "%",
-            ),
-        )
-    return StageBenchmark(
-        "microstructure-passes",
-        "error of two passes, % of the change",
-        "the response of each pixel's own kernel to 60 waves, exact",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("turn_rad_per_sigma", "growth_per_sigma", "sigma_px"),
-        interval_of="reliefs of waves",
-        no_bands="shape alone: no color of skin enters",
-    )
+        limits = {
+            "constant": errors[3.0, "cubic", 0.0, 0.0],
+            "turn": errors[3.0, "cubic", GRADUAL_CHANGE_PER_SIGMA, 0.0],
+            "growth": errors[3.0, "cubic", 0.0, GRADUAL_CHANGE_PER_SIGMA],
+        }
+    return described("microstructure-passes", points, limits)

@@ -14,14 +14,12 @@ from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing, measure
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384
 N_THREADS = 2
-MAX_HISTOGRAM_DISTANCE = 0.03
-"""Half the sum of differences of 64 x 64 buckets that a map may be off its patches."""
-MAX_MEMORY_GB = 6.0
 
 
 def blended(
@@ -153,12 +151,7 @@ def growth(*, toy: bool) -> StageBenchmark:
             ]
 
         timing = measure(run, repeats=1, memory=(cell, tried) == (knobs[-1][0], knobs[-1][2]))
-        about: dict[str, str | int | float | bool] = {
-            "method": "cut",
-            "cell": cell,
-            "overlap": overlap,
-            "candidates": tried,
-        }
+        about: Knobs = {"method": "cut", "cell": cell, "overlap": overlap, "candidates": tried}
         points.append(_point(about, timing, made[0], truth))
     edge = 40 if toy else 128
 
@@ -169,16 +162,14 @@ def growth(*, toy: bool) -> StageBenchmark:
 
     timing = measure(peer, repeats=1, memory=False)
     points.append(_point({"method": "blend", "cell": edge}, timing, theirs[0], truth))
-    return StageBenchmark(
+    return described(
         "displacement-synthesis",
-        "half the sum of differences of 64 x 64 buckets of slopes, 0...1",
-        f"the histogram of {count} patches of {size_mm:g} mm; maps of {side} x {side} px",
-        normal_histogram.halved_distance(*halves),
-        tuple(points),
-        () if toy else _judged(patches, truth, theirs[0]),
-        left_out=(("the whole map of 16,384 x 16,384", "judged by its tiles: all are made alike"),),
-        interval_of="quarters of the map",
-        no_bands="shape alone: no color of skin enters",
+        points,
+        {} if toy else _judged(patches, truth, theirs[0]),
+        reference_error=normal_histogram.halved_distance(*halves),
+        count=count,
+        size_mm=size_mm,
+        side=side,
     )
 
 
@@ -207,9 +198,7 @@ def _point(
     return Point(knobs, timing, error, (max(error - spread, 0.0), error + spread))
 
 
-def _judged(
-    patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array
-) -> tuple[Limit, ...]:
+def _judged(patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array) -> Findings:
     """Lay out the largest map, draw a band of its tiles, and judge them."""
     begin = time.process_time()
     layout = displacement_synthesis.lay_out(
@@ -239,44 +228,12 @@ def _judged(
     alike = np.mean([autocorrelation(patch) for patch in patches], axis=0)
     apart = [float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, theirs)]
     blend = normal_histogram.halved_distance(slope_histogram([theirs]), truth)
-    return (
-        Limit(
-            "half the sum of differences of 64 x 64 buckets from the patches'",
-            ours,
-            MAX_HISTOGRAM_DISTANCE,
-            "<=",
-        ),
-        Limit(
-            "rms slope at cuts over that elsewhere",
-            float(np.sqrt(square[cuts].mean() / square[~cuts].mean())),
-            1.1,
-            "<=",
-        ),
-        Limit(
-            "memory of 16,384 x 16,384 on 2 threads with the map held in memory",
-            memory_gb,
-            MAX_MEMORY_GB,
-            "<=",
-            "GB",
-        ),
-        Limit(
-            "processor minutes of 16,384 x 16,384, by one tile",
-            (laid_s + tiles * tile_s) / 60.0,
-            10.0,
-            "<=",
-            "min",
-        ),
-        Limit("times nearer to the patches' slopes than blended tiles", blend / ours, 1.0, ">="),
-        Limit(
-            "times nearer in the skewness of curvature (furrows) than blended tiles",
-            abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9),
-            2.0,
-            ">=",
-        ),
-        Limit(
-            "rms error of the autocorrelation of slopes within 64 px, over the blended tiles'",
-            apart[0] / apart[1],
-            1.0,
-            "<=",
-        ),
-    )
+    return {
+        "histogram": ours,
+        "cuts": float(np.sqrt(square[cuts].mean() / square[~cuts].mean())),
+        "memory": memory_gb,
+        "minutes": (laid_s + tiles * tile_s) / 60.0,
+        "slopes": blend / ours,
+        "furrows": abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9),
+        "autocorrelation": apart[0] / apart[1],
+    }

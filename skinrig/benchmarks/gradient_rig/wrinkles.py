@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,27 +19,22 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.description import described
 from skinrig.benchmarks.measurement import (
     BandError,
-    Case,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
-    compare,
     measure,
+    measured,
     once,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import rms_of_draws, squares
 
 ZONE_CENTERS_UV = (
-    (0.3, 0.12),
-    (0.7, 0.12),
-    (0.3, 0.3),
-    (0.7, 0.3),
-    (0.25, 0.5),
-    (0.75, 0.5),
-    (0.5, 0.65),
-    (0.5, 0.88),
+    *((x, y) for y in (0.12, 0.3) for x in (0.3, 0.7)),
+    *((0.25, 0.5), (0.75, 0.5), (0.5, 0.65), (0.5, 0.88)),
 )
 ZONE_RADIUS_UV = 0.12
 FURROWS_PER_FACE = 16
@@ -48,6 +43,14 @@ MAX_SLOPE = 0.6
 FULL_SIDE_PX = 2048
 MIN_SPEEDUP_OVER_NUMPY = 5.0
 NORMAL_NOISE_RAD = 0.02
+ENCODINGS: tuple[tuple[Any, Any], ...] = (
+    ("float32", "float32"),
+    ("float16", "float16"),
+    ("unit8", "unit8"),
+    ("bc5", "bc3"),
+    ("bc5", "unit8"),
+)
+"""Of maps and of masks."""
 
 
 def zone_masks(side: int) -> Float64Array:
@@ -155,20 +158,14 @@ def opencv_combine(
 def _error(normals: FloatArray, truth: FloatArray) -> BandError:
     """Return the mean angle, degrees, and its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
-    cut = max(angle.shape[0] // 8, 1)
-    squares = [
-        float(angle[i : i + cut, j : j + cut].mean())
-        for i in range(0, angle.shape[0], cut)
-        for j in range(0, angle.shape[1], cut)
-    ]
-    return BandError.around(float(angle.mean()), float(np.std(squares) / np.sqrt(len(squares))))
+    parts = [float(angle[at].mean()) for at in squares(len(angle))]
+    return BandError.around(float(angle.mean()), float(np.std(parts) / np.sqrt(len(parts))))
 
 
-def _mean_error(model: Any, states: dict[str, Float64Array]) -> tuple[float, tuple[float, float]]:
+def _mean_error(model: Any, states: dict[str, Float64Array]) -> BandError:
     errors = [_error(model.evaluate({name: 1.0}).normals, n) for name, n in states.items()]
-    mean = float(np.mean([one.error for one in errors]))
-    low, high = (float(np.mean([one.error_interval[i] for one in errors])) for i in (0, 1))
-    return mean, (low, high)
+    low, high = np.mean([one.error_interval for one in errors], axis=0).tolist()
+    return BandError(float(np.mean([one.error for one in errors])), (low, high))
 
 
 def fitting(*, toy: bool) -> StageBenchmark:
@@ -184,37 +181,20 @@ def fitting(*, toy: bool) -> StageBenchmark:
     for map_side, mask_side in sizes:
         masks = zone_masks(mask_side)
 
-        def run(map_side: int = map_side, masks: Float64Array = masks) -> wrinkle_fit.WrinkleFit:
+        def fit() -> wrinkle_fit.WrinkleFit:
             return wrinkle_fit.fit(
                 neutral, states, masks, size=(map_side, map_side), clamp="signed"
             )
 
-        cold, found = once(run)
-        timing = dataclasses.replace(once(run)[0], cold_s=cold.seconds)
-        model = found.model()
-        error, interval = _mean_error(model, states)
+        cold, found = once(fit)
+        timing = dataclasses.replace(once(fit)[0], cold_s=cold.seconds)
         size = wrinkle_storage.footprint((map_side, map_side), (mask_side, mask_side))
-        knobs: dict[str, str | int | float] = {
-            "map": map_side,
-            "masks": mask_side,
-            "KB as BC5 and BC3": size.total_bytes / 1024,
-        }
-        points.append(Point(knobs, timing, error, interval))
+        knobs: Knobs = {"map": map_side, "masks": mask_side}
+        knobs["KB as BC5 and BC3"] = size.total_bytes / 1024
+        points.append(Point.of(knobs, timing, _mean_error(found.model(), states)))
     rest = float(np.mean([_error(neutral, n).error for n in states.values()]))
     best = min(point.error for point in points)
-    return StageBenchmark(
-        "wrinkles",
-        "mean angle to the true normals of six expressions, deg",
-        "normals of heights whose furrows deepen and narrow by a law that is not the model's",
-        0.0,
-        tuple(points),
-        ()
-        if toy
-        else (Limit("of the neutral face's error, with the best map", best / rest, 0.6, "<="),),
-        left_out=(("masks from the data", "see tests of reconstruction.wrinkles.zones"),),
-        interval_of="squares of the face",
-        no_bands="shape alone: no color of skin enters",
-    )
+    return described("wrinkles", points, {} if toy else {"best": best / rest})
 
 
 def summing(*, toy: bool) -> StageBenchmark:
@@ -248,55 +228,27 @@ def summing(*, toy: bool) -> StageBenchmark:
         "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
     }
 
-    def limits(points: Sequence[Point]) -> tuple[Limit, ...]:
-        peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
-        library_s = processor_seconds(ways["OpenCV and NumPy"], 5)
-        apart = float(np.abs(by_derivatives() - truth).max())
-        return (
-            Limit(
-                "times less processor time than NumPy, 2048 x 2048, map 256, masks 64",
-                peer_s / own_s,
-                MIN_SPEEDUP_OVER_NUMPY,
-                ">=",
-            ),
-            Limit("the same, than OpenCV and NumPy", library_s / own_s, 2.0, ">="),
-            Limit("largest difference from NumPy's normals", apart, 1e-6, "<="),
-            Limit(
-                "of the error of differences of normals",
-                points[0].error / points[1].error,
-                0.1,
-                "<=",
-            ),
-            Limit(
-                "KB of the paper's textures",
-                wrinkle_storage.paper_footprint().total_bytes / 1024,
-                96.0,
-                "<=",
-            ),
-        )
-
-    cases = [
-        Case(
+    points = [
+        measured(
             {"way": way, "side": side},
             call,
             lambda normals: _error(normals, truth),
             repeats=1 if way == "NumPy" else 5,
+            memory=False,
         )
         for way, call in ways.items()
     ]
-    return compare(
-        StageBenchmark(
-            "wrinkle-sum",
-            "mean angle to the normals of the summed relief at half weight, deg",
-            "listing 1.1 in double precision",
-            interval_of="squares of the face",
-            no_bands="shape alone: no color of skin enters",
-        ),
-        cases[:3],
-        cases[3:],
-        memory=False,
-        limits=None if toy else limits,
-    )
+    if toy:
+        return described("wrinkle-sum", points)
+    peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
+    limits = {
+        "over_numpy": peer_s / own_s,
+        "over_opencv": processor_seconds(ways["OpenCV and NumPy"], 5) / own_s,
+        "difference": float(np.abs(by_derivatives() - truth).max()),
+        "differences": points[0].error / points[1].error,
+        "storage": wrinkle_storage.paper_footprint().total_bytes / 1024,
+    }
+    return described("wrinkle-sum", points, limits)
 
 
 def storing(*, toy: bool) -> StageBenchmark:
@@ -312,44 +264,28 @@ def storing(*, toy: bool) -> StageBenchmark:
     table = fitted.layer.table
     weights = {"surprise": 1.0, "disgust": 0.6}
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
-    encodings: tuple[tuple[Any, Any], ...] = (
-        ("float32", "float32"),
-        ("float16", "float16"),
-        ("unit8", "unit8"),
-        ("bc5", "bc3"),
-        ("bc5", "unit8"),
-    )
-
-    def cases() -> Iterator[Case[FloatArray]]:
-        for at in (64, 32) if toy else (512, 256, 128, 64):
-            small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
-            for maps_as, masks_as in encodings if at in (64, 256) else encodings[:1]:
-                layer = Layer(
-                    wrinkle_storage.stored_map(small, maps_as),
-                    wrinkle_storage.stored_masks(masks, masks_as),
-                    table,
-                )
-                size = wrinkle_storage.footprint(
-                    (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
-                )
-                kilobytes = round(size.total_bytes / 1024, 3)
-                yield Case(
-                    {"map": at, "as": maps_as, "masks as": masks_as, "KB": kilobytes},
+    points = []
+    for at in (64, 32) if toy else (512, 256, 128, 64):
+        small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
+        for maps_as, masks_as in ENCODINGS if at in (64, 256) else ENCODINGS[:1]:
+            layer = Layer(
+                wrinkle_storage.stored_map(small, maps_as),
+                wrinkle_storage.stored_masks(masks, masks_as),
+                table,
+            )
+            size = wrinkle_storage.footprint(
+                (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
+            )
+            knobs: Knobs = {"map": at, "as": maps_as, "masks as": masks_as}
+            points.append(
+                measured(
+                    knobs | {"KB": round(size.total_bytes / 1024, 3)},
                     partial(wrinkles.combine_layers, base, [layer], weights),
                     lambda normals: _error(normals, whole),
+                    memory=False,
                 )
-
-    return compare(
-        StageBenchmark(
-            "wrinkle-storage",
-            "mean angle to the normals with the map at full size in 32 bits, deg",
-            "the same wrinkles, stored without loss",
-            interval_of="squares of the face",
-            no_bands="shape alone: no color of skin enters",
-        ),
-        cases(),
-        memory=False,
-    )
+            )
+    return described("wrinkle-storage", points)
 
 
 def weighing(*, toy: bool) -> StageBenchmark:
@@ -367,48 +303,20 @@ def weighing(*, toy: bool) -> StageBenchmark:
         for noise in (0.005, NORMAL_NOISE_RAD) if toy else (0.005, NORMAL_NOISE_RAD, 0.08):
             stderr = np.full((side, side), noise)
             bound = _bound(layer, clean, stderr)
-            misses = []
 
-            def run(
-                seed: int = 0,
-                clean: FloatArray = clean,
-                stderr: Float64Array = stderr,
-                layer: Layer = layer,
-                neutral: Any = neutral,
-            ) -> wrinkle_weights.ZoneWeights:
+            def run(seed: int = 0) -> wrinkle_weights.ZoneWeights:
                 noisy = _disturbed(clean, stderr, np.random.default_rng(seed))
-                measured = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr)
-                return wrinkle_fit.fit_weights(layer, neutral, measured, clamp="signed")
+                seen = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr)
+                return wrinkle_fit.fit_weights(layer, neutral, seen, clamp="signed")
 
             timing = measure(run, repeats=1, memory=False)
-            for seed in range(draws):
-                misses.append(run(seed).weights - true)
-            miss = np.array(misses)
-            error = float(np.sqrt(np.mean(miss**2)))
-            scatter = error / np.sqrt(2 * miss.size)
+            miss = np.array([run(seed).weights - true for seed in range(draws)])
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
-            points.append(
-                Point(
-                    {"side": side, "noise, mrad": 1e3 * noise},
-                    timing,
-                    error,
-                    (error - scatter, error + scatter),
-                    float(np.sqrt(np.mean(bound**2))),
-                )
-            )
+            told = rms_of_draws(miss, bound=float(np.sqrt(np.mean(bound**2))))
+            points.append(Point.of({"side": side, "noise, mrad": 1e3 * noise}, timing, told))
     # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
-    limits = (Limit("times the Cramér-Rao bound, on average", float(np.mean(ratios)), 1.1, "<="),)
-    return StageBenchmark(
-        "wrinkle-weights",
-        "root mean square error of a zone's weight",
-        "the weights that made the normals; map and masks known, noise on the expression",
-        0.0,
-        tuple(points),
-        () if toy else limits,
-        condition=("noise, mrad",),
-        interval_of="draws of noise",
-        no_bands="shape alone: no color of skin enters",
-    )
+    limits = {"over_bound": float(np.mean(ratios))}
+    return described("wrinkle-weights", points, {} if toy else limits)
 
 
 def _disturbed(

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.intervals import dome as interval_trials_dome
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
 from skinrig.benchmarks.intervals import gradient as interval_trials_gradient
@@ -25,7 +26,7 @@ from skinrig.benchmarks.intervals import probe as interval_trials_probe
 from skinrig.benchmarks.intervals import sequence as interval_trials_sequence
 from skinrig.benchmarks.intervals import trials as interval_trials
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing, once
+from skinrig.benchmarks.measurement import Point, StageBenchmark, Timing, once
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05
@@ -83,21 +84,15 @@ def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) 
         for level in COVERAGE_RANGES
         for row in by_band(told, level=level, confidence=confidence)
     ]
-    return StageBenchmark(
+    return described(
         "intervals",
-        "distance of the coverage from the nominal one, percentage points",
-        f"truths of simulated subjects of seeds from {FIRST_SEED} on",
-        0.0,
         tuple(_point(row, spent[row.quantity]) for row in rows),
-        () if toy else tuple(limit for row in rows for limit in _limits(row)),
-        tuple(
+        {} if toy else {k: v for row in rows for k, v in _limits(row).items()},
+        left_out=tuple(
             (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
             for trial in trials
             if not trial.deviation.size
         ),
-        condition=("quantity", "skin", "nominal %"),
-        interval_of="subjects, by the exact interval of a share",
-        no_bands="bands of skin are points of their own",
     )
 
 
@@ -163,11 +158,10 @@ def _point(row: Covered, timing: Timing) -> Point:
     )
 
 
-def _limits(row: Covered) -> tuple[Limit, Limit]:
+def _limits(row: Covered) -> Findings:
     low, high = COVERAGE_RANGES[row.level]
     skin = "" if row.band in ("all", interval_trials.ANY_BAND) else f", {row.band} skin"
-    name = f"share of truths in {row.level} % intervals, {row.quantity}{skin}"
-    return (
-        Limit(f"{name}: upper end of its interval", row.interval[1], low, ">="),
-        Limit(f"{name}: lower end of its interval", row.interval[0], high, "<="),
-    )
+    return {
+        ("upper", f"{row.level}", f"{row.quantity}{skin}"): (row.interval[1], low),
+        ("lower", f"{row.level}", f"{row.quantity}{skin}"): (row.interval[0], high),
+    }

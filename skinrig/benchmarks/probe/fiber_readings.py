@@ -16,17 +16,15 @@ from capture.rig import load_rig
 from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
 from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import Point, StageBenchmark, measure
 
 PROBE_SEED = 5
 LIGHT_DECADES = 7.0
 EXPOSURE_COUNTS = (1, 2, 3, 5, 8, 12, 23)
 N_NOISE_DRAWS = 6
 """Series of each number of exposures, of one probe with new noise."""
-MAX_RMS_ERROR_PERCENT = 1.0
-"""Within five decades of the brightest."""
 MAX_RATIO_TO_BOUND = 1.15
-COVERAGE_RANGE_PERCENT = (60.0, 76.0)
 
 Frames = list[UInt16Array]
 
@@ -89,31 +87,10 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
     worst = 100 * float(np.sqrt((relative[:, near] ** 2).mean(axis=0)).max())
     ratio = float(np.sqrt((relative**2 / bound.ravel() ** 2).mean()))
     inside = 100 * float((np.abs(away) < 1).mean())
-    return StageBenchmark(
+    return described(
         "fibre-readings",
-        "median relative error of a fibre's light, %",
-        "the light that the frames were drawn from: shot, dark, read and rounding noise",
-        0.0,
-        tuple(points),
-        (
-            Limit(
-                "largest RMS error within five decades, 23 exposures",
-                worst,
-                MAX_RMS_ERROR_PERCENT,
-                "<=",
-                "%",
-            ),
-            Limit(
-                "RMS error over the Cramér-Rao bound, 23 exposures", ratio, MAX_RATIO_TO_BOUND, "<="
-            ),
-            Limit("68 % intervals that hold", inside, COVERAGE_RANGE_PERCENT[0], ">=", "%"),
-            Limit(
-                "68 % intervals that hold, at most", inside, COVERAGE_RANGE_PERCENT[1], "<=", "%"
-            ),
-        ),
-        (("steadiness of the source", "steady here; see `test_readings.py` of its calibration"),),
-        interval_of="fibres and colors",
-        no_bands="light of fibres over seven decades, whatever sends it",
+        points,
+        {"rms": worst, "over_bound": ratio, "inside": inside, "inside_most": inside},
     )
 
 

@@ -14,9 +14,10 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     BandError,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
     measure,
@@ -24,7 +25,6 @@ from skinrig.benchmarks.measurement import (
 )
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
-from skinrig.evaluating.subsurface import MAX_MEDIAN_ERROR, MAX_WORST_ERROR
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 FIBER_CORE_MM = 0.2
@@ -86,7 +86,8 @@ def tiers(*, toy: bool) -> StageBenchmark:
         ("photon_table", slice(0, 14)),
         ("photon_table", slice(0, None, 4)),
     ]
-    points, limits = [], []
+    points = []
+    limits: Findings = {}
     for method, part in chosen:
 
         def fit(method: Method = method, part: slice = part) -> subsurface.SubsurfaceFit:
@@ -113,7 +114,7 @@ def tiers(*, toy: bool) -> StageBenchmark:
         bias = np.median(relative[:, spread], axis=0)
         interval = _over_media(error)
         radius = FIBER_RADII_MM[part]
-        knobs: dict[str, str | int | float] = {
+        knobs: Knobs = {
             "model": method,
             "fibres": radius.size,
             "from mm": float(radius[0]),
@@ -129,47 +130,24 @@ def tiers(*, toy: bool) -> StageBenchmark:
         # 60...76 %, and what the simulation's own error makes ten media's share scatter
         share = float(inside.mean())
         if method == "photon_table":
-            limits += [
-                Limit(
-                    "median error of sigma_tr, 0.3...3.0 per mm, photon table",
-                    float(np.median(error)),
-                    MAX_MEDIAN_ERROR,
-                    "<=",
-                ),
-                Limit(
-                    "worst of the media's median errors, photon table",
-                    float(np.median(error, axis=0).max()),
-                    MAX_WORST_ERROR,
-                    "<=",
-                ),
-                Limit("share of 68 % intervals that hold the truth, at least", share, 0.55, ">="),
-                Limit("share of 68 % intervals that hold the truth, at most", share, 0.81, "<="),
-            ]
+            limits |= {
+                "median": float(np.median(error)),
+                "worst": float(np.median(error, axis=0).max()),
+                "inside": share,
+                "inside_most": share,
+            }
             best = float(np.median(np.abs(bias)))
         elif method == "dipole":
-            limits += [
-                Limit(
-                    "least bias of the dipole's sigma_tr (it is too small)",
-                    float(bias.max()),
-                    -0.02,
-                    "<=",
-                ),
-                Limit("greatest bias of the dipole's sigma_tr", float(bias.min()), -0.12, "<="),
-                Limit(
-                    "median bias of the dipole over that of the photon table",
-                    float(np.median(np.abs(bias))) / max(best, 1e-9),
-                    5.0,
-                    ">=",
-                ),
-            ]
-    return StageBenchmark(
+            limits |= {
+                "least_bias": float(bias.max()),
+                "greatest_bias": float(bias.min()),
+                "over_table": float(np.median(np.abs(bias))) / max(best, 1e-9),
+            }
+    return described(
         "subsurface-fit",
-        "relative error of sigma_tr, median",
-        "Monte Carlo profiles in fibres of homogeneous media, sigma_tr 0.3...3.0 per mm",
-        float(np.median(errors / profiles)) / np.sqrt(FIBER_RADII_MM.size),
-        tuple(points),
-        () if toy else tuple(limits),
-        interval_of="media, drawn again with their noise",
+        points,
+        {} if toy else limits,
+        reference_error=float(np.median(errors / profiles)) / np.sqrt(FIBER_RADII_MM.size),
         by_band=bands,
     )
 
@@ -240,7 +218,7 @@ def batches(*, toy: bool) -> StageBenchmark:
             error = np.abs(ours(n, model_error).sigma_tr_per_mm / k[:n] - 1.0)
             told = median_error(error)
             own = "none" if model_error == 0.0 else "diffusion's"
-            knobs: dict[str, str | int | float] = {"profiles": n, "model error": own}
+            knobs: Knobs = {"profiles": n, "model error": own}
             # the bound is that of noise alone: an error that is allowed for is not in these data
             bound = float(np.median(drawn[:n])) if model_error == 0.0 else None
             points.append(Point(knobs, timing, told.error, told.error_interval, bound))
@@ -250,7 +228,7 @@ def batches(*, toy: bool) -> StageBenchmark:
                     for name, band in MELANIN_BANDS.items()
                     for some in (_absorbs_like(a, band),)
                 }
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
         found, above, apart = ours(), [], []
         start = np.log([0.1, 1.0])
@@ -273,29 +251,9 @@ def batches(*, toy: bool) -> StageBenchmark:
         theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
         theirs_s *= count / N_PEER_FITS
         ours_s = processor_seconds(ours, 3)
-        limits = (
-            Limit(
-                f"times less processor time than SciPy's loop, 30,000 fits ({N_PEER_FITS} timed)",
-                theirs_s / ours_s,
-                MIN_SPEEDUP_OVER_LEAST_SQUARES,
-                ">=",
-            ),
-            Limit("chi2 above SciPy's, relative, worst", float(max(above)), 1e-6, "<="),
-            Limit(
-                "logarithms of the coefficients apart from SciPy's, median",
-                float(np.median(apart)),
-                1e-5,
-                "<=",
-            ),
-        )
-    return StageBenchmark(
-        "subsurface-batch",
-        "relative error of sigma_tr, median",
-        "diffusion's own profiles with 2 % noise",
-        0.0,
-        tuple(points),
-        limits,
-        condition=("profiles",),
-        interval_of="profiles",
-        by_band=bands,
-    )
+        limits = {
+            "speed_up": theirs_s / ours_s,
+            "chi2": float(max(above)),
+            "apart": float(np.median(apart)),
+        }
+    return described("subsurface-batch", points, limits, by_band=bands)

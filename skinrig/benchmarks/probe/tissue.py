@@ -10,14 +10,14 @@ from model import color_table, metrics, spectra
 from model.tissue_optics import layers as tissue_optics
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
+from skinrig.benchmarks.description import described
 from skinrig.benchmarks.measurement import (
     BandError,
-    Case,
-    Limit,
+    Knobs,
     Point,
     StageBenchmark,
-    compare,
-    measure,
+    measure_and_keep,
+    measured,
 )
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
@@ -37,12 +37,12 @@ def layered_reflectance(*, toy: bool) -> StageBenchmark:
     c_m, c_hd = truth.c_m[rows], truth.c_hd[columns]
     reference = truth.reflectance[rows, columns]
     reference_error = 100 * np.median(truth.standard_error[rows, columns] / reference)
-    tiers: list[dict[str, str | float]] = [{"tier": "diffusion"}]
+    tiers: list[Knobs] = [{"tier": "diffusion"}]
     for g in (0.0, tissue_optics.ANISOTROPY_SKIN):
         for directions in (4, 8) if toy else (4, 8, 16, 24):
             tiers.append({"tier": "adding_doubling", "g": g, "directions": directions})
 
-    def evaluate(knobs: dict[str, str | float]) -> Float64Array:
+    def evaluate(knobs: Knobs) -> Float64Array:
         if knobs["tier"] == "diffusion":
             return tissue_optics.two_layer_reflectance(
                 truth.wavelength_nm, c_m, c_hd, tier="diffusion"
@@ -58,28 +58,21 @@ def layered_reflectance(*, toy: bool) -> StageBenchmark:
     def relative(found: Float64Array) -> Float64Array:
         return np.asarray(100 * np.abs(found / reference - 1))
 
-    def by_band() -> dict[str, BandError]:
-        off, bands = relative(evaluate(tiers[-1])), melanin_band(c_m)
-        return {band: median_error(off[bands == band]) for band in MELANIN_BANDS}
-
-    return compare(
-        StageBenchmark(
-            "layered-reflectance",
-            "median error of R, %",
-            "Monte Carlo transport with the full phase function",
-            float(reference_error),
-            interval_of="chromophores and wavelengths",
-        ),
-        [
-            Case(
-                knobs,
-                partial(evaluate, knobs),
-                lambda found: BandError(*metrics.median_with_interval(relative(found), rng=rng)),
-            )
-            for knobs in tiers
-        ],
-        repeats=1 if toy else 3,
-        by_band=by_band,
+    points = [
+        measured(
+            knobs,
+            partial(evaluate, knobs),
+            lambda found: BandError(*metrics.median_with_interval(relative(found), rng=rng)),
+            repeats=1 if toy else 3,
+        )
+        for knobs in tiers
+    ]
+    off, bands = relative(evaluate(tiers[-1])), melanin_band(c_m)
+    return described(
+        "layered-reflectance",
+        points,
+        by_band={band: median_error(off[bands == band]) for band in MELANIN_BANDS},
+        reference_error=float(reference_error),
     )
 
 
@@ -96,58 +89,41 @@ def table(*, toy: bool) -> StageBenchmark:
     smallest = {"spline": float("nan"), "bilinear": float("nan")}
     by_band: dict[str, BandError] = {}
     for size in (8, 16, 32, 64) if toy else (8, 16, 32, 64, 128, 256, 512, 1024):
-
-        def build(size: int = size) -> color_table.ColorTable:
-            return color_table.build(spectra.LINEAR_SRGB, "D65", size=size)
-
-        timing = measure(build, repeats=1 if toy or size > 512 else 3, memory=size <= 512)
-        made = build()
+        timing, made = measure_and_keep(
+            lambda: color_table.build(spectra.LINEAR_SRGB, "D65", size=size),
+            repeats=1 if toy or size > 512 else 3,
+            memory=size <= 512,
+        )
         # as the paper's texture is read by graphics hardware, and as the table reads itself
         for between, color in (
             ("spline", made.lookup(c_m, c_hd)),
             ("bilinear", _bilinear(made, c_m, c_hd)),
         ):
             difference = metrics.delta_e_2000(_lab(color), reference)
-            worst = float(difference.max())
-            points.append(
-                Point({"size": size, "between nodes": between}, timing, worst, _largest(difference))
-            )
+            told = _largest(difference)
+            points.append(Point.of({"size": size, "between nodes": between}, timing, told))
             if (size, between) == (BAND_TABLE_SIZE, "spline"):
                 by_band = {
-                    band: BandError(float(some.max()), _largest(some))
-                    for band in MELANIN_BANDS
-                    for some in (difference[melanin_band(c_m) == band],)
+                    band: _largest(difference[melanin_band(c_m) == band]) for band in MELANIN_BANDS
                 }
-            if worst < 0.5 and not np.isfinite(smallest[between]):
+            if told.error < 0.5 and not np.isfinite(smallest[between]):
                 smallest[between] = size
-    return StageBenchmark(
+    return described(
         "color-table",
-        "largest Delta E 2000",
-        "direct evaluation of the layered model, no table",
-        0.0,
-        tuple(points),
-        tuple(
-            Limit(
-                f"smallest table with every Delta E 2000 below 0.5, {between}",
-                size,
-                128,
-                "<=",
-                "nodes",
-            )
-            for between, size in smallest.items()
-        ),
-        interval_of="chromophores: of the largest error of all, by the two largest seen",
+        points,
+        {("smallest", between): size for between, size in smallest.items()},
         by_band=by_band,
     )
 
 
-def _largest(difference: Float64Array) -> tuple[float, float]:
-    """Return a 68 % interval of the largest error there is, from the two largest seen.
+def _largest(difference: Float64Array) -> BandError:
+    """Return the largest error; its 68 % interval is by the two largest seen.
 
     Robson and Whitlock 1964, Biometrika 51, 33, doi 10.1093/biomet/51.1-2.33.
     """
     second, worst = np.sort(difference)[-2:]
-    return float(worst), float(worst + 0.68 / 0.32 * (worst - second))
+    most = float(worst + 0.68 / 0.32 * (worst - second))
+    return BandError(float(worst), (float(worst), most))
 
 
 def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Array) -> Float64Array:

@@ -17,9 +17,9 @@ from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
+from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import (
     BandError,
-    Limit,
     Point,
     StageBenchmark,
     measure,
@@ -152,19 +152,8 @@ def directions(*, toy: bool) -> StageBenchmark:
         name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
         for name, band in MELANIN_BANDS.items()
     }
-    limits = () if toy else _direction_limits(errors, rng=rng)
-    return StageBenchmark(
-        "anisotropy",
-        "error of the log of the ratio",
-        f"profiles of tissue whose sigma_tr is an ellipse of ratio {TRUE_RATIO}, coupling off by "
-        f"{100 * COUPLING_ERROR:g} % and fibres by {100 * SINGLE_FIBER_ERROR:g} %; truth and both "
-        "ways by one table, so that errors are those of noise alone",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="cases",
-        by_band=bands,
-    )
+    limits = {} if toy else _direction_limits(errors, rng=rng)
+    return described("anisotropy", points, limits, by_band=bands)
 
 
 def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator) -> BandError:
@@ -179,32 +168,22 @@ def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator
 
 def _direction_limits(
     errors: dict[tuple[Way, int], float], *, rng: np.random.Generator
-) -> tuple[Limit, ...]:
+) -> Findings:
     cases = 1000
     angle = _directions(16)
     null = _profiles(angle, 1.0, cases, rng=rng)
-    limits = []
+    limits: Findings = {}
     # an outlier left out by mistake may add its own rate
     most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
     ways: tuple[Way, ...] = ("sigma_tr", "profiles")
     for way in ways:
         alarms = float((_told(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
-        limits.append(Limit(f"false alarms of {cases} at a rate of 1 %, {way}", alarms, most, "<="))
-    return (
-        *limits,
-        Limit(
-            "error over the Cramér-Rao bound, profiles of 16 directions",
-            errors["profiles", 16] / _bound(16),
-            1.2,
-            "<=",
-        ),
-        Limit(
-            "error of sigma_tr's fits over that of profiles, 16 directions",
-            errors["sigma_tr", 16] / errors["profiles", 16],
-            2.0,
-            ">=",
-        ),
-    )
+        limits["alarms", str(cases), way] = (alarms, most)
+    return {
+        **limits,
+        "over_bound": errors["profiles", 16] / _bound(16),
+        "over_profiles": errors["sigma_tr", 16] / errors["profiles", 16],
+    }
 
 
 def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
@@ -273,36 +252,19 @@ def sites(*, toy: bool) -> StageBenchmark:
         if count == 3:
             within = float(np.mean(inside))
             three_sites = error
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
         times, mismatch = _beside_scikit_learn(prior, named)
         # of a patch without sites nothing is known but the population
         alone = math.hypot(float(prior.person_deviation[0]), float(prior.place_deviation[0]))
-        limits = (
-            Limit("part of the map within its standard error, 3 sites", within, 0.76, "<="),
-            Limit("the same", within, 0.60, ">="),
-            Limit(
-                "error of 3 sites over that of the population's mean",
-                three_sites / alone,
-                0.9,
-                "<=",
-            ),
-            Limit(
-                "times less processor time than scikit-learn, 512 x 512, 4 sites", times, 5.0, ">="
-            ),
-            Limit("difference of log(1/sigma_tr) from scikit-learn", mismatch, 1e-4, "<="),
-        )
-    return StageBenchmark(
-        "translucency",
-        "error of log(1/sigma_tr) over a face",
-        "faces drawn from the prior, red; the bound is the posterior's deviation: no map of "
-        "such faces has less",
-        0.0,
-        tuple(points),
-        limits,
-        interval_of="faces",
-        no_bands="faces are drawn from one prior, whatever their pigment",
-    )
+        limits = {
+            "within": within,
+            "within_least": within,
+            "over_mean": three_sites / alone,
+            "speed_up": times,
+            "difference": mismatch,
+        }
+    return described("translucency", points, limits)
 
 
 def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:

@@ -8,15 +8,13 @@ import numpy as np
 
 from capture.rig import load_rig
 from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.description import described
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing
 from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.reference import Way
-
-MIN_SPEEDUP_OVER_PATH = 10.0
-MIN_SPEEDUP_OVER_DIRECT = 5.0
 
 
 def render(*, toy: bool) -> StageBenchmark:
@@ -56,31 +54,14 @@ def render(*, toy: bool) -> StageBenchmark:
         for name, band in MELANIN_BANDS.items()
     }
     finest = next(p for p in points if p.knobs == {"way": "ours", "rays": max(efforts) ** 2})
-    limits = (
-        Limit(
-            "times faster than Mitsuba's path tracer, no noisier",
-            found.speed_up(found.path),
-            MIN_SPEEDUP_OVER_PATH,
-            ">=",
-        ),
-        Limit(
-            "times faster than Mitsuba's direct integrator, no noisier",
-            found.speed_up(found.direct),
-            MIN_SPEEDUP_OVER_DIRECT,
-            ">=",
-        ),
-    )
-    return StageBenchmark(
+    limits = {"over_path": found.speed_up(found.path), "over_direct": found.speed_up(found.direct)}
+    return described(
         "render-dome",
-        "RMS error over the mean, seconds a light, %",
-        f"ours with {fine**2} rays a pixel; Mitsuba's mean agrees with it but for noise. Its own "
-        "error falls at least with the root of the rays from that of the most here",
-        finest.error * max(efforts) / fine,
-        tuple(points),
+        points,
         limits,
-        left_out=(("subjects with relief and vellus hair", "Mitsuba has no such lobe"),),
-        interval_of="tiles of the pictures",
+        reference_error=finest.error * max(efforts) / fine,
         by_band=bands,
+        rays=fine**2,
     )
 
 

@@ -16,11 +16,11 @@ from rigsim.scenes.flash.polarizer_reference import (
     sphere_mesh,
 )
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import tiled_rms
 
 MIN_SPEEDUP_OVER_MITSUBA = 8.0
-MIN_NOISE_RATIO = 20.0
 REFERENCE_RAYS = 144
 
 
@@ -45,39 +45,21 @@ def render(*, toy: bool) -> StageBenchmark:
 
         timing = measure(by_closed_forms, memory=None)
         told = _worse(by_closed_forms(), truth)
-        knobs: dict[str, str | int | float] = {"way": "closed form", "subpixels": subpixels}
+        knobs: Knobs = {"way": "closed form", "subpixels": subpixels}
         ours.append(Point(knobs, timing, told.error, told.error_interval))
         timing = measure(by_mitsuba, memory=None)
         told = _worse(by_mitsuba(), truth)
         knobs = {"way": "mitsuba", "samples": samples}
         theirs.append(Point(knobs, timing, told.error, told.error_interval))
-    limits: tuple[Limit, ...] = ()
+    limits: Findings = {}
     if not toy:
         final = polarizer_reference(width_px=width, samples=efforts[-1][1], subpixels=1)
-        limits = (
-            Limit(
-                "times faster than Mitsuba's polarizers",
-                final.speed_up,
-                MIN_SPEEDUP_OVER_MITSUBA,
-                ">=",
-            ),
-            Limit(
-                "times less noisy than Mitsuba's polarizers",
-                final.noise_ratio,
-                MIN_NOISE_RATIO,
-                ">=",
-            ),
-        )
-    return StageBenchmark(
+        limits = {"speed_up": final.speed_up, "noise": final.noise_ratio}
+    return described(
         "render-flash",
-        "RMS error of the worse image, %",
-        f"closed forms with {REFERENCE_RAYS} rays a pixel; Mitsuba's mean agrees with it but for "
-        "noise. Its own error falls at least with the root of the rays from that of the most here",
-        ours[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5,
         (*ours, *theirs),
         limits,
-        interval_of="tiles of the pictures",
-        no_bands="a plastic sphere, as Mitsuba can render it too",
+        reference_error=ours[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5,
     )
 
 

@@ -17,7 +17,8 @@ from rigsim.scenes.gradient.reference import (
     traced,
 )
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
 
 MIN_SPEEDUP_OVER_MITSUBA = 25.0
 N_LIT_CONDITIONS = 14
@@ -39,9 +40,7 @@ def render(*, toy: bool) -> StageBenchmark:
     reference, _ = traced(plain, pixels, subpixels=2 if toy else 4)
     points: list[Point] = []
 
-    def add(
-        knobs: dict[str, str | int | float], seconds: float, error: float, memory: float | None
-    ) -> None:
+    def add(knobs: Knobs, seconds: float, error: float, memory: float | None) -> None:
         spread = error / math.sqrt(2.0 * len(pixels))
         timing = Timing(seconds, (seconds, seconds), seconds, memory, "resident")
         interval = (100.0 * (error - spread), 100.0 * (error + spread))
@@ -63,7 +62,7 @@ def render(*, toy: bool) -> StageBenchmark:
             spent = time.process_time() - begin
         way = judge(found, reference, spent)
         ours[subpixels, sectors, table] = way
-        knobs: dict[str, str | int | float] = {"way": "moments"}
+        knobs: Knobs = {"way": "moments"}
         knobs |= {"subpixels": subpixels, "sectors": sectors, "table": table}
         add(knobs, spent, way.error, rise.mb)
     without = judge(picture(plain_scene(skin, width_px=width, shadows=False), pixels), reference, 0)
@@ -84,29 +83,10 @@ def render(*, toy: bool) -> StageBenchmark:
     peer_s, peer_error, ways = theirs[samples]
     at_equal_error = peer_s * (peer_error / best.error) ** 2
     off = max(abs(way.mean_ratio - 1.0) / way.mean_ratio_stderr for way in ways)
-    limits = (
-        Limit(
-            f"times less processor time than {N_LIT_CONDITIONS} Mitsuba renders at equal error, "
-            f"extrapolated from {samples} samples by 1 over their root",
-            at_equal_error / best.seconds,
-            MIN_SPEEDUP_OVER_MITSUBA,
-            ">=",
-        ),
-        Limit("error, 2 samples a pixel's side, of the mean", 100.0 * best.error, 1.0, "<=", "%"),
-        Limit("Mitsuba's mean off the reference's, in its standard errors", off, 4.0, "<="),
-        Limit("error without shadows over that with", without.error / best.error, 3.0, ">="),
-    )
-    return StageBenchmark(
-        "render-gradient",
-        "RMS error over the mean, processor seconds for all conditions of a state, %",
-        "sums over LEDs with shadow rays, in some pixels",
-        0.05,
-        tuple(points),
-        () if toy else limits,
-        left_out=(
-            ("polarization in the comparison", "Mitsuba has no film before each light here"),
-            ("the lens", "Mitsuba's cameras do not diffract"),
-        ),
-        interval_of="pixels",
-        no_bands="surface reflection, which pigment does not enter, is most of what is rendered",
-    )
+    limits: Findings = {
+        ("speed_up", samples): at_equal_error / best.seconds,
+        "error": 100.0 * best.error,
+        "mean": off,
+        "shadows": without.error / best.error,
+    }
+    return described("render-gradient", points, {} if toy else limits)

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rigsim.needs.flash import LATERAL_EFFECT
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.description import Findings, described
+from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
-
-MAX_OMITTED_NOISE_RATIO = 0.1
-"""Of a pixel's noise: what may be left out. Not `rigsim.needs.effects.NEGLIGIBLE_NOISE_RATIO`
-itself, so that a rule that was loosened shows here."""
 
 WHY_NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
@@ -31,60 +28,31 @@ def omissions(*, toy: bool) -> StageBenchmark:
     sums without chance, so that what is uncertain is rounding; the probe's are of equal photons.
     """
     found = list(_cases(toy))
-    points, limits = [], []
+    points = []
+    limits: Findings = {}
     for one in found:
         spent = one.without_s
         timing = Timing(spent, (spent, spent), spent, None, no_memory=WHY_NO_MEMORY)
-        knobs: dict[str, str | int | float | bool] = {
+        knobs: Knobs = {
             "rig": one.rig,
             "subject": one.subject,
             "effect": one.effect,
             "verdict": one.verdict,
         }
-        also: dict[str, str | int | float | bool] = {"seconds saved": one.with_s - one.without_s}
+        also: Knobs = {"seconds saved": one.with_s - one.without_s}
         if one.told is not None:
             also["told by the rule"] = one.told
         interval = (max(one.found - one.uncertain, 0.0), one.found + one.uncertain)
         points.append(Point(knobs, timing, one.found, interval, also=also))
         if one.verdict == "negligible":
-            limits.append(
-                Limit(
-                    f"{one.rig}, {one.subject}: {one.effect}: change with 3 standard errors",
-                    one.at_most,
-                    MAX_OMITTED_NOISE_RATIO,
-                    "<=",
-                    "of the noise",
-                )
-            )
+            limits["change", one.rig, one.subject, one.effect] = one.at_most
     built = [one for one in found if one.verdict == "built"]
     told = [one for one in built if one.told is not None and not _other_shadows(one)]
-    limits.append(
-        Limit(
-            "largest change, less its rounding, over what the rule told, of what is built",
-            max(((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0),
-            1.0,
-            "<=",
-        )
+    limits["over_rule"] = max(
+        ((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0
     )
-    return StageBenchmark(
-        "omissions",
-        "largest change of a pixel by leaving it out, over its noise",
-        "the same scene with the effect",
-        max(one.uncertain for one in found),
-        tuple(points),
-        tuple(limits),
-        left_out=(
-            ("effects that no scene can build", "a session's and a report's table names them"),
-            ("effects that the simulated world has not", "there is nothing to render"),
-            (
-                "what the rule told of spreading in the dome's skin",
-                "its switch also takes shadows from texels instead of from rays; "
-                "the flash rig's does not",
-            ),
-        ),
-        no_bands="subjects are points of their own",
-        condition=("rig", "subject", "effect", "verdict"),
-        interval_of="rounding in single precision: pictures with and without share all chance",
+    return described(
+        "omissions", points, limits, reference_error=max(one.uncertain for one in found)
     )
 
 

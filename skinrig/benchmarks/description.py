@@ -1,0 +1,84 @@
+"""What stages measure and promise, as `data/benchmarks.toml` has it, with what a run found."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark
+
+STAGES_TABLE = resources.files("skinrig").joinpath("data/benchmarks.toml")
+
+Findings = dict[str | tuple[Any, ...], float | tuple[float, float]]
+"""What was found of limits, by their keys in the table. What follows a key's first part fills the
+numbered braces of the limit's name; beside a value may stand its bound, where the run sets it."""
+
+
+@cache
+def descriptions() -> dict[str, dict[str, Any]]:
+    """Return the description of every stage by its name, in the order of the table."""
+    return tomllib.loads(STAGES_TABLE.read_text(encoding="utf-8"))
+
+
+def described(
+    name: str,
+    points: Iterable[Point],
+    limits: Mapping[Any, float | tuple[float, float]] | None = None,
+    *,
+    by_band: Mapping[str, BandError] | None = None,
+    reference_error: float | None = None,
+    left_out: Iterable[tuple[str, str]] = (),
+    **words: object,
+) -> StageBenchmark:
+    """Return what a run found of a stage with the stage's description.
+
+    Parameters
+    ----------
+    name
+        Of the stage.
+    points
+        In the order in which they are shown.
+    limits
+        What was found of its limits; those without are not judged.
+    by_band
+        Errors by melanin band.
+    reference_error
+        How far the reference may be off; None: as described, or not at all.
+    left_out
+        What this run did not measure, and why, beside what no run does.
+    words
+        Fill the braces of the description.
+    """
+    told = descriptions()[name]
+    return StageBenchmark(
+        name,
+        told["error_name"],
+        told["reference"].format(**words),
+        told.get("reference_error", 0.0) if reference_error is None else reference_error,
+        tuple(points),
+        tuple(_limit(told["limits"], key, found, words) for key, found in (limits or {}).items()),
+        (*((what, why) for what, why in told.get("left_out", ())), *left_out),
+        by_band or {},
+        told.get("no_bands", ""),
+        tuple(told.get("condition", ())),
+        told["interval_of"],
+        told.get("squared", False),
+    )
+
+
+def _limit(
+    table: Mapping[str, Mapping[str, Any]],
+    key: str | tuple[Any, ...],
+    found: float | tuple[float, float],
+    words: Mapping[str, object],
+) -> Limit:
+    first, *parts = (key,) if isinstance(key, str) else key
+    told = table[first]
+    name, unit = told["name"].format(*parts, **words), told.get("unit", "")
+    got, bound = found if isinstance(found, tuple) else (found, None)
+    if "at_most" in told:
+        return Limit(name, got, told["at_most"] if bound is None else bound, "<=", unit)
+    return Limit(name, got, told["at_least"] if bound is None else bound, ">=", unit)
