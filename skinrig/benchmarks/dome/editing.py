@@ -62,7 +62,7 @@ def editing(*, toy: bool) -> StageBenchmark:
         for one, truth in zip(before, after, strict=True):
             new = call(one.r_d, one.valid, 1.0)
             again = call(new, one.valid, -1.0)
-            errors.append(float(np.median(_percent_off(new, one, truth))))
+            errors.append(_error_percent(new, one, truth))
             there = one.valid & truth.valid
             back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[there] ** 2))))
         timing = measure(
@@ -80,7 +80,7 @@ def editing(*, toy: bool) -> StageBenchmark:
         kept[kind, iterations, noise] = points[-1].error, float(np.mean(back))
     error, returned = kept[settings[0]]
     pairs = zip(before, after, strict=True)
-    none = float(np.mean([np.median(_percent_off(a.r_d, a, b)) for a, b in pairs]))
+    none = float(np.mean([_error_percent(a.r_d, a, b) for a, b in pairs]))
     same = _edit(spaces["quantiles"], 5, usual, before[0].r_d, before[0].valid, 0.0)
     zero = float(np.abs(same / before[0].r_d - 1)[before[0].valid].max())
     return described(
@@ -102,14 +102,15 @@ def _on_skin(
     good = one.valid & truth.valid
     sizes = 100 * np.abs(new / truth.r_d - 1)
     # neighbors err alike: the face is cut into squares
-    medians = [np.median(sizes[at][good[at]]) for at in squares(len(good)) if good[at].any()]
+    places = [at for at in squares(len(good)) if good[at].any()]
+    medians = [float(np.median(sizes[at][good[at]])) for at in places]
     half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
     return BandError.around(float(np.median(sizes[good])), half)
 
 
-def _percent_off(r_d: FloatArray, one: AlbedoSample, truth: AlbedoSample) -> FloatArray:
-    """Return how far an edited R_d is off where both faces are known, %."""
-    return np.asarray(100 * np.abs(r_d / truth.r_d - 1)[one.valid & truth.valid])
+def _error_percent(r_d: FloatArray, one: AlbedoSample, truth: AlbedoSample) -> float:
+    """Return the median error of an edited R_d where both faces are known, %."""
+    return 100 * float(np.median(np.abs(r_d / truth.r_d - 1)[one.valid & truth.valid]))
 
 
 def _tanned(person: Member) -> Member:

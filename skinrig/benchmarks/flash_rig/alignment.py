@@ -16,7 +16,7 @@ from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Points = dict[str, tuple[float, float]]
@@ -86,6 +86,23 @@ class MovedFace:
     hemoglobin: Float32Array
     hemoglobin_at_rest: Float32Array
     hemoglobin_moving: Float32Array
+
+    def align(self, landmarks: int, rounds: int) -> expression_alignment.Alignment:
+        """Lay the moving picture over the neutral one by so many landmarks and rounds of flow."""
+        names = list(self.landmarks)[:landmarks]
+        return expression_alignment.align(
+            self.moving,
+            self.neutral,
+            rounds=rounds,
+            landmarks_moving={n: self.landmarks_moving[n] for n in names} or None,
+            landmarks_neutral={n: self.landmarks[n] for n in names} or None,
+            valid_moving=self.valid_moving,
+            valid_neutral=self.valid,
+        )
+
+    def errors_px(self, found: expression_alignment.Alignment) -> Float64Array:
+        """Return how far each aligned pixel is from its place, px, (n,)."""
+        return np.asarray(np.linalg.norm(found.source_px - self.source_px, axis=-1)[found.valid])
 
 
 def table() -> ColorTable:
@@ -205,70 +222,41 @@ def aligned(*, toy: bool) -> StageBenchmark:
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
-    settings: list[tuple[int, int]] = [(8, 0), (24, 0), (48, 0), (24, 2)]
+    effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not toy:
-        settings = [
+        effort = [
             (8, 0),
             (8, 2),
-            (24, 0),
-            (24, 1),
-            (24, 2),
-            (24, 4),
+            *((24, n) for n in (0, 1, 2, 4)),
             (48, 0),
             (48, 2),
             (0, 0),
             (0, 2),
         ]
-    points = []
-    covered = None
-    for count, rounds in settings:
-
-        def run(
-            count: int = count, rounds: int = rounds, pictures: MovedFace = seen
-        ) -> expression_alignment.Alignment:
-            names = list(pictures.landmarks)[:count]
-            return expression_alignment.align(
-                pictures.moving,
-                pictures.neutral,
-                rounds=rounds,
-                landmarks_moving={n: pictures.landmarks_moving[n] for n in names} or None,
-                landmarks_neutral={n: pictures.landmarks[n] for n in names} or None,
-                valid_moving=pictures.valid_moving,
-                valid_neutral=pictures.valid,
-            )
-
-        timing = measure(run, repeats=1, memory=(count, rounds) == (24, 2))
-        found = run()
-        error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
+    points = {}
+    for count, rounds in effort:
+        timing, found = measure_and_keep(
+            lambda: seen.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
+        )
+        error = seen.errors_px(found)
         if (count, rounds) == (24, 2):
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
-        points.append(
-            Point(
-                {"by": found.by, "landmarks": count, "rounds": rounds},
-                timing,
-                _rms(error),
-                _rms_interval(error, side),
-            )
-        )
+        knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
+        points[count, rounds] = Point.of(knobs, timing, _rms(error, side))
     bands = {
         name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
     }
     limits: Findings = {}
     if not toy:
-        before = run(24, 2, still)
-        false_motion = np.linalg.norm(before.source_px - still.source_px, axis=-1)[before.valid]
-        by_setting = {(p.knobs["landmarks"], p.knobs["rounds"]): p.error for p in points}
         limits = {
-            "false_motion": float(np.median(false_motion)),
-            "covered": float(covered or 0.0),
-            "by_flow": by_setting[24, 0] / by_setting[24, 2],
-            "seconds": next(
-                p.timing.seconds
-                for p in points
-                if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)
-            ),
+            "false_motion": float(np.median(still.errors_px(still.align(24, 2)))),
+            "covered": covered,
+            "by_flow": points[24, 0].error / points[24, 2].error,
+            "seconds": points[24, 2].timing.seconds,
         }
-    return described("expression-alignment", points, limits, by_band=bands, moved_px=side / 50)
+    return described(
+        "expression-alignment", points.values(), limits, by_band=bands, moved_px=side / 50
+    )
 
 
 def _on_skin(preset: str, side: int) -> BandError:
@@ -276,17 +264,7 @@ def _on_skin(preset: str, side: int) -> BandError:
     rng = np.random.default_rng(4)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face_of(preset, side, seed=2), away, state="exercise", rng=rng)
-    found = expression_alignment.align(
-        seen.moving,
-        seen.neutral,
-        rounds=2,
-        landmarks_moving=seen.landmarks_moving,
-        landmarks_neutral=seen.landmarks,
-        valid_moving=seen.valid_moving,
-        valid_neutral=seen.valid,
-    )
-    error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
-    return BandError(_rms(error), _rms_interval(error, side))
+    return _rms(seen.errors_px(seen.align(24, 2)), side)
 
 
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -303,46 +281,34 @@ def misaligned(*, toy: bool) -> StageBenchmark:
     mask = oval(side)
     neutral = face.hemoglobin().astype(np.float64)
     points = []
-    errors: dict[tuple[str, float], float] = {}
+    errors: dict[tuple[float, float, str], float] = {}
     for state in ("exercise",) if toy else ("exercise", "smile"):
         truth = face.hemoglobin(state).astype(np.float64)
-        size = _rms((truth - neutral)[mask])
+        size = _rms((truth - neutral)[mask], side).error
         for off_px in MISALIGNMENTS_PX[:3] if toy else MISALIGNMENTS_PX:
             map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
 
-            def interpolated(map_of_state: Float64Array = map_of_state) -> Float64Array:
-                return neutral + 1.0 * (map_of_state - neutral)
+            def blended(radius: float) -> Float64Array:
+                if radius == 0.0:
+                    return neutral + 1.0 * (map_of_state - neutral)
+                rig = HemoglobinRig.from_maps(
+                    neutral, {state: map_of_state}, radius_px=radius, valid=mask
+                )
+                return np.asarray(rig.blend({state: 1.0, "neutral": 0.0}), np.float64)
 
-            ways = [("interpolated", 0.0, interpolated)]
-            for radius in (16.0,) if toy else (8.0, 16.0, 32.0):
-
-                def blended(
-                    map_of_state: Float64Array = map_of_state,
-                    radius: float = radius,
-                    name: str = state,
-                ) -> Float64Array:
-                    rig = HemoglobinRig.from_maps(
-                        neutral, {name: map_of_state}, radius_px=radius, valid=mask
-                    )
-                    return np.asarray(rig.blend({name: 1.0, "neutral": 0.0}), np.float64)
-
-                ways.append(("blended", radius, blended))
-            for way, radius, call in ways:
-                timing = measure(call, repeats=1, memory=False)
-                error = (call() - truth)[mask] / size
-                error = error[np.isfinite(error)]
-                errors[f"{way} {radius:g} {state}", off_px] = _rms(error)
+            for radius in (0.0, 16.0) if toy else (0.0, 8.0, 16.0, 32.0):
+                timing, found = measure_and_keep(lambda: blended(radius), repeats=1, memory=False)
+                error = (found - truth)[mask] / size
+                told = _rms(error[np.isfinite(error)], side)
+                errors[radius, off_px, state] = told.error
+                way = "blended" if radius else "interpolated"
                 knobs: Knobs = {"state": state, "way": way, "off_px": off_px}
-                if radius:
-                    knobs["radius_px"] = radius
-                points.append(Point(knobs, timing, _rms(error), _rms_interval(error, side)))
+                knobs |= {"radius_px": radius} if radius else {}
+                points.append(Point.of(knobs, timing, told))
     limits: Findings = {}
     if not toy:
-        limits = {
-            ("ratio", state): errors[f"interpolated 0 {state}", 2.0]
-            / errors[f"blended 16 {state}", 2.0]
-            for state in ("exercise", "smile")
-        }
+        for state in ("exercise", "smile"):
+            limits["ratio", state] = errors[0.0, 2.0, state] / errors[16.0, 2.0, state]
     return described("misalignment", points, limits)
 
 
@@ -357,13 +323,10 @@ def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -
     return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
 
 
-def _rms(values: Float64Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _rms_interval(values: Float64Array, side: int) -> tuple[float, float]:
-    """Return the 68 % interval of a root mean square over pixels that go together in patches."""
+def _rms(values: Float64Array, side: int) -> BandError:
+    """Return a root mean square over pixels that go together in patches, with its interval."""
     squares = np.square(values)
     patches = max(values.size / (side / 10.0) ** 2, 2.0)
     mean, spread = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
-    return float(np.sqrt(max(mean - spread, 0.0))), float(np.sqrt(mean + spread))
+    low, high = np.sqrt([max(mean - spread, 0.0), mean + spread]).tolist()
+    return BandError(float(np.sqrt(mean)), (low, high))

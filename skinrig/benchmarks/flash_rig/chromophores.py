@@ -12,7 +12,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure_and_keep
 from skinrig.benchmarks.resampling import median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
@@ -41,22 +41,21 @@ def inversion(*, toy: bool) -> StageBenchmark:
             coarse = color_table.build(
                 "Nikon 5100 (NPL)", "D55", size=size, anisotropy=ANISOTROPY_SKIN
             )
-            given = "known" if shading == "known" else None
-
-            def invert(
-                coarse: color_table.ColorTable = coarse, given: str | None = given
-            ) -> chromophores.ChromophoreMaps:
-                return chromophores.invert(picture, coarse, shading=given, variance=variance)
-
-            timing = measure(invert, repeats=1 if toy else 3)
-            found = invert()
+            timing, found = measure_and_keep(
+                lambda: chromophores.invert(
+                    picture,
+                    coarse,
+                    shading="known" if shading == "known" else None,
+                    variance=variance,
+                ),
+                repeats=1 if toy else 3,
+            )
             relative = 100 * np.abs(found.melanin / c_m - 1)
             median, interval = metrics.median_with_interval(relative[found.valid], rng=rng)
             # the median of |error| of a normal error of the bound's size
             bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
-            points.append(
-                Point({"shading": shading, "table": size}, timing, median, interval, bound)
-            )
+            knobs = {"shading": shading, "table": size}
+            points.append(Point(knobs, timing, median, interval, bound))
         if shading == "free":
             peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2

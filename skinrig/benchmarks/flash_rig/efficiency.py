@@ -21,7 +21,7 @@ from reconstruction import chromophores, diffuse_albedo, photometric_stereo, sub
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 
@@ -73,29 +73,27 @@ def efficiency(*, toy: bool) -> StageBenchmark:
     for name, made in _ESTIMATOR_TRIALS.items():
         ratios: dict[str, list[tuple[float, float]]] = {band: [] for band in MELANIN_BANDS}
         for subject, trial in made(draws):
-            timing = measure(trial.squared_errors, repeats=1)
-            squared = trial.squared_errors()
+            timing, squared = measure_and_keep(trial.squared_errors, repeats=1)
             ratio = float(squared.mean()) / trial.bound
             spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
-            knobs: Knobs = {
-                "estimator": name,
-                "subject": subject,
-                "noise_percent": round(100 * trial.noise, 2),
-            }
-            also = {"judged": trial.clear >= MIN_EVALUATED_SIGMAS}
-            points.append(Point(knobs, timing, ratio, (ratio - spread, ratio + spread), 1.0, also))
-            if trial.clear >= MIN_EVALUATED_SIGMAS:
+            knobs: Knobs = {"estimator": name, "subject": subject}
+            knobs["noise_percent"] = round(100 * trial.noise, 2)
+            judged = trial.clear >= MIN_EVALUATED_SIGMAS
+            told = BandError.around(ratio, spread, 1.0)
+            points.append(Point.of(knobs, timing, told, {"judged": judged}))
+            if judged:
                 ratios[str(melanin_band(SUBJECT_CHROMOPHORES[subject][0]))].append((ratio, spread))
         left_out += _left_out(name, points)
-        for band, told in ratios.items():
-            if not told:
+        for band, pairs in ratios.items():
+            if not pairs:
                 continue
-            ratio = float(np.mean([one for one, _ in told]))
-            spread = float(np.sqrt(np.sum([s**2 for _, s in told]))) / len(told)
+            each, spreads = np.array(pairs).T
+            ratio = float(np.mean(each))
+            spread = float(np.sqrt(np.sum(spreads**2))) / len(pairs)
             # what so many draws leave open of the ratio counts for the estimator
             limits["ratio", name, band] = ratio - 2.0 * spread
             if band not in worst or ratio > worst[band].error:
-                worst[band] = BandError(ratio, (ratio - spread, ratio + spread), 1.0)
+                worst[band] = BandError.around(ratio, spread, 1.0)
     return described("efficiency", points, limits, left_out=tuple(left_out), by_band=worst)
 
 
@@ -119,7 +117,6 @@ def _chromophores(
     index = 0 if which == "melanin" else 1
 
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
-    given = "known" if shading == "known" else None
 
     def squared(
         noisy: Float64Array, sigma: Float64Array, truth: tuple[float, float]
@@ -127,7 +124,7 @@ def _chromophores(
         found = chromophores.invert(
             noisy.astype(np.float32),
             table,
-            shading=given,
+            shading="known" if shading == "known" else None,
             variance=np.broadcast_to(np.float32(sigma**2), noisy.shape),
         )
         value = getattr(found, which)
@@ -142,9 +139,8 @@ def _chromophores(
         least = np.diag(np.linalg.inv(relative.T @ relative))[:2]  # at noise of 1
         for noise in CHANNEL_NOISES:
             clear = float(np.min(np.array(truth) / (noise * np.sqrt(least))))
-            if clear < (
-                MIN_MEASURED_SIGMAS if noise == CHANNEL_NOISES[0] else MIN_EVALUATED_SIGMAS
-            ):
+            usual = noise == CHANNEL_NOISES[0]
+            if clear < (MIN_MEASURED_SIGMAS if usual else MIN_EVALUATED_SIGMAS):
                 continue
             sigma = noise * color
             rng = np.random.default_rng([1, number])

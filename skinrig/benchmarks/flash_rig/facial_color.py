@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,7 +14,14 @@ from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, his
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, measure, processor_seconds
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Knobs,
+    Point,
+    StageBenchmark,
+    measure,
+    processor_seconds,
+)
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -37,17 +45,16 @@ def rig(*, toy: bool) -> StageBenchmark:
     names = PREDICTED_STATES[:2] if toy else PREDICTED_STATES
     truths = {name: face.hemoglobin(name) for name in names}
 
-    def point(
-        knobs: Knobs, predict: Callable[[str], FloatArray], call: Callable[[], object] | None = None
-    ) -> Point:
-        knobs = {"misaligned_px": 0} | knobs
-        timing = measure(call or (lambda: predict(names[0])), repeats=1 if toy else 3, memory=False)
+    points: list[Point] = []
+
+    def add(knobs: Knobs, predict: Callable[[str], FloatArray]) -> None:
+        timing = measure(lambda: predict(names[0]), repeats=1 if toy else 3, memory=False)
         left = []
         for name in names:
             found = blood_errors.compare(predict(name), truths[name], neutral, valid=covered)
             left.append(100.0 * found.predicted / found.neutral_kept)
-        middle, interval = metrics.median_with_interval(left, rng=rng)
-        return Point(knobs, timing, middle, interval)
+        told = BandError(*metrics.median_with_interval(left, rng=rng))
+        points.append(Point.of({"misaligned_px": 0} | knobs, timing, told))
 
     def fitted(radius_px: float, stored: int | None, moved_px: int = 0) -> HemoglobinRig:
         return HemoglobinRig.from_maps(
@@ -58,15 +65,11 @@ def rig(*, toy: bool) -> StageBenchmark:
             stored_size=stored,
         )
 
-    points = [
-        point({"method": "neutral map kept"}, lambda name: neutral),
-        point(
-            {"method": "one gain"},
-            lambda name: (
-                blood_errors.compare(neutral, truths[name], neutral, valid=covered).gain * neutral
-            ),
-        ),
-    ]
+    def gained(name: str) -> FloatArray:
+        return blood_errors.compare(neutral, truths[name], neutral, valid=covered).gain * neutral
+
+    add({"method": "neutral map kept"}, lambda name: neutral)
+    add({"method": "one gain"}, gained)
     sweep: list[tuple[float, int | None, int]] = [(RIG_RADIUS_PX, 256, 0)]
     if not toy:
         sweep += [(r, 256, 0) for r in (4.0, 8.0, 32.0, 64.0)]
@@ -74,45 +77,23 @@ def rig(*, toy: bool) -> StageBenchmark:
         sweep += [(RIG_RADIUS_PX, 256, moved) for moved in (1, 2, 4, 8)]
     for radius_px, stored, moved_px in sweep:
         made = fitted(radius_px, stored, moved_px)
-        points.append(
-            point(
-                {
-                    "method": "scale and bias",
-                    "radius_px": radius_px,
-                    "stored": stored or neutral.shape[0],
-                    "misaligned_px": moved_px,
-                },
-                lambda name, made=made: made.blend({name: 1.0}),  # type: ignore[misc]
-            )
-        )
-    points.append(
-        point(
-            {"method": "scale and bias, fitted anew", "radius_px": RIG_RADIUS_PX},
-            lambda name: HemoglobinRig.from_maps(
-                neutral, {name: truths[name]}, radius_px=RIG_RADIUS_PX, valid=covered
-            ).blend({name: 1.0}),
-        )
+        knobs: Knobs = {"method": "scale and bias", "radius_px": radius_px}
+        knobs |= {"stored": stored or neutral.shape[0], "misaligned_px": moved_px}
+        add(knobs, lambda name: made.blend({name: 1.0}))
+    add(
+        {"method": "scale and bias, fitted anew", "radius_px": RIG_RADIUS_PX},
+        lambda name: HemoglobinRig.from_maps(
+            neutral, {name: truths[name]}, radius_px=RIG_RADIUS_PX, valid=covered
+        ).blend({name: 1.0}),
     )
-    windows = [8] if toy else [11, 8, 4]
-    for spacing in windows:
-        points.append(
-            point(
-                {
-                    "method": "exact histograms, windows",
-                    "radius_px": RIG_RADIUS_PX,
-                    "spacing_px": spacing,
-                },
-                lambda name, spacing=spacing: (
-                    histogram_matching.match(  # type: ignore[misc]
-                        neutral,
-                        truths[name],
-                        RIG_RADIUS_PX,
-                        valid=covered,
-                        valid_target=covered,
-                        spacing_px=spacing,
-                    ).hemoglobin
-                ),
-            )
+    matched = partial(histogram_matching.match, valid=covered, valid_target=covered)
+    for spacing in [8] if toy else [11, 8, 4]:
+        knobs = {"method": "exact histograms, windows", "radius_px": RIG_RADIUS_PX}
+        add(
+            knobs | {"spacing_px": spacing},
+            lambda name: (
+                matched(neutral, truths[name], RIG_RADIUS_PX, spacing_px=spacing).hemoglobin
+            ),
         )
     limits = {} if toy else _round_trip(neutral, covered) | _digits(rng) | _speed(rng)
     return described("facial-color", points, limits)
@@ -163,9 +144,9 @@ def _speed(rng: np.random.Generator) -> Findings:
         kernel = disc(radius)
         crop = np.ascontiguousarray(h[: CROP_SIDES_PX[radius], : CROP_SIDES_PX[radius]])
         ways: list[tuple[int, Callable[[], object]]] = [
-            (PARALLEL_CORES, lambda radius=radius: disc_statistics.measure(h, radius)),  # type: ignore[misc]
-            (1, lambda kernel=kernel: by_opencv(h, kernel)),  # type: ignore[misc]
-            (PARALLEL_CORES, lambda kernel=kernel: by_fft(h, kernel)),  # type: ignore[misc]
+            (PARALLEL_CORES, lambda: disc_statistics.measure(h, radius)),
+            (1, lambda: by_opencv(h, kernel)),
+            (PARALLEL_CORES, lambda: by_fft(h, kernel)),
         ]
         for _, way in ways:
             way()
@@ -173,7 +154,7 @@ def _speed(rng: np.random.Generator) -> Findings:
         for _ in range(N_TIMING_ROUNDS):
             for index, (cores, way) in enumerate(ways):
                 least[index] = min(least[index], processor_seconds(way) / cores)
-        convolve_s = processor_seconds(lambda crop=crop, kernel=kernel: by_convolve(crop, kernel))  # type: ignore[misc]
+        convolve_s = processor_seconds(lambda: by_convolve(crop, kernel))
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits |= {

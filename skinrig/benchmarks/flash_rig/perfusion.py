@@ -19,7 +19,8 @@ from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import rms_of_draws
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0
@@ -120,27 +121,18 @@ def curves(*, toy: bool) -> StageBenchmark:
             rng = np.random.default_rng(0)
             draws = [train.draw(TIME_CONSTANT_S, rng) for _ in range(runs)]
 
-            def one(values: Float64Array, way: str = way, phase: Float64Array = phase) -> float:
-                if way == "five places":
-                    return fit_cycle(phase, values, cycle_s=CYCLE_S).time_constant_s
-                if way == "best place":
-                    return fit_cycle(phase, values[-1], cycle_s=CYCLE_S).time_constant_s
-                return scipy_fit(phase, values[-1])[0]
+            def fitted_s(values: Float64Array) -> float:
+                if way == "best place, scipy":
+                    return scipy_fit(phase, values[-1])[0]
+                places = values if way == "five places" else values[-1]
+                return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
 
-            off = np.array([one(values) for values in draws]) - TIME_CONSTANT_S
-            error = float(np.sqrt(np.mean(off**2)))
-            errors[way, train.captures] = error
-            spread = error / np.sqrt(2 * runs)
-            timing: Timing = measure(lambda one=one, v=draws[0]: one(v), repeats=3)  # type: ignore[misc]
-            points.append(
-                Point(
-                    {"captures": train.captures, "every s": train.shot_period_s, "fit": way},
-                    timing,
-                    error,
-                    (error - spread, error + spread),
-                    train.bound_s() if way == "five places" else None,
-                )
-            )
+            off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
+            told = rms_of_draws(off, bound=train.bound_s() if way == "five places" else None)
+            errors[way, train.captures] = told.error
+            timing = measure(lambda: fitted_s(draws[0]))
+            knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}
+            points.append(Point.of(knobs, timing, told))
     bands = {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
     limits = {} if toy else _limits(runs, errors, trains)
     return described("perfusion-curves", points, limits, by_band=bands)
@@ -172,22 +164,11 @@ def _on_skin(noisier: float, runs: int) -> BandError:
     """Return the error of five places in 44 captures, with so many times the noise."""
     train, rng = Train(44, 10.25), np.random.default_rng(0)
     clean = REST_BLOOD + np.outer(BLOOD_CHANGES, train.levels(TIME_CONSTANT_S))
-    off = (
-        np.array(
-            [
-                fit_cycle(
-                    train.phase_s,
-                    clean + noisier * BLOOD_NOISE * rng.standard_normal(clean.shape),
-                    cycle_s=CYCLE_S,
-                ).time_constant_s
-                for _ in range(runs)
-            ]
-        )
-        - TIME_CONSTANT_S
-    )
-    error = float(np.sqrt(np.mean(off**2)))
-    spread = error / np.sqrt(2 * runs)
-    return BandError(error, (error - spread, error + spread), noisier * train.bound_s())
+    found = []
+    for _ in range(runs):
+        noise = noisier * BLOOD_NOISE * rng.standard_normal(clean.shape)
+        found.append(fit_cycle(train.phase_s, clean + noise, cycle_s=CYCLE_S).time_constant_s)
+    return rms_of_draws(np.array(found) - TIME_CONSTANT_S, bound=noisier * train.bound_s())
 
 
 def _limits(runs: int, errors: dict[tuple[str, int], float], trains: list[Train]) -> Findings:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from skinrig.benchmarks.measurement import (
     Knobs,
     Point,
     StageBenchmark,
-    measure,
+    measured,
     processor_seconds,
 )
 from skinrig.benchmarks.resampling import median_error
@@ -38,67 +40,50 @@ FULL_SIDE_PX = 1024
 def inversion(*, toy: bool) -> StageBenchmark:
     """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
     side = 64 if toy else 192
-    rng = np.random.default_rng(0)
-    colors, prior, covariance = table(), shading_prior.of_faces(), model_error.load()
-    face = face_of("II", side, seed=3)
-    mask = oval(side)
-    blood = np.stack([face.hemoglobin(state) for state in STATE_NAMES]).astype(np.float64)
-    rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=rng)
-    valid = np.broadcast_to(mask, blood.shape)
-    truth = blood[1] - blood[0]
+    model = _Model(table(), shading_prior.of_faces(), model_error.load())
+    seen = _States.of("II", side, STATE_NAMES, model)
 
     def alone() -> Float64Array:
         each = [
             chromophore_posterior.estimate(
-                rgb[k],
-                colors,
-                prior=prior,
-                variance=variance[k],
-                model_error=covariance,
-                valid=mask,
+                seen.rgb[k],
+                model.colors,
+                prior=model.prior,
+                variance=seen.variance[k],
+                model_error=model.covariance,
+                valid=seen.mask,
             )
             for k in (0, 1)
         ]
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
     def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
-        return shared_melanin.estimate_shared_melanin(
-            rgb[:count],
-            colors,
-            prior=prior,
-            variance=variance[:count],
-            model_error=covariance,
-            valid=valid[:count],
-            shading_window_px=window,
+        return seen.together(count, window, model)
+
+    def point(
+        knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]
+    ) -> Point:
+        return measured(
+            knobs, call, lambda made: _error(seen.errors(change(made))), repeats=1, memory=False
         )
 
-    points = [_point({"way": "each alone", "states": 2}, alone, lambda: alone() - truth, mask)]
+    points = [point({"way": "each alone", "states": 2}, alone, lambda made: made)]
     settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
     if not toy:
         settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
     for count, window in settings:
-        points.append(
-            _point(
-                {"way": "together", "states": count, "light": "free" if window is None else window},
-                lambda count=count, window=window: together(count, window),  # type: ignore[misc]
-                lambda count=count, window=window: together(count, window).change[1] - truth,  # type: ignore[misc]
-                mask,
-            )
-        )
-    bands = {
-        name: _on_skin(band.preset, side, colors, prior, covariance)
-        for name, band in MELANIN_BANDS.items()
-    }
+        knobs: Knobs = {"way": "together", "states": count, "light": window or "free"}
+        points.append(point(knobs, lambda: together(count, window), lambda made: made.change[1]))
+    bands = {name: _on_skin(band.preset, side, model) for name, band in MELANIN_BANDS.items()}
     limits: Findings = {}
     if not toy:
         found = together(7, 3.0)
-        error = np.abs(found.change[1] - truth)[mask]
-        within = float(np.mean(error < 2.0 * found.stderr_change[1][mask]))
+        stated = found.stderr_change[1][seen.mask]
         limits = {
             "over_alone": points[0].error / points[4].error,
-            "within": within,
-            **_melanin_limits(colors, prior),
-            **_full_size(colors, prior, covariance),
+            "within": float(np.mean(seen.errors(found.change[1]) < 2.0 * stated)),
+            **_melanin_limits(model),
+            **_full_size(model),
         }
     return described("shared-melanin", points, limits, by_band=bands)
 
@@ -131,66 +116,92 @@ def pictures(
     return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
 
 
-def _on_skin(
-    preset: str, side: int, colors: ColorTable, prior: ShadingPrior, covariance: Float64Array
-) -> BandError:
+def _on_skin(preset: str, side: int, model: _Model) -> BandError:
     """Return the error of smile's change of blood on skin of a preset, three states together."""
-    face, mask = face_of(preset, side, seed=3), oval(side)
-    blood = np.stack([face.hemoglobin(state) for state in STATE_NAMES[:3]]).astype(np.float64)
-    rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
-    found = shared_melanin.estimate_shared_melanin(
-        rgb,
-        colors,
-        prior=prior,
-        variance=variance,
-        model_error=covariance,
-        valid=np.broadcast_to(mask, blood.shape),
-        shading_window_px=3.0,
-    )
-    return median_error(np.abs(found.change[1] - (blood[1] - blood[0]))[mask])
+    seen = _States.of(preset, side, STATE_NAMES[:3], model)
+    found = seen.together(3, 3.0, model)
+    return median_error(seen.errors(found.change[1]))
 
 
-def _point(
-    knobs: Knobs, call: Callable[[], object], error: Callable[[], Float64Array], mask: BoolArray
-) -> Point:
-    timing = measure(call, repeats=1, memory=False)
-    off = np.abs(error())[mask]
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """What inversions know of all faces."""
+
+    colors: ColorTable
+    prior: ShadingPrior
+    covariance: Float64Array
+
+    def invert(
+        self, rgb: Float32Array, variance: Float32Array, **options: Any
+    ) -> shared_melanin.SharedMelanin:
+        return shared_melanin.estimate_shared_melanin(
+            rgb,
+            self.colors,
+            prior=self.prior,
+            variance=variance,
+            model_error=self.covariance,
+            **options,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _States:
+    """Pictures of a face in states of its blood."""
+
+    rgb: Float32Array
+    variance: Float32Array
+    blood: Float64Array
+    mask: BoolArray
+
+    @classmethod
+    def of(cls, preset: str, side: int, names: Sequence[str], model: _Model) -> _States:
+        face = face_of(preset, side, seed=3)
+        blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
+        rng = np.random.default_rng(0)
+        seen = pictures(model.colors, face.melanin, blood, model.covariance, rng=rng)
+        return cls(*seen, blood, oval(side))
+
+    def together(
+        self, count: int, window: float | None, model: _Model
+    ) -> shared_melanin.SharedMelanin:
+        """Invert the first states together, the light smooth in a window, px, or free."""
+        valid = np.broadcast_to(self.mask, self.blood[:count].shape)
+        return model.invert(
+            self.rgb[:count], self.variance[:count], valid=valid, shading_window_px=window
+        )
+
+    def errors(self, change: Float64Array) -> Float64Array:
+        """Return how far the second state's change of blood is off, (n,)."""
+        return np.asarray(np.abs(change - (self.blood[1] - self.blood[0]))[self.mask])
+
+
+def _error(off: Float64Array) -> BandError:
+    """Return the median; its interval is by the density about it."""
     off = off[np.isfinite(off)]
-    middle = float(np.median(off))
-    # standard error of a median, by the density about it
     low, high = np.quantile(off, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(off.size))
-    return Point(knobs, timing, middle, (float(low), float(high)))
+    return BandError(float(np.median(off)), (float(low), float(high)))
 
 
-def _melanin_limits(colors: ColorTable, prior: ShadingPrior) -> Findings:
+def _melanin_limits(model: _Model) -> Findings:
     """Check how melanin's variance by noise goes with the number of states."""
     rng = np.random.default_rng(1)
     variances = {}
     for count in (1, 7):
-        clean = 0.6 * np.broadcast_to(colors.lookup(0.02, 0.025), (count, 4000, 3))
+        clean = 0.6 * np.broadcast_to(model.colors.lookup(0.02, 0.025), (count, 4000, 3))
         seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
         found = shared_melanin.estimate_shared_melanin(
-            seen, colors, prior=prior, variance=(2e-3 * clean) ** 2
+            seen, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
         )
         variances[count] = float(found.melanin.var())
     return {"melanin": variances[1] / variances[7]}
 
 
-def _full_size(colors: ColorTable, prior: ShadingPrior, covariance: Float64Array) -> Findings:
+def _full_size(model: _Model) -> Findings:
     """Time 7 states of a megapixel by a band of it."""
     rng = np.random.default_rng(2)
     band = 96
     melanin = np.full((band, FULL_SIDE_PX), 0.02)
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
-    rgb, variance = pictures(colors, melanin, blood, covariance, rng=rng)
-    run = partial(
-        shared_melanin.estimate_shared_melanin,
-        rgb,
-        colors,
-        prior=prior,
-        variance=variance,
-        model_error=covariance,
-        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-    )
-    whole = processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES
-    return {"seconds": whole}
+    seen = pictures(model.colors, melanin, blood, model.covariance, rng=rng)
+    run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
+    return {"seconds": processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

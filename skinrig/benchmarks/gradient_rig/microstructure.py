@@ -38,8 +38,10 @@ from skinrig.benchmarks.measurement import (
     Point,
     StageBenchmark,
     measure,
+    measure_and_keep,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import mean_error
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -124,108 +126,66 @@ def strained_relief(
     )
 
 
-def _judged(
-    made: Callable[[MicroSkin, StretchedSkin], Float32Array],
-    skins: list[MicroSkin],
-    settled: list[list[StretchedSkin]],
-) -> tuple[float, float, float]:
-    """Return the mean distance of normals, its standard error over skins, and slopes' variance's.
-
-    The last is the mean absolute logarithm of its ratio, along the jaws.
-    """
-    off, wrong = [], []
-    for skin, own in zip(skins, settled, strict=True):
-        for state in own:
-            there = slopes_under(state.height_um, state)
-            ours = slopes_under(made(skin, state), state)
-            off.append(
-                normal_histogram.distance(
-                    normal_histogram.from_slopes(*there), normal_histogram.from_slopes(*ours)
-                )
-            )
-            wrong.append(abs(math.log(ours[0].var() / there[0].var())))
-    by_skin = np.asarray(off).reshape(len(skins), -1).mean(axis=1)
-    spread = float(by_skin.std(ddof=1) / math.sqrt(len(skins))) if len(skins) > 1 else 0.0
-    return float(by_skin.mean()), spread, float(np.mean(wrong))
+def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, float]:
+    """Return the distance of normals from settled skin's, and |log| of the ratio of variances."""
+    there, ours = slopes_under(state.height_um, state), slopes_under(made, state)
+    distance = normal_histogram.distance(
+        normal_histogram.from_slopes(*there), normal_histogram.from_slopes(*ours)
+    )
+    return distance, abs(math.log(ours[0].var() / there[0].var()))
 
 
 def truth(*, toy: bool) -> StageBenchmark:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
-    size_mm = 0.8 if toy else 2.4
+    patch = partial(make_micro_skin, "forehead", size_mm=0.8 if toy else 2.4, texel_um=TEXEL_UM)
     states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STRETCHES
-    table = fitted_table(
-        [make_micro_skin("forehead", seed=1, size_mm=size_mm, texel_um=TEXEL_UM)],
-        states,
-        every=4 if toy else 1,
-    )
-    seeds = (7, 8) if toy else (7, 8, 9)
-    skins = [
-        make_micro_skin("forehead", seed=seed, size_mm=size_mm, texel_um=TEXEL_UM) for seed in seeds
+    table = fitted_table([patch(seed=1)], states, every=4 if toy else 1)
+    skins = [patch(seed=seed) for seed in ((7, 8) if toy else (7, 8, 9))]
+    ways: list[tuple[str, KernelTable | None, Sampling]] = [
+        ("none", None, "cubic"),
+        ("the paper's forehead", FOREHEAD, "cubic"),
+        ("fitted", table, "cubic"),
+        ("fitted", table, "linear"),
     ]
     points = []
-    errors: dict[tuple[str, str, str], float] = {}
-    variances: dict[tuple[str, str, str], float] = {}
+    found: dict[tuple[str, str, str], tuple[float, float]] = {}
     for angle, across in JAW_CONDITIONS[-1:] if toy else JAW_CONDITIONS:
-        settled = [
-            [
-                deform(skin, stretch=r, angle_deg=angle, compensation=across)
-                for r in (EVALUATED_STRETCHES[::3] if toy else EVALUATED_STRETCHES)
-            ]
+        pairs = [
+            (skin, deform(skin, stretch=r, angle_deg=angle, compensation=across))
             for skin in skins
-        ]
-        ways: list[tuple[str, KernelTable | None, Sampling]] = [
-            ("none", None, "cubic"),
-            ("the paper's forehead", FOREHEAD, "cubic"),
-            ("fitted", table, "cubic"),
-            ("fitted", table, "linear"),
+            for r in (EVALUATED_STRETCHES[::3] if toy else EVALUATED_STRETCHES)
         ]
         for name, kernels, sampling in ways:
             if sampling == "linear" and across == "none":
                 continue
-
-            def made(
-                skin: MicroSkin,
-                state: StretchedSkin,
-                kernels: KernelTable | None = kernels,
-                sampling: Sampling = sampling,
-            ) -> Float32Array:
-                if kernels is None:
-                    return skin.height_um
-                return strained_relief(skin, state, kernels, sampling)
-
-            def run(
-                made: Callable[..., Float32Array] = made,
-                settled: list[list[StretchedSkin]] = settled,
-            ) -> list[Float32Array]:
-                pairs = zip(skins, settled, strict=True)
-                return [made(skin, state) for skin, own in pairs for state in own]
-
-            timing = measure(run, repeats=1, memory=False)
-            error, spread, wrong = _judged(made, skins, settled)
-            errors[name, across, sampling], variances[name, across, sampling] = error, wrong
-            knobs: Knobs = {
-                "kernels": name,
-                "jaws_deg": angle,
-                "across": across,
-                "sampling": sampling,
-            }
-            also = {"variance_error_percent": 100.0 * math.expm1(wrong)}
-            interval = (error - spread, error + spread)
-            points.append(Point(knobs, timing, error, interval, also=also))
-
-    def left(of: dict[tuple[str, str, str], float], across: str) -> float:
-        return of["fitted", across, "cubic"] / of["none", across, "cubic"]
-
-    limits: Findings = {}
-    if not toy:
-        limits = {
-            "normals": left(errors, "none"),
-            "variance": left(variances, "none"),
-            "normals_volume": left(errors, "volume"),
-            "variance_volume": left(variances, "volume"),
-            **_full_size(),
-        }
-    return described("microstructure", points, limits)
+            timing, made = measure_and_keep(
+                lambda: [
+                    skin.height_um
+                    if kernels is None
+                    else strained_relief(skin, state, kernels, sampling)
+                    for skin, state in pairs
+                ],
+                repeats=1,
+                memory=False,
+            )
+            states_of = zip(made, pairs, strict=True)
+            off, wrong = np.array([_slope_errors(one, state) for one, (_, state) in states_of]).T
+            told = mean_error(off.reshape(len(skins), -1).mean(axis=1))
+            variance = float(np.mean(wrong))
+            found[name, across, sampling] = told.error, variance
+            knobs: Knobs = {"kernels": name, "jaws_deg": angle}
+            knobs |= {"across": across, "sampling": sampling}
+            also = {"variance_error_percent": 100.0 * math.expm1(variance)}
+            points.append(Point.of(knobs, timing, told, also))
+    if toy:
+        return described("microstructure", points)
+    kept, by_volume = (
+        np.divide(found["fitted", across, "cubic"], found["none", across, "cubic"]).tolist()
+        for across in ("none", "volume")
+    )
+    limits: Findings = {"normals": kept[0], "variance": kept[1]}
+    limits |= {"normals_volume": by_volume[0], "variance_volume": by_volume[1]}
+    return described("microstructure", points, limits | _full_size())
 
 
 def varying_fields(
@@ -447,38 +407,28 @@ def passes(*, toy: bool) -> StageBenchmark:
         values = (0.01, GRADUAL_CHANGE_PER_SIGMA, 0.05, 0.1, 0.2)
         tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
     points, errors = [], {}
-    draws = 2 if toy else 3
-    samplings: tuple[Sampling, ...] = ("cubic", "linear")
+    efforts: list[tuple[Sampling, list[tuple[float, float]]]] = [
+        ("cubic", tried),
+        ("linear", tried[::5]),
+    ]
     for sigma_px in (2.0,) if toy else (1.5, 3.0):
-        for sampling in samplings:
-            for turn, growth in tried if sampling == "cubic" else tried[::5]:
-                found = []
-                for seed in range(draws):
-                    error, call = two_passes_error(
-                        turn=turn,
-                        growth=growth,
-                        sigma_px=sigma_px,
-                        sampling=sampling,
-                        side=48 if toy else 160,
-                        rng=np.random.default_rng(seed),
-                    )
-                    found.append(100.0 * error)
-                mean = float(np.mean(found))
-                spread = float(np.std(found, ddof=1) / math.sqrt(draws)) if draws > 1 else 0.0
-                errors[sigma_px, sampling, turn, growth] = mean
-                points.append(
-                    Point(
-                        {
-                            "turn_rad_per_sigma": turn,
-                            "growth_per_sigma": growth,
-                            "sigma_px": sigma_px,
-                            "sampling": sampling,
-                        },
-                        measure(call, repeats=1, memory=False),
-                        mean,
-                        (mean - spread, mean + spread),
-                    )
+        for sampling, turn, growth in ((s, *pair) for s, pairs in efforts for pair in pairs):
+            found = []
+            for seed in range(2 if toy else 3):
+                error, call = two_passes_error(
+                    turn=turn,
+                    growth=growth,
+                    sigma_px=sigma_px,
+                    sampling=sampling,
+                    side=48 if toy else 160,
+                    rng=np.random.default_rng(seed),
                 )
+                found.append(100.0 * error)
+            told = mean_error(found)
+            errors[sigma_px, sampling, turn, growth] = told.error
+            knobs: Knobs = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
+            knobs |= {"sigma_px": sigma_px, "sampling": sampling}
+            points.append(Point.of(knobs, measure(call, repeats=1, memory=False), told))
     limits: Findings = {}
     if not toy:
         limits = {

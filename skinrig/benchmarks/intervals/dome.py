@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from model import metrics, store
+from model import metrics
 from model.skin import SkinAppearance
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import Trial
 from skinrig.benchmarks.intervals.trials import (
     delete_trial_outputs,
+    maps_of,
+    of_errors,
     of_map,
     of_normals,
-    truth_of,
     valid_of,
 )
 from skinrig.calibrating.calibrate import calibrate
@@ -55,18 +54,9 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
         done = simulate_session(
             "dome", folder / "session-subject", subject=preset, seed=seed, width_px=width_px
         )
-        pipeline.reconstruct(
-            done.session,
-            want=[*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES],
-            out=folder / "maps",
-            calibration=calibration,
-        )
-        yield from of_face(
-            store.read(folder / "maps"), store.read(truth_of(done)), f"{preset} {seed}"
-        )
-        delete_trial_outputs(folder, done)
-        for place in (*targets, calibration):
-            shutil.rmtree(place)
+        found, truth = maps_of(folder, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
+        yield from of_face(found, truth, f"{preset} {seed}")
+        delete_trial_outputs(folder, done, *targets, calibration)
 
 
 def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Iterator[Trial]:
@@ -87,6 +77,7 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
         for key in ("normals", "r_d")
     )
     band = str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(true_albedo))))
+    who: dict[str, Any] = {"subject": subject, "band": band}
     for name, quantity in NORMAL_MAP_NAMES.items():
         normals = found.maps[name]
         good = valid_of(normals)[pairs.rows, pairs.columns]
@@ -96,8 +87,7 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
                 quantity,
                 metrics.angular_error_rad(normals.values[at], true_normals[good]),
                 normals.stderr[at][:, 0].astype(np.float64),
-                subject=subject,
-                band=band,
+                **who,
                 factor_95=FACTORS_95["normals"],
             )
     albedo = found.maps["r_d"]
@@ -108,25 +98,11 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
     told[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(CHANNEL_NAMES):
         yield of_map(
-            f"R_d, {color}",
-            albedo,
-            true,
-            told,
-            subject=subject,
-            band=band,
-            channel=channel,
-            factor_95=FACTORS_95["R_d"],
+            f"R_d, {color}", albedo, true, told, **who, channel=channel, factor_95=FACTORS_95["R_d"]
         )
     off, stderr = lobe_strength(found, truth)
-    width = float(100.0 * np.median(stderr)) if stderr.size else float("nan")
-    yield Trial(
-        "light from the surface, dome",
-        subject,
-        band,
-        np.abs(off) / stderr,
-        width,
-        "%",
-        FACTORS_95["surface"],
+    yield of_errors(
+        "light from the surface, dome", np.abs(off), stderr, **who, factor_95=FACTORS_95["surface"]
     )
 
 

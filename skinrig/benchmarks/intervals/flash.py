@@ -9,22 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from capture.rig import load_rig
 from model import store
 from reconstruction.chromophores import shading_prior
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.benchmarks.intervals.coverage import Trial
 from skinrig.benchmarks.intervals.trials import (
     band_of,
     calibrated,
     delete_trial_outputs,
+    maps_of,
     of_map,
-    truth_of,
     valid_of,
 )
 from skinrig.evaluating import facial_color
@@ -93,15 +92,9 @@ def flash(
             states=("neutral", state) if moving else ("neutral",),
             nearer_mm=nearer_mm(seed),
         )
-        pipeline.reconstruct(
-            done.session,
-            want=["melanin", "hemoglobin"],
-            out=folder / "maps",
-            calibration=folder / "calibration",
-        )
-        found, truth = store.read(folder / "maps"), store.read(truth_of(done))
+        found, truth = maps_of(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5
-        band = band_of(truth, "reflectance_blurred", skin)
+        who: dict[str, Any] = {"subject": name, "band": band_of(truth, "reflectance_blurred", skin)}
         for quantity in ("melanin", "hemoglobin"):
             true = truth.maps[f"{quantity}_blurred"].values
             yield of_map(
@@ -109,19 +102,15 @@ def flash(
                 found.maps[quantity],
                 true,
                 skin,
-                subject=name,
-                band=band,
+                **who,
                 factor_95=FACTOR_95,
             )
         if moving:
-            yield from _of_rig(done, folder, state, subject=name, band=band)
+            yield from _of_rig(done, folder, state, **who)
         delete_trial_outputs(folder, done)
 
 
-def _of_rig(
-    done: Simulated, folder: Path, state: str, *, subject: str, band: str
-) -> Iterator[Trial]:
-
+def _of_rig(done: Simulated, folder: Path, state: str, **who: Any) -> Iterator[Trial]:
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
     except UnknownBloodError:
@@ -137,15 +126,5 @@ def _of_rig(
         return
     both = valid_of(rest) & valid_of(moved) & (moved.values > 0)
     change = moved.values.astype(np.float64) - rest.values
-    yield of_map(
-        "hemoglobin of the rig",
-        blood,
-        moved.values,
-        both,
-        subject=subject,
-        band=band,
-        factor_95=FACTOR_95,
-    )
-    yield of_map(
-        "change of hemoglobin", found, change, both, subject=subject, band=band, over=rest.values
-    )
+    yield of_map("hemoglobin of the rig", blood, moved.values, both, **who, factor_95=FACTOR_95)
+    yield of_map("change of hemoglobin", found, change, both, **who, over=rest.values)

@@ -9,31 +9,29 @@ other skin lead to narrower and stronger kernels.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from model import metrics, store
+from model import metrics
 from model.skin import SkinAppearance
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import deform
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.intervals.trials import (
-    ANY_BAND,
     delete_trial_outputs,
+    maps_of,
+    of_errors,
     of_normals,
-    truth_of,
     valid_of,
 )
 from skinrig.calibrating.calibrate import calibrate
@@ -74,13 +72,7 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
             angles=(0.0,),
             steps=(-MAX_STRETCH_STEP, MAX_STRETCH_STEP),
         )
-        pipeline.reconstruct(
-            done.session,
-            want=["normals", "height", "strain", "kernels"],
-            out=folder / "maps",
-            calibration=calibration,
-        )
-        found, truth = store.read(folder / "maps"), store.read(truth_of(done))
+        found, truth = maps_of(folder, done, ["normals", "height", "strain", "kernels"])
         state = next(
             key.removeprefix("normals_")
             for key in found.maps
@@ -102,27 +94,17 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
         good = valid_of(height) & valid_of(truth.maps[f"height_{state}"])
         if height.stderr is not None:
             stderr = height.stderr[good].astype(np.float64)
-            off = np.abs(height.values.astype(np.float64)[good] - relief[good]) / stderr
-            yield Trial(
-                "height", name, ANY_BAND, off, float(np.median(stderr)), "um", FACTORS_95["height"]
+            off = np.abs(height.values.astype(np.float64)[good] - relief[good])
+            yield of_errors(
+                "height", off, stderr, subject=name, unit="um", factor_95=FACTORS_95["height"]
             )
         # the neutral state is what stretch is told against: exact by definition
         rows = [row for row in compare_stretch(found, truth) if row.state != state]
         spread = np.array([row.stderr for row in rows])
-        width = float(100.0 * np.median(spread)) if rows else float("nan")
-        yield Trial(
-            "stretch ratio",
-            name,
-            ANY_BAND,
-            np.array([abs(row.error) for row in rows]) / spread,
-            width,
-            "%",
-            FACTORS_95["stretch"],
-        )
+        off = np.array([abs(row.error) for row in rows])
+        yield of_errors("stretch ratio", off, spread, subject=name, factor_95=FACTORS_95["stretch"])
         yield from _kernels(found, truth, site=site, seed=seed)
-        delete_trial_outputs(folder, done)
-        for place in (ball, calibration):
-            shutil.rmtree(place)
+        delete_trial_outputs(folder, done, ball, calibration)
 
 
 def _kernels(
@@ -134,33 +116,28 @@ def _kernels(
     known = truth.parameters["states"]
     states = {str(s["name"]): s for s in known} if isinstance(known, list) else {}
     pixel_um = float(str(found.parameters["pixel_um"]))
-    off: dict[str, list[float]] = {"alpha": [], "sigma": []}
-    widths: dict[str, list[float]] = {"alpha": [], "sigma": []}
+    off: dict[str, list[float]] = {"alpha": [], "sigma_um": []}
+    widths: dict[str, list[float]] = {"alpha": [], "sigma_um": []}
     for fit in fits:
         gradient = np.asarray(states[str(fit["name"])]["gradient"], np.float64)
         true = kernel_of_skin(
             site, seed=seed, stretch=float(np.linalg.norm(gradient[:, 0])), pixel_um=pixel_um
         )
-        for key, value, stated, likely, likely_95 in (
-            ("alpha", true.alpha, "alpha", "alpha_stderr", "alpha_95"),
-            ("sigma", true.sigma_um, "sigma_um", "sigma_stderr_um", "sigma_95_um"),
+        for key, half, half_95 in (
+            ("alpha", "alpha_stderr", "alpha_95"),
+            ("sigma_um", "sigma_stderr_um", "sigma_95_um"),
         ):
-            off[key].append(
-                deviation(
-                    abs(float(fit[stated]) - value), float(fit[likely]), float(fit[likely_95])
-                )
-            )
-            widths[key].append(float(fit[likely]))
-    for key, unit in (("alpha", ""), ("sigma", "um")):
-        width = float(np.median(widths[key])) if widths[key] else float("nan")
-        yield Trial(
-            f"{key} of kernels",
-            f"{site} {seed}",
-            ANY_BAND,
+            error = abs(float(fit[key]) - getattr(true, key))
+            off[key].append(deviation(error, float(fit[half]), float(fit[half_95])))
+            widths[key].append(float(fit[half]))
+    for key, unit in (("alpha", ""), ("sigma_um", "um")):
+        yield of_errors(
+            f"{key.removesuffix('_um')} of kernels",
             np.array(off[key]),
-            width,
-            unit,
-            GAUSSIAN_95,
+            np.ones(len(off[key])),
+            subject=f"{site} {seed}",
+            unit=unit,
+            widths=np.array(widths[key]),
         )
 
 

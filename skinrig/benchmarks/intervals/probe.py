@@ -10,16 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from model import store
 from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
 from rigsim.subject.pigment import MELANIN_PRESETS
-from skinrig.arrays import Float64Array
-from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, truth_of
+from skinrig.benchmarks.intervals.coverage import Trial
+from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, maps_of, of_errors
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
@@ -62,7 +59,7 @@ def probe(
     """
     for seed, medium in media.items():
         done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
-        found, truth = _maps(folder, done, "subsurface")
+        found, truth = maps_of(folder, done, ["subsurface"])
         name = f"{medium} {seed}"
         yield of_decay("sigma_tr of media", found, truth, subject=name, band=ANY_BAND)
         for coefficient in COEFFICIENT_LABELS:
@@ -70,13 +67,13 @@ def probe(
         delete_trial_outputs(folder, done)
     for seed, preset in (skin or {}).items():
         done = _subject(folder, preset, seed)
-        found, truth = _maps(folder, done, "subsurface")
+        found, truth = maps_of(folder, done, ["subsurface"])
         band = melanin_band_of(preset)
         yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
         delete_trial_outputs(folder, done)
     for seed, medium in (directed or {}).items():
         done = _subject(folder, medium, seed, sites=("cheek",), angles=(N_DIRECTIONS,))
-        found, truth = _maps(folder, done, "anisotropy")
+        found, truth = maps_of(folder, done, ["anisotropy"])
         yield from of_directions(found, truth, _farthest_deg(medium), f"{medium} {seed}")
         delete_trial_outputs(folder, done)
 
@@ -155,9 +152,7 @@ def of_decay(
     half = np.array([0.5 * np.log(fit.interval[1] / fit.interval[0]) for fit in fits])
     center = np.array([0.5 * np.log(fit.interval[1] * fit.interval[0]) for fit in fits])
     true = np.log(np.array([fit.truth for fit in fits]))
-    return Trial(
-        quantity, subject, band, np.abs(center - true) / half, _width(half), "%", GAUSSIAN_95
-    )
+    return of_errors(quantity, np.abs(center - true), half, subject=subject, band=band)
 
 
 def of_coefficient(
@@ -186,16 +181,7 @@ def of_coefficient(
             value = evaluation.number(fit[f"{name}_per_mm"])
             off.append(abs(value / true[CHANNEL_NAMES.index(fit["channel"])] - 1.0))
             stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
-    spread = np.array(stderr)
-    return Trial(
-        COEFFICIENT_LABELS[name],
-        subject,
-        ANY_BAND,
-        np.array(off) / spread,
-        _width(spread),
-        "%",
-        GAUSSIAN_95,
-    )
+    return of_errors(COEFFICIENT_LABELS[name], np.array(off), np.array(stderr), subject=subject)
 
 
 def of_directions(
@@ -224,41 +210,14 @@ def of_directions(
     )
     turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
     stderr = np.array([row["axis_stderr_deg"] for row in rows])
-    yield Trial(
-        "axis of anisotropy",
-        subject,
-        ANY_BAND,
-        turn / stderr,
-        float(np.median(stderr)) if len(rows) else float("nan"),
-        "degrees",
-        GAUSSIAN_95,
-    )
+    yield of_errors("axis of anisotropy", turn, stderr, subject=subject, unit="degrees")
     ratio = np.array([true.ratio[CHANNEL_NAMES.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
     spread = np.array([row["ratio_stderr"] for row in rows])
-    yield Trial(
-        "ratio of anisotropy",
-        subject,
-        ANY_BAND,
-        off / spread,
-        _width(spread / ratio),
-        "%",
-        GAUSSIAN_95,
-    )
-
-
-def _maps(folder: Path, done: Simulated, want: str) -> tuple[SkinAppearance, SkinAppearance]:
-    pipeline.reconstruct(
-        done.session, want=[want], out=folder / "maps", calibration=folder / "calibration"
-    )
-    return store.read(folder / "maps"), store.read(truth_of(done))
+    yield of_errors("ratio of anisotropy", off, spread, subject=subject, widths=spread / ratio)
 
 
 def _farthest_deg(medium: str) -> float:
     """Return the direction in which light goes farthest: where it is scattered least."""
     strength, axis_deg = (float(number) for number in medium.split(",")[2:4])
     return axis_deg if strength < 0.0 else axis_deg + 90.0
-
-
-def _width(relative: Float64Array) -> float:
-    return float(100.0 * np.median(relative)) if relative.size else float("nan")

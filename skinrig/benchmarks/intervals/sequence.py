@@ -71,19 +71,12 @@ def sequences(
             landmarks=truth / "landmarks.csv",
         )
         told = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
-        subject, band = f"{preset} {seed}", _band(truth)
+        who: dict[str, Any] = {"subject": f"{preset} {seed}", "band": _band(truth)}
         fits = list(told["fits"].values())
-        yield of_fits(f"time constant after {state}", fits, constant_s, subject=subject, band=band)
+        yield of_fits(f"time constant after {state}", fits, constant_s, **who)
         course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
         if "reaction_s" in course:
-            yield of_fits(
-                f"delay of {state}",
-                fits,
-                course["reaction_s"],
-                subject=subject,
-                band=band,
-                delay=True,
-            )
+            yield of_fits(f"delay of {state}", fits, course["reaction_s"], **who, delay=True)
         delete_trial_outputs(folder, done)
 
 

@@ -8,13 +8,15 @@ compared with the truth that the simulator wrote.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
+from model.store import read
+from reconstruction.pipeline.recipes import reconstruct
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, RAYLEIGH_95, Trial
 from skinrig.calibrating.calibrate import calibrate
@@ -47,6 +49,34 @@ def valid_of(skin_map: SkinMap) -> BoolArray:
     """Return where a map means something, (H, W)."""
     shape = skin_map.values.shape[:2]
     return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def of_errors(
+    quantity: str,
+    off: FloatArray,
+    half: FloatArray,
+    *,
+    subject: str,
+    band: str = ANY_BAND,
+    unit: str = "%",
+    widths: FloatArray | None = None,
+    factor_95: float = GAUSSIAN_95,
+) -> Trial:
+    """Compare errors with the half widths of their 68 % intervals.
+
+    Parameters
+    ----------
+    quantity, subject, band, unit, factor_95
+        Of the trial; widths in "%" are taken for fractions.
+    off, half
+        (n,): sizes of errors, and half widths.
+    widths
+        Half widths as the trial shows them; None: `half`.
+    """
+    shown = half if widths is None else widths
+    to_unit = 100.0 if unit == "%" else 1.0
+    width = float(to_unit * np.median(shown)) if shown.size else float("nan")
+    return Trial(quantity, subject, band, np.asarray(off / half), width, unit, factor_95)
 
 
 def of_map(
@@ -94,8 +124,16 @@ def of_map(
     truth = np.asarray(true, np.float64)[part]
     whole = truth if over is None else np.asarray(over, np.float64)[part]
     with np.errstate(divide="ignore"):  # what is nothing has a width of infinity
-        width = float(100.0 * np.median(stderr / np.abs(whole))) if value.size else float("nan")
-    return Trial(quantity, subject, band, np.abs(value - truth) / stderr, width, "%", factor_95)
+        relative = np.asarray(stderr / np.abs(whole))
+    return of_errors(
+        quantity,
+        np.abs(value - truth),
+        stderr,
+        subject=subject,
+        band=band,
+        widths=relative,
+        factor_95=factor_95,
+    )
 
 
 def of_normals(
@@ -118,9 +156,16 @@ def of_normals(
     stderr_rad
         (n,): standard error of each of two directions across.
     """
-    reach = RAYLEIGH_68 * stderr_rad
-    width = float(np.degrees(np.median(reach))) if reach.size else float("nan")
-    return Trial(quantity, subject, band, angle_rad / reach, width, "degrees", factor_95)
+    reach = np.degrees(RAYLEIGH_68 * stderr_rad)
+    return of_errors(
+        quantity,
+        np.degrees(angle_rad),
+        reach,
+        subject=subject,
+        band=band,
+        unit="degrees",
+        factor_95=factor_95,
+    )
 
 
 def calibrated(rig: str, folder: Path, targets: Mapping[str, str], *, width_px: int | None) -> None:
@@ -157,9 +202,17 @@ def truth_of(done: Simulated) -> Path:
     return done.truth
 
 
-def delete_trial_outputs(folder: Path, done: Simulated) -> None:
-    """Take a subject's folders away: the next one's have their names."""
-    for place in (done.session, folder / "maps", folder / "moving"):
+def maps_of(
+    folder: Path, done: Simulated, want: Sequence[str]
+) -> tuple[SkinAppearance, SkinAppearance]:
+    """Reconstruct a subject's maps into a folder's `maps`; return them and the truth."""
+    reconstruct(done.session, want=want, out=folder / "maps", calibration=folder / "calibration")
+    return read(folder / "maps"), read(truth_of(done))
+
+
+def delete_trial_outputs(folder: Path, done: Simulated, *others: Path) -> None:
+    """Take a subject's folders away, and others: the next one's have their names."""
+    for place in (done.session, folder / "maps", folder / "moving", *others):
         shutil.rmtree(place, ignore_errors=True)
     for place in folder.glob("truth-subject*"):
         shutil.rmtree(place)

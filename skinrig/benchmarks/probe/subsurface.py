@@ -20,10 +20,10 @@ from skinrig.benchmarks.measurement import (
     Knobs,
     Point,
     StageBenchmark,
-    measure,
+    measure_and_keep,
     processor_seconds,
 )
-from skinrig.benchmarks.resampling import median_error
+from skinrig.benchmarks.resampling import drawn_again, median_error
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
@@ -88,10 +88,10 @@ def tiers(*, toy: bool) -> StageBenchmark:
     ]
     points = []
     limits: Findings = {}
+    best = np.zeros(1)
     for method, part in chosen:
-
-        def fit(method: Method = method, part: slice = part) -> subsurface.SubsurfaceFit:
-            return subsurface.invert(
+        timing, found = measure_and_keep(
+            lambda: subsurface.invert(
                 FIBER_RADII_MM[part],
                 noisy[..., part],
                 variance=variance[..., part],
@@ -100,10 +100,9 @@ def tiers(*, toy: bool) -> StageBenchmark:
                 core_mm=FIBER_CORE_MM,
                 source_core_mm=FIBER_CORE_MM,
                 common_error=RELATIVE_COMMON_ERROR,
-            )
-
-        timing = measure(fit, repeats=1 if toy else 3)
-        found = fit()
+            ),
+            repeats=1 if toy else 3,
+        )
         relative = found.sigma_tr_per_mm / sigma_tr - 1.0
         if not bands:
             bands = {
@@ -111,38 +110,17 @@ def tiers(*, toy: bool) -> StageBenchmark:
                 for k, name in enumerate(MELANIN_BANDS)
             }
         error = np.abs(relative[:, spread])
-        bias = np.median(relative[:, spread], axis=0)
-        interval = _over_media(error)
+        told = BandError(float(np.median(error)), _over_media(error))
         radius = FIBER_RADII_MM[part]
-        knobs: Knobs = {
-            "model": method,
-            "fibres": radius.size,
-            "from mm": float(radius[0]),
-            "to mm": float(radius[-1]),
-        }
-        points.append(Point(knobs, timing, float(np.median(error)), interval))
-        if part != slice(None):
-            continue
-        inside = (found.interval_per_mm[..., 0] <= sigma_tr) & (
-            sigma_tr <= found.interval_per_mm[..., 1]
-        )
-        inside = inside[:, spread]
-        # 60...76 %, and what the simulation's own error makes ten media's share scatter
-        share = float(inside.mean())
-        if method == "photon_table":
-            limits |= {
-                "median": float(np.median(error)),
-                "worst": float(np.median(error, axis=0).max()),
-                "inside": share,
-                "inside_most": share,
-            }
-            best = float(np.median(np.abs(bias)))
-        elif method == "dipole":
-            limits |= {
-                "least_bias": float(bias.max()),
-                "greatest_bias": float(bias.min()),
-                "over_table": float(np.median(np.abs(bias))) / max(best, 1e-9),
-            }
+        knobs: Knobs = {"model": method, "fibres": radius.size}
+        knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
+        points.append(Point.of(knobs, timing, told))
+        if part == slice(None):
+            bias = np.median(relative[:, spread], axis=0)
+            low, high = np.moveaxis(found.interval_per_mm, -1, 0)
+            inside = ((low <= sigma_tr) & (sigma_tr <= high))[:, spread]
+            best = bias if method == "photon_table" else best
+            limits |= _tier_limits(method, error, bias, inside, best)
     return described(
         "subsurface-fit",
         points,
@@ -152,12 +130,32 @@ def tiers(*, toy: bool) -> StageBenchmark:
     )
 
 
+def _tier_limits(
+    method: Method, error: Float64Array, bias: Float64Array, inside: BoolArray, best: Float64Array
+) -> Findings:
+    """Return what is found of a model with all fibres; `best` is the photon table's bias."""
+    if method == "dipole":
+        over_table = float(np.median(np.abs(bias))) / max(float(np.median(np.abs(best))), 1e-9)
+        return {
+            "least_bias": float(bias.max()),
+            "greatest_bias": float(bias.min()),
+            "over_table": over_table,
+        }
+    if method != "photon_table":
+        return {}
+    # 60...76 %, and what the simulation's own error makes ten media's share scatter
+    share = float(inside.mean())
+    return {
+        "median": float(np.median(error)),
+        "worst": float(np.median(error, axis=0).max()),
+        "inside": share,
+        "inside_most": share,
+    }
+
+
 def _over_media(error: Float64Array) -> tuple[float, float]:
     """Return a 68 % interval of the median of errors (draws, media), of other media."""
-    rng = np.random.default_rng(0)
-    chosen = rng.integers(0, error.shape[1], (200, error.shape[1]))
-    low, high = np.quantile(np.median(error[:, chosen], axis=(0, 2)), [0.16, 0.84])
-    return float(low), float(high)
+    return drawn_again(error.T, lambda again, axis: np.median(again, axis=(axis, 2)))
 
 
 def _least_error(
@@ -211,17 +209,13 @@ def batches(*, toy: bool) -> StageBenchmark:
     drawn = np.abs(_least_error(a, s, variance) * rng.standard_normal(count))
     for model_error in (0.0, None):
         for n in (count // 10, count):
-            timing = measure(
-                lambda n=n, e=model_error: ours(n, e),  # type: ignore[misc]
-                repeats=1 if toy else 3,
-            )
-            error = np.abs(ours(n, model_error).sigma_tr_per_mm / k[:n] - 1.0)
-            told = median_error(error)
-            own = "none" if model_error == 0.0 else "diffusion's"
-            knobs: Knobs = {"profiles": n, "model error": own}
+            timing, made = measure_and_keep(lambda: ours(n, model_error), repeats=1 if toy else 3)
+            error = np.abs(made.sigma_tr_per_mm / k[:n] - 1.0)
             # the bound is that of noise alone: an error that is allowed for is not in these data
             bound = float(np.median(drawn[:n])) if model_error == 0.0 else None
-            points.append(Point(knobs, timing, told.error, told.error_interval, bound))
+            own = "none" if model_error == 0.0 else "diffusion's"
+            told = median_error(error, bound=bound)
+            points.append(Point.of({"profiles": n, "model error": own}, timing, told))
             if not bands and n == count:
                 bands = {
                     name: median_error(error[some], bound=float(np.median(drawn[some])))

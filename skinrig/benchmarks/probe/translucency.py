@@ -25,9 +25,11 @@ from skinrig.benchmarks.measurement import (
     measure,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import rms_of_draws
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Way = Literal["sigma_tr", "profiles"]
+WAYS: tuple[Way, ...] = ("sigma_tr", "profiles")
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 Medium = tuple[float, float]
@@ -124,30 +126,15 @@ def directions(*, toy: bool) -> StageBenchmark:
     cases = 12 if toy else 200
     points: list[Point] = []
     errors: dict[tuple[Way, int], float] = {}
-    ways: tuple[Way, ...] = ("sigma_tr", "profiles")
     for count in (5, 16) if toy else (5, 8, 16, 32, 64):
         angle = _directions(count)
         profiles = _profiles(angle, TRUE_RATIO, cases, rng=rng)
         one = profiles[:, :3]  # three channels of one measurement
-        for way in ways:
-            timing = measure(
-                lambda way=way, angle=angle, one=one: _told(way, angle, one),  # type: ignore[misc]
-                repeats=1 if toy else 3,
-                memory=False,
-            )
-            h = np.log(_told(way, angle, profiles).ratio)
-            error = float(np.sqrt(((h - math.log(TRUE_RATIO)) ** 2).mean()))
-            errors[way, count] = error
-            spread = error / math.sqrt(2.0 * (cases - 1))
-            points.append(
-                Point(
-                    {"way": way, "directions": count},
-                    timing,
-                    error,
-                    (error - spread, error + spread),
-                    _bound(count),
-                )
-            )
+        for way in WAYS:
+            timing = measure(lambda: _told(way, angle, one), repeats=1 if toy else 3, memory=False)
+            told = _ratio_error(_told(way, angle, profiles), _bound(count))
+            errors[way, count] = told.error
+            points.append(Point.of({"way": way, "directions": count}, timing, told))
     bands = {
         name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
         for name, band in MELANIN_BANDS.items()
@@ -160,10 +147,13 @@ def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator
     """Return the error of comparing profiles of skin that absorbs like this."""
     angle = _directions(count)
     profiles = _profiles(angle, TRUE_RATIO, cases, medium=medium, rng=rng)
-    h = np.log(_told("profiles", angle, profiles, medium=medium).ratio)
-    error = float(np.sqrt(((h - math.log(TRUE_RATIO)) ** 2).mean()))
-    spread = error / math.sqrt(2.0 * (cases - 1))
-    return BandError(error, (error - spread, error + spread), _bound(count, medium))
+    return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(count, medium))
+
+
+def _ratio_error(told: anisotropy.Anisotropy, bound: float) -> BandError:
+    """Return the error of the log of the ratio, of cases of which one is used up."""
+    off = np.log(told.ratio) - math.log(TRUE_RATIO)
+    return rms_of_draws(off, bound=bound, freedom=len(told.ratio) - 1)
 
 
 def _direction_limits(
@@ -175,8 +165,7 @@ def _direction_limits(
     limits: Findings = {}
     # an outlier left out by mistake may add its own rate
     most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
-    ways: tuple[Way, ...] = ("sigma_tr", "profiles")
-    for way in ways:
+    for way in WAYS:
         alarms = float((_told(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
         limits["alarms", str(cases), way] = (alarms, most)
     return {
@@ -213,7 +202,6 @@ def sites(*, toy: bool) -> StageBenchmark:
     )
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
     points = []
-    within = 0.0
     size = 64 if toy else 1024
     for count, uv in layouts.items():
         if toy and count == 16:
@@ -231,27 +219,16 @@ def sites(*, toy: bool) -> StageBenchmark:
             inside.append((np.abs(off) < deviation).mean())
         three = np.repeat(seen, 3, axis=1)
         timing = measure(
-            lambda uv=uv, three=three: translucency.interpolate(  # type: ignore[misc]
-                uv, three, SITE_ERROR * three, (size, size)
-            ),
+            lambda: translucency.interpolate(uv, three, SITE_ERROR * three, (size, size)),
             repeats=1 if toy else 3,
             memory=not toy,
         )
-        error = math.sqrt(float(np.mean(squares)))
+        error, bound = (math.sqrt(float(np.mean(part))) for part in (squares, stated))
         spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
-        bound = math.sqrt(float(np.mean(stated)))
-        points.append(
-            Point(
-                {"sites": count, "side": size},
-                timing,
-                error,
-                (error - spread, error + spread),
-                bound,
-            )
-        )
+        told = BandError.around(error, spread, bound)
+        points.append(Point.of({"sites": count, "side": size}, timing, told))
         if count == 3:
-            within = float(np.mean(inside))
-            three_sites = error
+            within, three_sites = float(np.mean(inside)), error
     limits: Findings = {}
     if not toy:
         times, mismatch = _beside_scikit_learn(prior, named)
