@@ -41,6 +41,11 @@ class Timing:
     no_memory: str = "this system does not tell"
     """Why it was not measured, where it was not."""
 
+    @classmethod
+    def single(cls, seconds: float, peak_memory_mb: float | None = None, **memory: Any) -> Timing:
+        """Return the timing of a call made a single time: cold and warm are one."""
+        return cls(seconds, (seconds, seconds), seconds, peak_memory_mb, **memory)
+
 
 def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = True) -> Timing:
     """Time ``call``: once cold, ``repeats`` times warm, and once more for its memory.
@@ -137,7 +142,7 @@ def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
         start = time.perf_counter()
         made = call()
         seconds = time.perf_counter() - start
-    return Timing(seconds, (seconds, seconds), seconds, rise.mb, "resident"), made
+    return Timing.single(seconds, rise.mb, memory_of="resident"), made
 
 
 def _allocated_mb(call: Callable[[], Any]) -> float:

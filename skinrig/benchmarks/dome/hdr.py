@@ -20,7 +20,6 @@ from skinrig.benchmarks.measurement import (
 )
 
 GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
-MAX_RATIO_TO_BOUND = 1.05
 N_FRAMES, FULL_SIDE_PX = 23, 1024
 EXPOSURE_RANGE_S = (1e-3, 1.0)
 

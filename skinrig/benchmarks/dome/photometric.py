@@ -26,7 +26,6 @@ from skinrig.benchmarks.measurement import (
 from skinrig.benchmarks.resampling import drawn_again
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-MAX_FIT_S = 3.0
 SAMPLE_NOISE = 0.005
 """Standard deviation of every sample; a white pixel that faces a light is 1."""
 

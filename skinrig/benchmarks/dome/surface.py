@@ -58,8 +58,7 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
         # samples of a point err alike: blocks of points are drawn
         blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
         told = BandError(float(off.mean()), blocks.error_interval)
-        timing = Timing(spent, (spent, spent), spent, peak)
-        points.append(Point.of({"points": count, "tables": kind}, timing, told))
+        points.append(Point.of({"points": count, "tables": kind}, Timing.single(spent, peak), told))
     return described("lumitexels", points, {"memory": peak, "hours": rate * N_FULL_SAMPLES / 3600})
 
 

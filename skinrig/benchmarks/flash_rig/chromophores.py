@@ -19,7 +19,6 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 CHANNEL_NOISE = 0.01
 MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
-MIN_SPEEDUP_OVER_LEAST_SQUARES = 1000.0
 
 
 def inversion(*, toy: bool) -> StageBenchmark:

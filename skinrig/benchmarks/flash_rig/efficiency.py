@@ -48,8 +48,6 @@ SUBJECT_CHROMOPHORES: Final = {
     "VI": (0.17, 0.05),
 }
 """Melanin and hemoglobin of typical skin."""
-MAX_RATIO_TO_BOUND = 1.2
-"""Mean squared error over the bound that is aimed at."""
 MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
 """Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
 cut off, and a bound on unbiased ones says nothing of it. Below the second the color bends within

@@ -30,8 +30,6 @@ REACTION_S = 0.16
 REST_BLOOD, BLOOD_NOISE = 0.03, 4e-4
 BLOOD_CHANGES = (0.0065, -0.002, 0.001, 0.004, 0.009)
 """Change of blood of the five places; the noise is that of a disc of 12 px of a small picture."""
-MAX_FIT_S = 1.0
-"""Most processor time of a fit of five places in 44 frames."""
 
 
 @dataclass(frozen=True, slots=True)

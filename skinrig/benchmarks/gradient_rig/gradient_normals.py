@@ -28,9 +28,10 @@ from skinrig.benchmarks.measurement import (
     Knobs,
     Point,
     StageBenchmark,
-    measure,
+    measured,
     processor_seconds,
 )
+from skinrig.benchmarks.resampling import drawn_again
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]
@@ -141,17 +142,13 @@ def vectors_alone(images: Images) -> Float64Array:
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def _judged(
-    normals: FloatArray, valid: BoolArray, truth: Float64Array, seed: int = 0
-) -> tuple[float, tuple[float, float]]:
+def _judged(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> BandError:
     inner = (slice(IGNORED_BORDER_PX, -IGNORED_BORDER_PX),) * 2
     good = valid[inner]
     error = np.degrees(angular_error_rad(normals[inner][good], truth[inner][good]))
     # neighbours share their error: blocks of lines are drawn, not pixels
-    rng = np.random.default_rng(seed)
     parts = [part.mean() for part in np.array_split(error, 64) if part.size]
-    means = rng.choice(parts, (200, len(parts))).mean(axis=1)
-    return float(error.mean()), (float(np.quantile(means, 0.16)), float(np.quantile(means, 0.84)))
+    return BandError(float(error.mean()), drawn_again(parts, np.mean))
 
 
 def normals(*, toy: bool) -> StageBenchmark:
@@ -164,19 +161,20 @@ def normals(*, toy: bool) -> StageBenchmark:
     told = {"lights": patch.lights, **patch.geometry}
 
     def add(knobs: Knobs, images: Images, **options: Any) -> float:
-        def run() -> NormalMaps:
-            return from_patterns(images, **options)
+        def error(found: NormalMaps) -> BandError:
+            told = _judged(found.normals, found.valid, patch.seen)
+            if "variance" not in options or {"wiener", "smooth_px"} & set(options):
+                return told
+            # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
+            rms = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
+            return replace(told, cramer_rao_bound=rms)
 
         knobs.setdefault("noise", "the sensor's")
-        timing = measure(run, repeats=1 if toy else 3)
-        found = run()
-        error, interval = _judged(found.normals, found.valid, patch.seen)
-        bound = None
-        if "variance" in options and not ({"wiener", "smooth_px"} & set(options)):
-            # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
-            bound = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
-        points.append(Point(knobs, timing, error, interval, bound))
-        return error
+        repeats = 1 if toy else 3
+        points.append(
+            measured(knobs, lambda: from_patterns(images, **options), error, repeats=repeats)
+        )
+        return points[-1].error
 
     subsets = {
         "16": PATTERN_NAMES,
@@ -230,16 +228,13 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
         wiener=True,
         **patch.geometry,
     )
-    return BandError(*_judged(found.normals, found.valid, patch.seen))
+    return _judged(found.normals, found.valid, patch.seen)
 
 
 def _limits(worst: float, rng: np.random.Generator) -> Findings:
     smooth = skin_patch(128, smooth=True)
     found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
-    against = {
-        "lens' resolution": _judged(found.normals, found.valid, smooth.seen)[0],
-        "as it is": _judged(found.normals, found.valid, smooth.sharp)[0],
-    }
+    against = {"lens' resolution": smooth.seen, "as it is": smooth.sharp}
     big = {
         key: np.tile(image, (16, 16)).astype(np.float32)
         for key, image in exposed(smooth, rng).items()
@@ -249,7 +244,10 @@ def _limits(worst: float, rng: np.random.Generator) -> Findings:
     with threadpool_limits(1):
         peer_s = processor_seconds(lambda: vectors_alone(big))
     return {
-        **{("clean", name): error for name, error in against.items()},
+        **{
+            ("clean", name): _judged(found.normals, found.valid, true).error
+            for name, true in against.items()
+        },
         "noisy": worst,
         "seconds": ours_s,
         "slowdown": LIMIT_CORES * ours_s / peer_s,

@@ -33,7 +33,6 @@ from skinrig.benchmarks.resampling import mean_error
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
-MIN_SPEEDUP_OVER_NUMPY = 100.0
 FULL_SIDE_PX = 2000
 N_PEER_CANDIDATES = 3
 """Candidates of the straightforward search that are timed; it is extrapolated to the grid."""

@@ -56,7 +56,6 @@ JAW_CONDITIONS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
 )
 """Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
 width, and where it does not, both passes act."""
-MIN_SPEEDUP_OVER_NUMPY = 5.0
 FULL_SIDE_PX = 4096
 PEER_ROWS = 256
 """Rows of the full map that the straightforward convolution is timed on."""

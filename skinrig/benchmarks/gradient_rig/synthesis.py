@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import fft
@@ -15,7 +15,14 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Knobs,
+    Point,
+    StageBenchmark,
+    measure,
+    measure_and_keep,
+)
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384
@@ -115,57 +122,37 @@ def growth(*, toy: bool) -> StageBenchmark:
     ]
     truth = slope_histogram(patches)
     halves = [slope_histogram(patches[part::2]) for part in (0, 1)]
-    knobs = (
-        ((24, 8, 4), (32, 12, 4), (40, 16, 4))
-        if toy
-        else (
-            (64, 32, 16),
-            (96, 32, 16),
-            (128, 64, 16),
-            (192, 64, 1),
-            (192, 64, 16),
-            (192, 64, 64),
-            (256, 64, 16),
-            (256, 128, 16),
-        )
-    )
+    efforts = [(24, 8, 4), (32, 12, 4), (40, 16, 4)]
+    if not toy:
+        efforts = [(64, 32, 16), (96, 32, 16), (128, 64, 16), *((192, 64, n) for n in (1, 16, 64))]
+        efforts += [(256, 64, 16), (256, 128, 16)]
     points = []
-    for cell, overlap, tried in knobs:
-        made: list[Float32Array] = []
-
-        def run(
-            cell: int = cell,
-            overlap: int = overlap,
-            tried: int = tried,
-            made: list[Float32Array] = made,
-        ) -> None:
-            made[:] = [
-                displacement_synthesis.grow(
-                    patches,
-                    side,
-                    rng=np.random.default_rng(1),
-                    cell_px=cell,
-                    overlap_px=overlap,
-                    candidates=tried,
-                )
-            ]
-
-        timing = measure(run, repeats=1, memory=(cell, tried) == (knobs[-1][0], knobs[-1][2]))
-        about: Knobs = {"method": "cut", "cell": cell, "overlap": overlap, "candidates": tried}
-        points.append(_point(about, timing, made[0], truth))
+    for cell, overlap, tried in efforts:
+        timing, grown = measure_and_keep(
+            lambda: displacement_synthesis.grow(
+                patches,
+                side,
+                rng=np.random.default_rng(1),
+                cell_px=cell,
+                overlap_px=overlap,
+                candidates=tried,
+            ),
+            repeats=1,
+            memory=(cell, tried) == (efforts[-1][0], efforts[-1][2]),
+        )
+        knobs: Knobs = {"method": "cut", "cell": cell, "overlap": overlap, "candidates": tried}
+        points.append(Point.of(knobs, timing, _error(grown, truth)))
     edge = 40 if toy else 128
-
-    theirs: list[Float32Array] = []
-
-    def peer() -> None:
-        theirs[:] = [blended(patches, side, edge_px=edge, rng=np.random.default_rng(1))]
-
-    timing = measure(peer, repeats=1, memory=False)
-    points.append(_point({"method": "blend", "cell": edge}, timing, theirs[0], truth))
+    timing, theirs = measure_and_keep(
+        lambda: blended(patches, side, edge_px=edge, rng=np.random.default_rng(1)),
+        repeats=1,
+        memory=False,
+    )
+    points.append(Point.of({"method": "blend", "cell": edge}, timing, _error(theirs, truth)))
     return described(
         "displacement-synthesis",
         points,
-        {} if toy else _judged(patches, truth, theirs[0]),
+        {} if toy else _judged(patches, truth, theirs),
         reference_error=normal_histogram.halved_distance(*halves),
         count=count,
         size_mm=size_mm,
@@ -173,29 +160,21 @@ def growth(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _point(
-    knobs: Mapping[str, str | int | float | bool],
-    timing: Timing,
-    height: Float32Array,
-    truth: Float64Array,
-) -> Point:
-    """Return a point with the spread of its quarters as the error's interval."""
+def _error(height: Float32Array, truth: Float64Array) -> BandError:
+    """Return the error of a map with the spread of its quarters as the interval."""
     error = normal_histogram.halved_distance(slope_histogram([height]), truth)
     half = height.shape[0] // 2
+    halves = (slice(None, half), slice(half, None))
     quarters = [
-        normal_histogram.histogram(part, pixel=PIXEL_UM)
-        for part in (
-            height[:half, :half],
-            height[:half, half:],
-            height[half:, :half],
-            height[half:, half:],
-        )
+        normal_histogram.histogram(height[rows, columns], pixel=PIXEL_UM)
+        for rows in halves
+        for columns in halves
     ]
     left_out = [
         normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
     ]
     spread = float(np.sqrt(0.75 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return Point(knobs, timing, error, (max(error - spread, 0.0), error + spread))
+    return BandError(error, (max(error - spread, 0.0), error + spread))
 
 
 def _judged(patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array) -> Findings:

@@ -41,7 +41,6 @@ FURROWS_PER_FACE = 16
 """Furrows over the height of the face, if it had them everywhere."""
 MAX_SLOPE = 0.6
 FULL_SIDE_PX = 2048
-MIN_SPEEDUP_OVER_NUMPY = 5.0
 NORMAL_NOISE_RAD = 0.02
 ENCODINGS: tuple[tuple[Any, Any], ...] = (
     ("float32", "float32"),

@@ -17,14 +17,14 @@ from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
 from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import drawn_again
 
 PROBE_SEED = 5
 LIGHT_DECADES = 7.0
 EXPOSURE_COUNTS = (1, 2, 3, 5, 8, 12, 23)
 N_NOISE_DRAWS = 6
 """Series of each number of exposures, of one probe with new noise."""
-MAX_RATIO_TO_BOUND = 1.15
 
 Frames = list[UInt16Array]
 
@@ -49,38 +49,25 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
     bench = _bench(draws=2 if toy else N_NOISE_DRAWS)
     points = []
-    away: Float64Array = np.zeros(0)
-    relative: Float64Array = np.zeros(0)
-    bound: Float64Array = np.ones(1)
     for count in (1, 3, 8, 23) if toy else EXPOSURE_COUNTS:
         chosen = _spread(len(bench.times), count)
 
-        def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FiberReadings:
-            return _read(bench, chosen, draw)
-
-        results = [call(draw=draw) for draw in range(len(bench.frames))]
-        valid = np.array([r.valid for r in results])
-        signal = np.array([r.signal for r in results])
-        stderr = np.array([r.stderr for r in results])
-        # what is saturated in every exposure is not known at all
-        miss = np.where(valid, np.abs(signal / bench.truth - 1), 1.0)
-        low, high = _interval(miss.reshape(len(miss), -1))
-        bound = np.sqrt(_bound(bench, chosen)) / bench.truth
-        known = np.isfinite(bound)
-        points.append(
-            Point(
-                {"exposures": count},
-                measure(call, repeats=1 if toy else 3),
-                100 * float(np.median(miss)),
-                (100 * low, 100 * high),
-                # the median of a normal distribution's size is 0.674 of its deviation
-                67.4 * float(np.median(np.where(known, bound, 1 / 0.674))),
-                {
-                    "exposed_s": round(float(bench.times[chosen].sum()), 1),
-                    "measured_percent": round(100 * float(valid.mean()), 1),
-                },
-            )
+        results = [_read(bench, chosen, draw) for draw in range(len(bench.frames))]
+        valid, signal, stderr = (
+            np.array([getattr(r, name) for r in results]) for name in ("valid", "signal", "stderr")
         )
+        # what is saturated in every exposure is not known at all
+        miss = 100 * np.where(valid, np.abs(signal / bench.truth - 1), 1.0)
+        bound = np.sqrt(_bound(bench, chosen)) / bench.truth
+        # the median of a normal distribution's size is 0.674 of its deviation
+        least = 67.4 * float(np.median(np.where(np.isfinite(bound), bound, 1 / 0.674)))
+        timing = measure(lambda: _read(bench, chosen, 0), repeats=1 if toy else 3)
+        also = {
+            "exposed_s": round(float(bench.times[chosen].sum()), 1),
+            "measured_percent": round(float(100 * valid.mean()), 1),
+        }
+        told = BandError(float(np.median(miss)), _interval(miss.reshape(len(miss), -1)), least)
+        points.append(Point.of({"exposures": count}, timing, told, also))
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
     near = bench.truth.ravel() > 1e-5 * bench.truth.max()
@@ -188,8 +175,4 @@ def _spread(total: int, count: int) -> list[int]:
 
 def _interval(sizes: Float64Array) -> tuple[float, float]:
     """Return a bootstrap interval over fibres of the median of all draws (draws, F), 68 %."""
-    rng = np.random.default_rng(0)
-    chosen = rng.integers(0, sizes.shape[1], (400, sizes.shape[1]))
-    again = np.median(sizes[:, chosen], axis=(0, 2))
-    low, high = np.quantile(again, [0.16, 0.84])
-    return float(low), float(high)
+    return drawn_again(sizes.T, lambda again, axis: np.median(again, axis=(axis, 2)), draws=400)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,9 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
-from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.resampling import drawn_again
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -33,7 +32,8 @@ BAND_G = 0.8
 
 def session(*, toy: bool) -> StageBenchmark:
     """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
-    with _bench() as folder:
+    with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as name:
+        folder = Path(name)
         simulate_session(
             "probe", folder / "session-phantom", target="phantom", seed=FIRST_MEDIUM_SEED
         )
@@ -58,18 +58,9 @@ def session(*, toy: bool) -> StageBenchmark:
         valid = [row for row in rows if row.method == method and row.valid]
         for channel in ("all", *sorted({row.channel for row in valid})):
             sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
-            points.append(
-                Point(
-                    {
-                        "method": method,
-                        "channel": channel,
-                        "media": len({row.name for row in rows}),
-                    },
-                    timing,
-                    100 * float(np.median(sizes)),
-                    _interval(sizes),
-                )
-            )
+            knobs: Knobs = {"method": method, "channel": channel}
+            knobs["media"] = len({row.name for row in rows})
+            points.append(Point.of(knobs, timing, _error(sizes)))
     return described("probe-session", points, {} if toy else _limits(by_method), by_band=bands)
 
 
@@ -133,19 +124,10 @@ def _captured(folder: Path, name: str, coefficients: tuple[float, float, float],
 def _best(rows: list[evaluation.FitError]) -> BandError:
     """Return the error of the usual method over the channels of one medium, %."""
     sizes = [abs(row.relative) for row in rows if row.method == METHOD_NAMES[0] and row.valid]
-    return BandError(100 * float(np.median(sizes)), _interval(sizes))
+    return _error(sizes)
 
 
-def _interval(sizes: list[float]) -> tuple[float, float]:
-    """Return a bootstrap interval of a median in percent, 68 %."""
-    rng = np.random.default_rng(0)
-    values: Float64Array = np.array(sizes)
-    again = np.median(values[rng.integers(0, len(values), (400, len(values)))], axis=1)
-    low, high = np.quantile(again, [0.16, 0.84])
-    return 100 * float(low), 100 * float(high)
-
-
-@contextmanager
-def _bench() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as folder:
-        yield Path(folder)
+def _error(sizes: list[float]) -> BandError:
+    """Return the median in percent, with its interval."""
+    percent = 100 * np.array(sizes)
+    return BandError(float(np.median(percent)), drawn_again(percent, draws=400))

@@ -32,7 +32,6 @@ RELATIVE_FIBER_ERROR, RELATIVE_COMMON_ERROR = 0.012, 0.01
 """Relative errors of a calibration: of each fibre, and common to all."""
 DARK_NOISE_PER_MM2 = 1e-8
 """Noise of a reading in the dark."""
-MIN_SPEEDUP_OVER_LEAST_SQUARES = 300.0
 N_BATCH_PROFILES = 30_000
 N_PEER_FITS = 60
 """SciPy fits that are timed; their time is extrapolated to the batch."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,18 @@ from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.measurement import (
+    BandError,
+    Knobs,
+    Point,
+    StageBenchmark,
+    Timing,
+    measure,
+    measure_and_keep,
+    measured,
+    processor_seconds,
+)
+from skinrig.benchmarks.resampling import drawn_again
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 FULL_SIDE_PX = 512
@@ -86,58 +98,41 @@ def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
     points = []
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
         tree = SourceTree.of(scene.place, scene.area)
-
-        def run(tree: SourceTree = tree, tolerance: float = tolerance) -> Float64Array:
-            return _gathered(scene, tree, tolerance)
-
-        timing = measure(run, repeats=1)
-        error = (run()[at] - truth) / (scene.r_d[at] * scene.entered.max())
-        points.append(
-            Point(
-                {"scene": "face", "texels": side**2, "tolerance": tolerance},
-                timing,
-                *_rms(error, rng),
-            )
-        )
+        timing, found = measure_and_keep(lambda: _gathered(scene, tree, tolerance), repeats=1)
+        error = (found[at] - truth) / (scene.r_d[at] * scene.entered.max())
+        knobs: Knobs = {"scene": "face", "texels": side**2, "tolerance": tolerance}
+        points.append(Point.of(knobs, timing, _rms(error, rng)))
     direct = measure(lambda: _directly(scene, at[:10]), repeats=1, memory=False)
-    scale = side**2 / 10
-    points.append(
-        Point(
-            {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"},
-            Timing(
-                direct.seconds * scale,
-                (direct.seconds * scale,) * 2,
-                direct.cold_s,
-                None,
-                no_memory="its seconds are extrapolated from those of 10 points",
-            ),
-            0.0,
-            (0.0, 0.0),
-        )
-    )
+    seconds = direct.seconds * side**2 / 10
+    why = "its seconds are extrapolated from those of 10 points"
+    timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory=why)
+    knobs = {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"}
+    points.append(Point.of(knobs, timing, BandError.around(0.0, 0.0)))
     return points
 
 
 def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
-    media = [
-        Media.of(r, t, eta=ETA_SKIN) for r, t in zip(MEAN_R_D, MEAN_TRANSLUCENCY_MM, strict=True)
-    ]
-    truth = np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
+    truth = _edge_truth(MEAN_R_D, MEAN_TRANSLUCENCY_MM)
     points = []
     for step in (0.8, 0.4) if toy else (1.6, 0.8, 0.4, 0.2):
         for known in (False, True):
-
-            def run(step: float = step, known: bool = known) -> Float64Array:
-                return _edge(step, known)
-
-            timing = measure(run, repeats=1)
-            knobs = {
-                "scene": "a shadow's edge",
-                "edge": "own light" if known else "sources alone",
-                "source mm": step,
-            }
-            points.append(Point(knobs, timing, *_rms(run() - truth, rng)))
+            knobs: Knobs = {"scene": "a shadow's edge"}
+            knobs |= {"edge": "own light" if known else "sources alone", "source mm": step}
+            points.append(
+                measured(
+                    knobs,
+                    lambda: _edge(step, known),
+                    lambda found: _rms(found - truth, rng),
+                    repeats=1,
+                )
+            )
     return points
+
+
+def _edge_truth(r_d: Float64Array, translucency_mm: Float64Array) -> Float64Array:
+    """Return the true profile of a shadow's edge in three channels, (X, 3)."""
+    media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(r_d, translucency_mm, strict=True)]
+    return np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
 
 
 def _bands(rng: np.random.Generator) -> dict[str, BandError]:
@@ -148,10 +143,7 @@ def _bands(rng: np.random.Generator) -> dict[str, BandError]:
             3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
         )
         skin = band.reflectance(), MEAN_TRANSLUCENCY_MM / MEAN_TRANSLUCENCY_MM[0] / sigma_tr
-        media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(*skin, strict=True)]
-        truth = np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
-        error, interval = _rms(_edge(BAND_STEP_MM, True, skin=skin) - truth, rng)
-        found[name] = BandError(error, interval)
+        found[name] = _rms(_edge(BAND_STEP_MM, True, skin=skin) - _edge_truth(*skin), rng)
     return found
 
 
@@ -173,11 +165,9 @@ def _edge(
     at = np.stack(
         [EDGE_POSITIONS_MM, 0.3 * EDGE_POSITIONS_MM, np.zeros_like(EDGE_POSITIONS_MM)], axis=-1
     )
-    own = (
-        np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64) if known else None
-    )
+    own = np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64)
     tree = SourceTree.of(place, np.full(len(place), step_mm**2))
-    found = gather(tree, lit, at, *skin, entered_at=own)
+    found = gather(tree, lit, at, *skin, entered_at=own if known else None)
     return np.asarray(found.exitance / skin[0])
 
 
@@ -199,22 +189,20 @@ def _directly(scene: Scene, at: NDArray[np.intp]) -> Float64Array:
         )
 
 
-def _rms(error: Float64Array, rng: np.random.Generator) -> tuple[float, tuple[float, float]]:
+def _rms(error: Float64Array, rng: np.random.Generator) -> BandError:
     """Return the root mean square in percent with its 68 % bootstrap interval over points."""
     square = (error**2).mean(axis=-1)
-    means = square[rng.integers(0, len(square), (200, len(square)))].mean(axis=1)
-    low, high = 100.0 * np.sqrt(np.quantile(means, (0.16, 0.84)))
-    return float(100.0 * np.sqrt(square.mean())), (float(low), float(high))
+    low, high = 100.0 * np.sqrt(drawn_again(square, np.mean, rng=rng))
+    return BandError(float(100.0 * np.sqrt(square.mean())), (float(low), float(high)))
 
 
 def _full_size(rng: np.random.Generator) -> Findings:
     """Gather 512 x 512 texels at as many exit points, and some of them directly."""
     scene = face(FULL_SIDE_PX)
-    spent = []
-    for _ in range(2):
-        begin = time.process_time()
-        found = _gathered(scene, SourceTree.of(scene.place, scene.area))
-        spent.append(time.process_time() - begin)
+    gathered = partial(_gathered, scene)
+    spent_s = processor_seconds(lambda: gathered(SourceTree.of(scene.place, scene.area)), 2)
+    tree = SourceTree.of(scene.place, scene.area)
+    found = gathered(tree)
     at = rng.choice(len(scene.area), 80, replace=False)
     begin = time.process_time()
     truth = _directly(scene, at)
@@ -222,22 +210,18 @@ def _full_size(rng: np.random.Generator) -> Findings:
     seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.entered.max())[at]
     relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
     even = gather(
-        SourceTree.of(scene.place, scene.area),
-        np.ones_like(scene.entered),
-        scene.place[at],
-        scene.r_d[at],
-        scene.translucency_mm[at],
+        tree, np.ones_like(scene.entered), scene.place[at], scene.r_d[at], scene.translucency_mm[at]
     ).exitance
     plane = _plane_level()
     return {
-        "seconds": min(spent),
+        "seconds": spent_s,
         "local": float(100.0 * np.quantile(relative, 0.95)),
         "largest": float(
             100.0 * np.max(np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))
         ),
         "even": float(np.max(np.abs(even / scene.r_d[at] - 1.0))),
         "plane": 100.0 * plane,
-        "speed_up": peer_s / min(spent),
+        "speed_up": peer_s / spent_s,
     }
 
 

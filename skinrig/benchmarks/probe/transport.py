@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
+from functools import partial
 from math import inf, log, pi, sqrt
 from typing import Any
 
@@ -21,7 +23,7 @@ from skinrig.benchmarks.measurement import (
     Knobs,
     Point,
     StageBenchmark,
-    measure,
+    measure_and_keep,
 )
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
@@ -106,57 +108,32 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
     if probe is None:
         raise ValueError("rig: the probe's rig has no probe")
     radii = np.array(probe.radius_mm)
-    stack = LayerStack(
-        (Layer(inf, RED_MEDIUM_PER_MM[0], RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G), MEDIUM_G, ETA),)
-    )
-    points = []
+    stack = _half_space(*RED_MEDIUM_PER_MM)
+    points: list[Point] = []
+    told = partial(measure_and_keep, repeats=1, memory=None)
     for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
-
-        def next_event(photons: int = photons) -> Any:
-            return fibre_profile(
-                stack,
-                radii_mm=radii,
-                photons=photons,
-                rng=np.random.default_rng(1),
-                threads=LIMIT_CORES,
-            )
-
-        timing = measure(next_event, repeats=1, memory=None)
-        run = next_event()
-        relative = 100.0 * run.stderr / run.reflectance_per_mm2
-        knobs: Knobs = {"quantity": "fibres", "score": "next event"}
-        points.append(_point(knobs | {"photons": photons}, timing, relative))
+        timing, run = told(lambda: _next_event(stack, radii, photons))
+        knobs: Knobs = {"quantity": "fibres", "score": "next event", "photons": photons}
+        points.append(Point.of(knobs, timing, _worst(run.stderr / run.reflectance_per_mm2)))
     for photons in (1000, 2000) if toy else (80_000, 320_000):
-
-        def in_the_cone(photons: int = photons) -> Float64Array:
-            return _in_the_cone(radii, photons)
-
-        timing = measure(in_the_cone, repeats=1, memory=None)
-        relative = in_the_cone()
-        knobs = {"quantity": "fibres", "score": "leaves in the cone"}
-        points.append(_point(knobs | {"photons": photons}, timing, relative))
+        timing, relative = told(lambda: _in_the_cone(radii, photons))
+        knobs = {"quantity": "fibres", "score": "leaves in the cone", "photons": photons}
+        points.append(Point.of(knobs, timing, _worst(relative)))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
-
-        def all_angles(engine: Any = engine) -> Any:
-            photons = 2000 if toy else 400_000
-            return transport(medium, photons=photons, rng=np.random.default_rng(2), engine=engine)
-
-        try:
-            timing = measure(all_angles, repeats=1, memory=None)
-        except ValueError:  # no LLVM on this machine
-            continue
-        total = all_angles()
-        error = 100.0 * total.reflectance_stderr / total.reflectance
-        spread = error / sqrt(2.0 * (total.batches - 1))
-        points.append(
-            Point(
-                {"quantity": "all that leaves", "engine": engine, "photons": total.photons},
-                timing,
-                error,
-                (error - spread, error + spread),
+        with suppress(ValueError):  # no LLVM on this machine
+            timing, total = told(
+                lambda: transport(
+                    medium,
+                    photons=2000 if toy else 400_000,
+                    rng=np.random.default_rng(2),
+                    engine=engine,
+                )
             )
-        )
+            error = 100.0 * total.reflectance_stderr / total.reflectance
+            knobs = {"quantity": "all that leaves", "engine": engine, "photons": total.photons}
+            spread = error / sqrt(2.0 * (total.batches - 1))
+            points.append(Point.of(knobs, timing, BandError.around(error, spread)))
     return described(
         "photon-transport",
         points,
@@ -169,29 +146,31 @@ def _bands(radii: Float64Array, *, photons: int) -> dict[str, BandError]:
     """Return the error of as many photons in skin that absorbs little and much."""
     found = {}
     for name, band in MELANIN_BANDS.items():
-        layer = Layer(
-            inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - MEDIUM_G), MEDIUM_G, ETA
+        run = _next_event(
+            _half_space(band.sigma_a_per_mm, band.sigma_s_prime_per_mm), radii, photons
         )
-        run = fibre_profile(
-            LayerStack((layer,)),
-            radii_mm=radii,
-            photons=photons,
-            rng=np.random.default_rng(1),
-            threads=LIMIT_CORES,
-        )
-        point = _point({}, None, 100.0 * run.stderr / run.reflectance_per_mm2)
-        found[name] = BandError(point.error, point.error_interval)
+        found[name] = _worst(run.stderr / run.reflectance_per_mm2)
     return found
 
 
-def _point(knobs: Knobs, timing: Any, relative: Float64Array) -> Point:
-    worst = float(np.nan_to_num(relative, nan=100.0, posinf=100.0).max())
-    spread = worst / sqrt(2.0 * 19.0)  # of a standard error from 20 batches
-    return Point(knobs, timing, worst, (worst - spread, worst + spread))
+def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> LayerStack:
+    return LayerStack((Layer(inf, sigma_a, sigma_s_prime / (1.0 - MEDIUM_G), MEDIUM_G, eta),))
+
+
+def _next_event(stack: LayerStack, radii: Float64Array, photons: int) -> Any:
+    """Return what the fibres see by next event."""
+    rng = np.random.default_rng(1)
+    return fibre_profile(stack, radii_mm=radii, photons=photons, rng=rng, threads=LIMIT_CORES)
+
+
+def _worst(relative: Float64Array) -> BandError:
+    """Return the largest relative standard error, %, of 20 batches."""
+    worst = float(100.0 * np.nan_to_num(relative, nan=1.0, posinf=1.0).max())
+    return BandError.around(worst, worst / sqrt(2.0 * 19.0))
 
 
 def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
-    """Return relative standard errors, %, of the plain walk in rings as wide as the fibres."""
+    """Return relative standard errors of the plain walk in rings as wide as the fibres."""
     rings = np.zeros((20, 2 * len(radii)))
     edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
     for batch, row in enumerate(rings):
@@ -210,9 +189,7 @@ def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
         row[: counted.size] = counted
     seen = rings[:, 0 : 2 * len(radii) : 2]
     mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(20.0)
-    return np.asarray(
-        100.0 * np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
-    )
+    return np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
 
 
 def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
@@ -253,9 +230,7 @@ def _against_volpath(radii: Float64Array) -> Findings:
     # Where light came in one run or none the error is not known: it is taken as that of one run,
     # 100 %, which flatters the peer.
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
-    stack = LayerStack(
-        (Layer(inf, RED_MEDIUM_PER_MM[0], RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G), MEDIUM_G, 1.0),)
-    )
+    stack = _half_space(*RED_MEDIUM_PER_MM, eta=1.0)
     ours_s, run = _spent(
         lambda: fibre_profile(
             stack,

@@ -10,11 +10,13 @@ from capture.rig import load_rig
 from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
 from skinrig.benchmarks.description import described
 from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing
-from skinrig.benchmarks.resampling import tiled_rms
+from skinrig.benchmarks.resampling import drawn_again, tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.reference import Way
+
+WHY_NO_MEMORY = "three ways take turns in one process, each with its scene held"
 
 
 def render(*, toy: bool) -> StageBenchmark:
@@ -25,17 +27,6 @@ def render(*, toy: bool) -> StageBenchmark:
     """
     width, lights = (64, 2) if toy else (1300, 4)
     points = []
-
-    def add(name: str, rays: int, way: Way) -> None:
-        timing = Timing(
-            way.seconds,
-            (way.seconds, way.seconds),
-            way.seconds,
-            None,
-            no_memory="three ways take turns in one process, each with its scene held",
-        )
-        told = _error(way)
-        points.append(Point({"way": name, "rays": rays}, timing, told.error, told.error_interval))
 
     efforts = (1, 2) if toy else (1, 3, 2)
     fine = 4 if toy else 6
@@ -48,7 +39,9 @@ def render(*, toy: bool) -> StageBenchmark:
             rounds=2 if subpixels == efforts[-1] else 1,
         )
         for name in ("ours", "path", "direct"):
-            add(name, subpixels**2, getattr(found, name))
+            way = getattr(found, name)
+            timing = Timing.single(way.seconds, no_memory=WHY_NO_MEMORY)
+            points.append(Point.of({"way": name, "rays": subpixels**2}, timing, _error(way)))
     bands = {
         name: _on_skin(band.preset, 64 if toy else 650, fine)
         for name, band in MELANIN_BANDS.items()
@@ -68,9 +61,9 @@ def render(*, toy: bool) -> StageBenchmark:
 def _error(way: Way) -> BandError:
     """Return a way's error in percent, with its interval over tiles."""
     error, tiles = 100.0 * way.error, way.squared_by_tile
-    rng = np.random.default_rng(0)
-    again = np.sqrt(rng.choice(tiles, (200, len(tiles))).mean(axis=1) / tiles.mean())
-    low, high = error * np.quantile(again, [0.16, 0.84])
+    low, high = error * np.array(
+        drawn_again(tiles, lambda again, axis: np.sqrt(again.mean(axis=axis) / tiles.mean()))
+    )
     return BandError(error, (min(float(low), error), max(float(high), error)))
 
 

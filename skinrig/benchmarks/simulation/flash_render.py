@@ -17,10 +17,9 @@ from rigsim.scenes.flash.polarizer_reference import (
 )
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import BandError, StageBenchmark, measured
 from skinrig.benchmarks.resampling import tiled_rms
 
-MIN_SPEEDUP_OVER_MITSUBA = 8.0
 REFERENCE_RAYS = 144
 
 
@@ -33,24 +32,25 @@ def render(*, toy: bool) -> StageBenchmark:
     truth = closed_forms(rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5))
     ours, theirs = [], []
     for subpixels, samples in efforts:
-
-        def by_closed_forms(subpixels: int = subpixels) -> dict[str, Float32Array]:
-            return closed_forms(rig, view, caster, subpixels=subpixels)
-
-        def by_mitsuba(samples: int = samples) -> dict[str, Float32Array]:
-            return {
-                name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
-                for k, name in enumerate(ANALYZER_AXIS_DEG)
-            }
-
-        timing = measure(by_closed_forms, memory=None)
-        told = _worse(by_closed_forms(), truth)
-        knobs: Knobs = {"way": "closed form", "subpixels": subpixels}
-        ours.append(Point(knobs, timing, told.error, told.error_interval))
-        timing = measure(by_mitsuba, memory=None)
-        told = _worse(by_mitsuba(), truth)
-        knobs = {"way": "mitsuba", "samples": samples}
-        theirs.append(Point(knobs, timing, told.error, told.error_interval))
+        ours.append(
+            measured(
+                {"way": "closed form", "subpixels": subpixels},
+                lambda: closed_forms(rig, view, caster, subpixels=subpixels),
+                lambda found: _worse(found, truth),
+                memory=None,
+            )
+        )
+        theirs.append(
+            measured(
+                {"way": "mitsuba", "samples": samples},
+                lambda: {
+                    name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
+                    for k, name in enumerate(ANALYZER_AXIS_DEG)
+                },
+                lambda found: _worse(found, truth),
+                memory=None,
+            )
+        )
     limits: Findings = {}
     if not toy:
         final = polarizer_reference(width_px=width, samples=efforts[-1][1], subpixels=1)

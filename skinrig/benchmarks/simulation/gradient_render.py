@@ -9,6 +9,7 @@ import numpy as np
 
 from rigsim.as_built.sphere import PATTERN_WEIGHTS
 from rigsim.scenes.gradient.reference import (
+    Way,
     judge,
     picture,
     plain_scene,
@@ -16,13 +17,16 @@ from rigsim.scenes.gradient.reference import (
     rendered,
     traced,
 )
+from rigsim.skin_patch.microrelief import MicroSkin
+from skinrig.arrays import Float64Array, Int64Array
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, Timing
 
-MIN_SPEEDUP_OVER_MITSUBA = 25.0
 N_LIT_CONDITIONS = 14
 """Of the 16 conditions two are dark; Mitsuba is not asked to render those."""
+
+BEST_KNOBS: Knobs = {"way": "moments", "subpixels": 2, "sectors": 32, "table": 65}
 
 
 def render(*, toy: bool) -> StageBenchmark:
@@ -38,34 +42,8 @@ def render(*, toy: bool) -> StageBenchmark:
     pixels = np.sort(rng.choice(width * width, 200 if toy else 1500, replace=False))
     plain = plain_scene(skin, width_px=width)
     reference, _ = traced(plain, pixels, subpixels=2 if toy else 4)
-    points: list[Point] = []
-
-    def add(knobs: Knobs, seconds: float, error: float, memory: float | None) -> None:
-        spread = error / math.sqrt(2.0 * len(pixels))
-        timing = Timing(seconds, (seconds, seconds), seconds, memory, "resident")
-        interval = (100.0 * (error - spread), 100.0 * (error + spread))
-        points.append(Point(knobs, timing, 100.0 * error, interval))
-
-    picture(plain_scene(skin, width_px=width, table_size=17), pixels)  # compiles
-    settings = [(1, 16, 33), (1, 32, 65), (2, 32, 65)]
-    if not toy:
-        settings += [(1, 32, 129), (2, 16, 65), (2, 64, 65), (3, 32, 65)]
-    ours = {}
-    for subpixels, sectors, table in settings:
-        scene = plain_scene(
-            skin, width_px=width, subpixels=subpixels, sectors=sectors, table_size=table
-        )
-        with resident_memory.watched() as rise:
-            begin = time.process_time()
-            scene.lighting()
-            found = picture(scene, pixels)
-            spent = time.process_time() - begin
-        way = judge(found, reference, spent)
-        ours[subpixels, sectors, table] = way
-        knobs: Knobs = {"way": "moments"}
-        knobs |= {"subpixels": subpixels, "sectors": sectors, "table": table}
-        add(knobs, spent, way.error, rise.mb)
-    without = judge(picture(plain_scene(skin, width_px=width, shadows=False), pixels), reference, 0)
+    ours, without = _by_moments(skin, width, pixels, reference, toy=toy)
+    points = [_point(knobs, way.seconds, way.error, mb, len(pixels)) for knobs, way, mb in ours]
     theirs = {}
     for samples in (4,) if toy else (16, 64):
         ways = []
@@ -77,8 +55,9 @@ def render(*, toy: bool) -> StageBenchmark:
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
         seconds = N_LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
         theirs[samples] = (seconds, error, ways)
-        add({"way": "Mitsuba", "samples": samples}, seconds, error, rise.mb)
-    best = ours[2, 32, 65]
+        knobs: Knobs = {"way": "Mitsuba", "samples": samples}
+        points.append(_point(knobs, seconds, error, rise.mb, len(pixels)))
+    best = next(way for knobs, way, _ in ours if knobs == BEST_KNOBS)
     samples = max(theirs)
     peer_s, peer_error, ways = theirs[samples]
     at_equal_error = peer_s * (peer_error / best.error) ** 2
@@ -90,3 +69,36 @@ def render(*, toy: bool) -> StageBenchmark:
         "shadows": without.error / best.error,
     }
     return described("render-gradient", points, {} if toy else limits)
+
+
+def _by_moments(
+    skin: MicroSkin, width: int, pixels: Int64Array, reference: Float64Array, *, toy: bool
+) -> tuple[list[tuple[Knobs, Way, float | None]], Way]:
+    """Return our ways with their knobs and MB, and the usual one without shadows."""
+    picture(plain_scene(skin, width_px=width, table_size=17), pixels)  # compiles
+    settings = [(1, 16, 33), (1, 32, 65), (2, 32, 65)]
+    if not toy:
+        settings += [(1, 32, 129), (2, 16, 65), (2, 64, 65), (3, 32, 65)]
+    ours = []
+    for subpixels, sectors, table in settings:
+        scene = plain_scene(
+            skin, width_px=width, subpixels=subpixels, sectors=sectors, table_size=table
+        )
+        with resident_memory.watched() as rise:
+            begin = time.process_time()
+            scene.lighting()
+            found = picture(scene, pixels)
+            spent = time.process_time() - begin
+        knobs: Knobs = {"way": "moments", "subpixels": subpixels}
+        knobs |= {"sectors": sectors, "table": table}
+        ours.append((knobs, judge(found, reference, spent), rise.mb))
+    bare = picture(plain_scene(skin, width_px=width, shadows=False), pixels)
+    return ours, judge(bare, reference, 0)
+
+
+def _point(
+    knobs: Knobs, seconds: float, error: float, memory_mb: float | None, pixels: int
+) -> Point:
+    timing = Timing.single(seconds, memory_mb, memory_of="resident")
+    told = BandError.around(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
+    return Point.of(knobs, timing, told)

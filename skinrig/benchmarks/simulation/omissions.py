@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rigsim.needs.flash import LATERAL_EFFECT
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
 
@@ -31,19 +31,14 @@ def omissions(*, toy: bool) -> StageBenchmark:
     points = []
     limits: Findings = {}
     for one in found:
-        spent = one.without_s
-        timing = Timing(spent, (spent, spent), spent, None, no_memory=WHY_NO_MEMORY)
-        knobs: Knobs = {
-            "rig": one.rig,
-            "subject": one.subject,
-            "effect": one.effect,
-            "verdict": one.verdict,
-        }
+        timing = Timing.single(one.without_s, no_memory=WHY_NO_MEMORY)
+        knobs: Knobs = {"rig": one.rig, "subject": one.subject}
+        knobs |= {"effect": one.effect, "verdict": one.verdict}
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
         if one.told is not None:
             also["told by the rule"] = one.told
         interval = (max(one.found - one.uncertain, 0.0), one.found + one.uncertain)
-        points.append(Point(knobs, timing, one.found, interval, also=also))
+        points.append(Point.of(knobs, timing, BandError(one.found, interval), also))
         if one.verdict == "negligible":
             limits["change", one.rig, one.subject, one.effect] = one.at_most
     built = [one for one in found if one.verdict == "built"]

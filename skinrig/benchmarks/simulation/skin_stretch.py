@@ -12,6 +12,7 @@ from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, si
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.resampling import mean_error
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
@@ -35,30 +36,25 @@ def stretched(*, toy: bool) -> StageBenchmark:
     seeds = range(2 if toy else 3)
     skins = [make_micro_skin("forehead", seed=seed, size_mm=size) for seed in seeds]
     points = []
+    tolerances = (0.1, FORCE_TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, FORCE_TOLERANCE, 1e-3)
     for stretch in (0.8, 1.25):
         truth = [
             _variance(deform(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
             for s in skins
         ]
-        for tolerance in (
-            (0.1, FORCE_TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, FORCE_TOLERANCE, 1e-3)
-        ):
-
-            def run(stretch: float = stretch, tolerance: float = tolerance) -> list[StretchedSkin]:
-                return [
+        for tolerance in tolerances:
+            timing, states = measure_and_keep(
+                lambda: [
                     deform(s, stretch=stretch, angle_deg=90.0, tolerance=tolerance) for s in skins
-                ]
-
-            timing, states = measure_and_keep(run, repeats=1, memory=not toy)
-            errors = np.array(
-                [abs(_variance(s, half) / t - 1.0) for s, t in zip(states, truth, strict=True)]
+                ],
+                repeats=1,
+                memory=not toy,
             )
-            spread = float(errors.std(ddof=1) / np.sqrt(errors.size))
-            error = float(errors.mean())
+            pairs = zip(states, truth, strict=True)
+            told = mean_error([100.0 * abs(_variance(s, half) / t - 1.0) for s, t in pairs])
             evaluations = np.mean([s.convergence.evaluations for s in states])
             knobs = {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)}
-            interval = (100.0 * (error - spread), 100.0 * (error + spread))
-            points.append(Point(knobs, timing, 100.0 * error, interval))
+            points.append(Point.of(knobs, timing, told))
     return described("skin-stretch", points, {} if toy else _limits())
 
 
