@@ -20,7 +20,7 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
-from skinrig.benchmarks.measurement import Point, StageBenchmark, Timing
+from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
 from skinrig.traits import truth as trait_truth
@@ -92,9 +92,8 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findi
                 found.append(_drawn(fit, label, group, knobs, judged))
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
     limits["lotion"] = judged(space)
-    limits.update(_false_alarms("lobes", means, metric, toy=toy))
-    limits |= _returned(means[~label], space, metric)
-    return found, limits
+    limits |= _false_alarms("lobes", means, metric, toy=toy)
+    return found, limits | _returned(means[~label], space, metric)
 
 
 def _fitted(
@@ -126,11 +125,7 @@ def _drawn(
     rng = np.random.default_rng(5)
     seconds, errors, told, kept = [], [], [], []
     groups = [
-        np.sort(
-            np.concatenate(
-                [side if whole else rng.choice(side, most, replace=False) for side in sides]
-            )
-        )
+        np.sort(np.concatenate([s if whole else rng.choice(s, most, replace=False) for s in sides]))
         for _ in range(1 if whole else N_GROUP_DRAWS)
     ]
     with resident_memory.watched() as rise:
@@ -146,9 +141,8 @@ def _drawn(
     if whole:
         half = _jackknife(lambda rows: 1.0 - judged(fit(rows)), groups[0])
         low, high = max(middle - half, 0.0), middle + half
-    timing = Timing(
-        float(np.median(seconds)), (min(seconds), max(seconds)), seconds[0], rise.mb, "resident"
-    )
+    spread = min(seconds), max(seconds)
+    timing = Timing(float(np.median(seconds)), spread, seconds[0], rise.mb, "resident")
     shown = {**knobs, "people": 2 * most if not whole else len(label)}
     also = {"components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4)}
     return Point(shown, timing, middle, (low, high), also=also)
@@ -221,66 +215,52 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findin
             [faces.albedo(group[i], noise=0.0, rng=np.random.default_rng(0)) for i in compared]
             for group in (people, after)
         ]
+        # People who are seen without and with the trait; the truth is of others
+        twice = [
+            faces.albedo(group[i], noise=noise, rng=np.random.default_rng([9, i, k]))
+            for k, group in enumerate((people, after))
+            for i in seen
+        ]
         for kind in VECTOR_KINDS:
             names = tuple(p.name for p in people)
             spaces = fitting_traits.albedo_spaces(
                 maps, Labels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
             )
-            texture = spaces["texture"]
-
-            def vectors(
-                shown: Sequence[albedo_vectors.AlbedoSample],
-                texture: Any = texture,
-                kind: VectorKind = kind,
-            ) -> Float64Array:
-                return np.array(
-                    [
-                        albedo_vectors.vector(
-                            one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
-                        )
-                        for one in shown
-                    ]
-                )
-
+            vectors = partial(_vectors, texture=spaces["texture"], kind=kind, inside=inside)
             before, with_it = (vectors(group) for group in clean)
             truth = (with_it - before).mean(axis=0)
-            rows = vectors(maps)
+            rows, pairs = vectors(maps), vectors(twice)
 
-            def judged(space: TraitSpace, truth: Float64Array = truth) -> float:
+            def judged(space: TraitSpace) -> float:
                 return cosine(space.trait("trait").vector, truth)
 
+            knobs: Knobs = {"trait": "tan", "space": f"pca of {kind}", "noise": noise}
             for group in (2, 3) if toy else (3, 8, int(label.sum())):
                 for components in (None, 1) if toy else (None, 1, 4):
-                    knobs = {
-                        "trait": "tan",
-                        "space": f"pca of {kind}",
-                        "noise": noise,
-                        "asked": components or "chosen",
-                    }
+                    asked = knobs | {"asked": components or "chosen"}
                     fit = partial(_learned, rows, label, components)
-                    points.append(_drawn(fit, label, group, knobs, judged))
-            # People who are seen without and with the trait; the truth is of others
-            twice = [
-                faces.albedo(group[i], noise=noise, rng=np.random.default_rng([9, i, k]))
-                for k, group in enumerate((people, after))
-                for i in seen
-            ]
-            pairs = vectors(twice)
+                    points.append(_drawn(fit, label, group, asked, judged))
             tan = np.arange(len(pairs)) >= len(seen)
-            knobs = {
-                "trait": "tan",
-                "space": f"pca of {kind}",
-                "noise": noise,
-                "asked": "seen twice",
-            }
-            points.append(
-                _drawn(partial(_learned, pairs, tan, None), tan, len(pairs), knobs, judged)
-            )
+            fit, asked = partial(_learned, pairs, tan, None), knobs | {"asked": "seen twice"}
+            points.append(_drawn(fit, tan, len(pairs), asked, judged))
             # Plain histograms are measured, and miss it: their points say by how much
             if noise == 0.01 and kind == "quantiles":
-                limits["tan", kind, str(len(seen))] = 1.0 - points[-1].error
-                limits.update(_false_alarms("albedo", rows, None, toy=toy))
+                limits["tan", kind, len(seen)] = 1.0 - points[-1].error
+                limits |= _false_alarms("albedo", rows, None, toy=toy)
     return points, limits
+
+
+def _vectors(
+    shown: Sequence[albedo_vectors.AlbedoSample], texture: Any, kind: VectorKind, inside: BoolArray
+) -> Float64Array:
+    return np.array(
+        [
+            albedo_vectors.vector(
+                one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
+            )
+            for one in shown
+        ]
+    )
 
 
 def _learned(

@@ -63,80 +63,102 @@ class Omission:
         return self.found + 3.0 * self.uncertain
 
 
+Images = Float32Array | Float64Array
+"""What a camera gets, in full scales."""
+Render = Callable[..., Images]
+
+
 @dataclass(frozen=True, slots=True)
-class Pictures:
-    """What a camera gets, in full scales."""
+class ComparedScene:
+    """A scene whose images with and without effects are compared."""
 
-    light: Float32Array
-    stderr: Float32Array | None = None
-    """Of the Monte Carlo where there is one."""
+    rig: str
+    subject: str
+    scene: Any
+    """As its needs decide."""
 
+    @property
+    def noise(self) -> Noise:
+        """The sensor's."""
+        return Noise.of(self.scene.sensor())
 
-Render = Callable[..., Pictures]
+    def compare(
+        self, render: Render, switched: Mapping[str, tuple[Any, Any]]
+    ) -> Iterator[Omission]:
+        """Render the scene with and without each effect that has a switch.
 
+        Parameters
+        ----------
+        render
+            Called with settings of the scene; returns images.
+        switched
+            For each switch its settings with and without the effect.
+        """
+        for effect in self.scene.needs:
+            if effect.switch not in switched:
+                continue
+            # only of what is left out the seconds are a claim
+            times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
+            (have, with_s), (lack, without_s) = (
+                _timed(lambda: render(**{effect.switch: how}), times)
+                for how in switched[effect.switch]
+            )
+            yield self.changed(effect, have, lack, (with_s, without_s), full_scale=1.0)
 
-def compare(
-    rig: str,
-    subject: str,
-    scene: Any,
-    noise: Any,
-    render: Render,
-    switched: Mapping[str, tuple[Any, Any]],
-) -> Iterator[Omission]:
-    """Render a scene with and without each effect that has a switch.
-
-    Parameters
-    ----------
-    rig, subject
-        Names.
-    scene
-        As its needs decide.
-    noise
-        Of the sensor, see `rigsim.needs.effects.Noise`.
-    render
-        Called with settings of the scene; returns pictures.
-    switched
-        For each switch its settings with and without the effect.
-    """
-    for effect in scene.needs:
-        if effect.switch not in switched:
-            continue
-        on, off = switched[effect.switch]
-        # only of what is left out the seconds are a claim
-        times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
-        have, with_s = _timed(render, {effect.switch: on}, times)
-        lack, without_s = _timed(render, {effect.switch: off}, times)
-        sigma = noise.sigma(have.light)
-        change = np.abs(_shown(have) - _shown(lack)) / sigma
-        place = np.unravel_index(int(np.argmax(change)), change.shape)
-        rounded = FLOAT32_ROUNDING * float(np.max(have.light / sigma))
-        error = rounded
-        if have.stderr is not None and lack.stderr is not None:
-            both = np.hypot(have.stderr, lack.stderr) / sigma
-            error = math.hypot(rounded, float(both[place]))
-        yield Omission(
-            rig,
-            subject,
+    def changed(
+        self,
+        effect: Any,
+        have: Images,
+        lack: Images,
+        seconds: tuple[float, float],
+        *,
+        full_scale: float = math.inf,
+    ) -> Omission:
+        """Compare two images that one effect tells apart, as a sensor shows them."""
+        sigma = self.noise.sigma(have)
+        shown, bare = (np.minimum(one.astype(np.float64), full_scale) for one in (have, lack))
+        return Omission(
+            self.rig,
+            self.subject,
             effect.name,
             effect.verdict,
             effect.over_noise,
-            float(change[place]),
-            error,
-            with_s,
-            without_s,
+            float((np.abs(shown - bare) / sigma).max()),
+            FLOAT32_ROUNDING * float(np.max(have / sigma)),
+            *seconds,
         )
 
+    def plainer(self, render: Render) -> Iterator[Omission]:
+        """Compare a face with one of even pigment, one without relief, and three bands with one.
 
-def _shown(pictures: Pictures) -> Float64Array:
-    """Return what a sensor tells of light, which ends at full scale."""
-    return np.minimum(pictures.light.astype(np.float64), 1.0)
+        Parameters
+        ----------
+        render
+            Called with a subject; returns images.
+        """
+        face, needs = self.scene.subject, self.scene.needs
+        have, with_s = _timed(lambda: render(face))
+        even = np.full_like(face.melanin, np.median(face.melanin[face.atlas.covered]))
+        for name, plain in (
+            (RELIEF_EFFECT, dataclasses.replace(face, normal=face.atlas.normal)),
+            (PIGMENT_EFFECT, dataclasses.replace(face, melanin=even)),
+        ):
+            lack, spent = _timed(lambda: render(plain))
+            yield self.changed(needs[name], have, lack, (with_s, spent))
+        rig = self.scene.rig
+        white = spectra.camera_white(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
+        gray = np.asarray(white / white.mean(), np.float32)
+        one, spent = _timed(lambda: have.mean(axis=-1, keepdims=True) * gray)
+        # a band alone would be a third of the sums over colors, which are not timed apart
+        yield self.changed(needs[BAND_EFFECT], have, one, (spent, spent))
 
 
-def _timed(render: Render, settings: Mapping[str, Any], times: int) -> tuple[Pictures, float]:
+def _timed(call: Callable[[], Images], times: int = 1) -> tuple[Images, float]:
+    """Return images, and the least processor time of making them, s."""
     least = math.inf
     for _ in range(times):
         begin = time.process_time()
-        made = render(**settings)
+        made = call()
         least = min(least, time.process_time() - begin)
     return made, least
 
@@ -163,35 +185,23 @@ def flash_face(
     face = make_subject(preset, seed=0, size=texels)
     scene = FlashScene(rig, face)
 
-    def render(**settings: Any) -> Pictures:
-        made = FlashScene(rig, face, effects=SceneEffects.from_switches(settings))
-        return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
+    def render(subject: Any = face, **settings: Any) -> Images:
+        made = FlashScene(rig, subject, effects=SceneEffects.from_switches(settings))
+        return np.stack([made.radiance(name) for name in ("parallel", "crossed")])
 
     scene.radiance()  # compiles, and traces what all scenes of this face share
     coarser = 2 if scene.needs.builds(WAVELENGTH_STEP_EFFECT) else None
-    yield from compare(
-        "flash",
-        name,
-        scene,
-        Noise.of(scene.sensor()),
+    compared = ComparedScene("flash", name, scene)
+    yield from compared.compare(
         render,
         {
-            "lateral": (True, False),
-            "interreflections": (True, False),
-            "spectral": (True, False),
+            **dict.fromkeys(("lateral", "interreflections", "spectral", "optics"), (True, False)),
             "spectral_step": (1, coarser),
             "last_bounce": (1e-7, None),
-            "optics": (True, False),
         },
     )
-    if light_deg is not None:
-        return
-
-    def look(subject: Any) -> Pictures:
-        made = FlashScene(rig, subject)
-        return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
-
-    yield from _plainer("flash", preset, scene, look)
+    if light_deg is None:
+        yield from compared.plainer(render)
 
 
 def _lit_from(rig: Any, angle_deg: float) -> Any:
@@ -210,32 +220,17 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     view = rig.views[0].name
     brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
 
-    def render(**settings: Any) -> Pictures:
+    def render(subject: Any = face, **settings: Any) -> Images:
         # what light goes from skin to skin is traced once for all scenes of the face
-        return Pictures(
-            DomeScene(rig, face, effects=SceneEffects.from_switches(settings)).radiance(view)
-            / brightest
-        )
+        made = DomeScene(rig, subject, effects=SceneEffects.from_switches(settings))
+        return np.asarray(made.radiance(view) / brightest)
 
-    yield from compare(
-        "dome",
-        preset,
-        scene,
-        Noise.of(scene.sensor()),
-        render,
-        {
-            "subsurface": (True, False),
-            "interreflections": (True, False),
-            "spectral": (True, False),
-            "last_bounce": (1e-7, None),
-            "optics": (True, False),
-        },
+    names = ("subsurface", "interreflections", "spectral", "optics")
+    compared = ComparedScene("dome", preset, scene)
+    yield from compared.compare(
+        render, {**dict.fromkeys(names, (True, False)), "last_bounce": (1e-7, None)}
     )
-
-    def look(subject: Any) -> Pictures:
-        return Pictures(DomeScene(rig, subject).radiance(view) / brightest)
-
-    yield from _plainer("dome", preset, scene, look)
+    yield from compared.plainer(render)
 
 
 def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
@@ -247,75 +242,13 @@ def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]
     view = rig.views[0].name
     brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
 
-    def render(**settings: Any) -> Pictures:
+    def render(**settings: Any) -> Images:
         effects = SceneEffects.from_switches(plain | settings)
         made = DomeScene(rig, face, state="surprise", effects=effects)
-        return Pictures(made.radiance(view) / brightest)
+        return np.asarray(made.radiance(view) / brightest)
 
-    yield from compare(
-        "dome",
-        f"{preset}, surprise",
-        scene,
-        Noise.of(scene.sensor()),
-        render,
-        {"relief_shadows": (True, False)},
-    )
-
-
-def _plainer(
-    rig: str, preset: str, scene: Any, look: Callable[[Any], Pictures]
-) -> Iterator[Omission]:
-    """Compare a face with one of even pigment, with one without relief, and three bands with one.
-
-    Parameters
-    ----------
-    rig, preset
-        Names.
-    scene
-        The face's own.
-    look
-        Returns the pictures of a subject, in full scales.
-    """
-    face, noise = scene.subject, Noise.of(scene.sensor())
-    begin = time.process_time()
-    have = look(face)
-    with_s = time.process_time() - begin
-    covered = face.atlas.covered
-    even = np.full_like(face.melanin, np.median(face.melanin[covered]))
-    for name, plain in (
-        (RELIEF_EFFECT, dataclasses.replace(face, normal=face.atlas.normal)),
-        (PIGMENT_EFFECT, dataclasses.replace(face, melanin=even)),
-    ):
-        begin = time.process_time()
-        lack = look(plain)
-        spent = time.process_time() - begin
-        yield changed(rig, preset, scene.needs[name], have, lack, noise, (with_s, spent))
-    view = scene.rig.views[0]
-    white = spectra.camera_white(view.spectral_sensitivity, scene.rig.lights[0].illuminant)
-    gray = np.asarray(white / white.mean(), np.float32)
-    begin = time.process_time()
-    one = Pictures(have.light.mean(axis=-1, keepdims=True) * gray)
-    spent = time.process_time() - begin
-    # a band alone would be a third of the sums over colors, which are not timed apart
-    yield changed(rig, preset, scene.needs[BAND_EFFECT], have, one, noise, (spent, spent))
-
-
-def changed(
-    rig: str,
-    subject: str,
-    effect: Any,
-    have: Pictures,
-    lack: Pictures,
-    noise: Any,
-    seconds: tuple[float, float],
-) -> Omission:
-    """Compare two pictures that one effect tells apart."""
-    sigma = noise.sigma(have.light)
-    change = float((np.abs(have.light.astype(np.float64) - lack.light) / sigma).max())
-    rounded = FLOAT32_ROUNDING * float(np.max(have.light / sigma))
-    return Omission(
-        rig, subject, effect.name, effect.verdict, effect.over_noise, change, rounded, *seconds
-    )
+    compared = ComparedScene("dome", f"{preset}, surprise", scene)
+    yield from compared.compare(render, {"relief_shadows": (True, False)})
 
 
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
@@ -324,18 +257,15 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     base = make_scene(rig, site=site)
     brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL).values())
 
-    def render(**settings: Any) -> Pictures:
-        made = GradientScene(
-            rig, base.subject, sphere=base.sphere, effects=SceneEffects.from_switches(settings)
-        )
-        found = made.moments(NEUTRAL)
-        light = np.stack([part[0] for part in found.values()]) / np.float32(brightest)
-        return Pictures(np.asarray(light, np.float32))
+    def render(**settings: Any) -> Images:
+        effects = SceneEffects.from_switches(settings)
+        made = GradientScene(rig, base.subject, sphere=base.sphere, effects=effects)
+        light = np.stack([part[0] for part in made.moments(NEUTRAL).values()])
+        return np.asarray(light / np.float32(brightest), np.float32)
 
     names = ("shadows", "lateral", "interreflections", "optics")
-    yield from compare(
-        "gradient", site, base, Noise.of(base.sensor()), render, dict.fromkeys(names, (True, False))
-    )
+    compared = ComparedScene("gradient", site, base)
+    yield from compared.compare(render, dict.fromkeys(names, (True, False)))
 
 
 def flat_targets() -> Iterator[Omission]:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
 from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue
-from rigsim.needs.effects import Noise
 from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
 from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
 from rigsim.world.suction import HeadState
-from skinrig.benchmarks.simulation.omission_cases import Omission, Pictures, changed
+from skinrig.arrays import Float32Array
+from skinrig.benchmarks.simulation.omission_cases import ComparedScene, Omission
 
 
 def gray_tissue() -> Iterator[Omission]:
@@ -25,8 +24,7 @@ def gray_tissue() -> Iterator[Omission]:
     bands = tuple(float(nm) for nm in range(400, 701, 10))
     colored = dataclasses.replace(gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands)
     head = HeadState("forehead", 0.0, True, 0.0, 5.0)
-    pictures, seconds = [], []
-    scene = ProbeScene(rig, gray)
+    images, seconds = [], []
     for tissue in (colored, gray):
         begin = time.process_time()
         made = ProbeScene(rig, tissue)
@@ -34,43 +32,34 @@ def gray_tissue() -> Iterator[Omission]:
         seconds.append(time.process_time() - begin)
         if profile is None:
             raise ValueError("gray tissue: the head touches nothing")
-        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
-        pictures.append(Pictures(light))  # of stored photons: the same for both
-    brightest = np.float32(pictures[0].light.max())
-    noise = Noise.of(scene.sensor())
-    have, lack = (Pictures(part.light / brightest) for part in pictures)
-    effect = scene.needs[COLOR_EFFECT]
-    yield changed("probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1]))
-    yield from _probe_build(scene, head, noise)
+        images.append(made.image(made.through_fibres(profile.reflectance_per_mm2)))
+    brightest = np.float32(images[0].max())
+    scene = ProbeScene(rig, gray)
+    compared = ComparedScene("probe", "gray medium", scene)
+    have, lack = (part / brightest for part in images)  # of stored photons: the same for both
+    yield compared.changed(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
+    yield from _probe_build(compared, head)
 
 
-def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
+def _probe_build(compared: ComparedScene, head: HeadState) -> Iterator[Omission]:
     """Compare the probe as built with one without cross-talk, wings, or dark current."""
-    profile = scene.profile(head)
-    build = scene.build
+    scene = compared.scene
+    profile, build = scene.profile(head), scene.build
 
-    def picture(made: Any) -> tuple[Pictures, float]:
+    def timed(made: ProbeScene) -> tuple[Float32Array, float]:
         begin = time.process_time()
         light = made.image(made.through_fibres(profile.reflectance_per_mm2))
-        return Pictures(light), time.process_time() - begin
+        return light, time.process_time() - begin
 
-    have, with_s = picture(scene)
-    unit = np.float32(have.light.max())
+    have, with_s = timed(scene)
+    unit = np.float32(have.max())
     plain = {
         CROSSTALK_EFFECT: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
         WINGS_EFFECT: dataclasses.replace(build, wings=0.0),
     }
     for name, without in plain.items():
-        lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
-        yield changed(
-            "probe",
-            "gray medium",
-            scene.needs[name],
-            Pictures(have.light / unit),
-            Pictures(lack.light / unit),
-            noise,
-            (with_s, spent),
-        )
+        lack, spent = timed(ProbeScene(scene.rig, scene.tissue, build=without))
+        yield compared.changed(scene.needs[name], have / unit, lack / unit, (with_s, spent))
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
     begin = time.process_time()
@@ -78,12 +67,4 @@ def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
     middle = time.process_time()
     none = np.zeros_like(hot)
     spent_s = middle - begin, time.process_time() - middle
-    yield changed(
-        "probe",
-        "gray medium",
-        scene.needs[DARK_CURRENT_EFFECT],
-        Pictures(hot),
-        Pictures(none),
-        noise,
-        spent_s,
-    )
+    yield compared.changed(scene.needs[DARK_CURRENT_EFFECT], hot, none, spent_s)
