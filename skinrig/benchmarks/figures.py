@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skinrig.drawing import figures, point_names
 
@@ -30,17 +31,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     """
     figure, axes = figures.canvas(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
-    # a log axis has no place for what is quicker than the clock tells
-    seconds = np.maximum(np.array([p["seconds"] for p in points], float), 1e-7)
-    error = np.array([p["error"] for p in points], float)
-    low = np.array([p["error_interval"][0] for p in points], float)
-    high = np.array([p["error_interval"][1] for p in points], float)
-    exact = ~(error > 0.0)
-    if exact.any() and not exact.all():  # a log axis has no place for 0: below the others
-        error = np.where(exact, error[~exact].min() / 10.0, error)
-        low, high = np.where(exact, error, low), np.where(exact, error, high)
-    bars = np.maximum(np.stack([error - low, high - error]), 0.0)
-    bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
+    seconds, error, bars, exact = _measured(points)
     labels: list[tuple[str, float, float]] = []
     joined = [best for front in fronts if len(best := np.array(front["points"], int)) > 1]
     named = len(fronts) <= MAX_NAMED_FRONTS
@@ -61,12 +52,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         if bend is not None:
             axes.plot(seconds[bend], error[bend], "o", mfc="none", mec="0.5", ms=11)
         for index in best if named or len(best) > 1 else ():
-            effort = {
-                k: v
-                for k, v in points[index]["knobs"].items()
-                if k not in front["condition"] and any(p["knobs"].get(k) != v for p in points)
-            }
-            label = _words(effort)
+            label = _words(_effort(points, index, front["condition"]))
             label += "  (knee)" if index == bend else ""
             label += "  (error 0)" if exact[index] else ""
             labels.append((label, float(seconds[index]), float(error[index])))
@@ -78,17 +64,13 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         axes.axhline(
             document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
         )
-    axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.margins(x=0.25, y=0.2)
-    figures.plain_numbers(axes.xaxis, axes.yaxis)
-    axes.set_xlabel("seconds, warm, median")
-    axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     small = document.get("size") == "small"
-    axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
+    _dress(axes, f"{stage}, small size" if small else stage, document["error_name"])
     legend = None
     if axes.get_legend_handles_labels()[0]:
         legend = axes.legend(fontsize=6, frameon=False)
+    ends = np.stack([error - bars[0], error + bars[1]])
     point_names.name_points(
         figure,
         axes,
@@ -96,27 +78,60 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         points=list(zip(seconds.tolist(), error.tolist(), strict=True)),
         lines=[
             *(np.column_stack([seconds[best], error[best]]) for best in joined),
-            *np.stack(
-                [np.stack([seconds, error - bars[0]], 1), np.stack([seconds, error + bars[1]], 1)],
-                1,
-            ),
+            *np.stack([np.stack([seconds, end], 1) for end in ends], 1),
         ],
         legend=legend,
     )
-    told = "; ".join(
-        f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
-        + (
-            ""
-            if front["knee"] is None
-            else f", knee at {seconds[front['knee']]:.3g} s, error {error[front['knee']]:.3g}"
-        )
-        for front in fronts[:MAX_NAMED_FRONTS]
-    )
+    told = "; ".join(_summary(front, seconds, error) for front in fronts[:MAX_NAMED_FRONTS])
     alt = (
         f"{stage}: {document['error_name']}, {figures.span_of(error)}, against "
         f"{figures.span_of(seconds)} seconds for {len(points)} settings; fronts: {told}"
     )
     return figures.finished(figure, alt)
+
+
+def _measured(points: Sequence[Mapping[str, Any]]) -> tuple[NDArray[Any], ...]:
+    """Return seconds, errors, error bars (2, n) as a log axis can show them, and which are 0."""
+    # a log axis has no place for what is quicker than the clock tells
+    seconds = np.maximum(np.array([p["seconds"] for p in points], float), 1e-7)
+    error = np.array([p["error"] for p in points], float)
+    low, high = np.array([p["error_interval"] for p in points], float).T
+    exact = ~(error > 0.0)
+    if exact.any() and not exact.all():  # a log axis has no place for 0: below the others
+        error = np.where(exact, error[~exact].min() / 10.0, error)
+        low, high = np.where(exact, error, low), np.where(exact, error, high)
+    bars = np.maximum(np.stack([error - low, high - error]), 0.0)
+    bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
+    return seconds, error, bars, exact
+
+
+def _effort(
+    points: Sequence[Mapping[str, Any]], index: int, condition: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the knobs of a point that no condition names and not all points share."""
+    return {
+        k: v
+        for k, v in points[index]["knobs"].items()
+        if k not in condition and any(p["knobs"].get(k) != v for p in points)
+    }
+
+
+def _summary(front: Mapping[str, Any], seconds: NDArray[Any], error: NDArray[Any]) -> str:
+    told = f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
+    bend = front["knee"]
+    if bend is None:
+        return told
+    return f"{told}, knee at {seconds[bend]:.3g} s, error {error[bend]:.3g}"
+
+
+def _dress(axes: Any, title: str, error_name: str) -> None:
+    """Set log scales, title and names of the axes."""
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    figures.plain_numbers(axes.xaxis, axes.yaxis)
+    axes.set_xlabel("seconds, warm, median")
+    axes.set_ylabel("\n".join(textwrap.wrap(error_name, 36)))
+    axes.set_title(title, fontsize=10)
 
 
 MAX_NAMED_FRONTS = 6
@@ -155,15 +170,8 @@ def compared_fronts(
         points = [p for p in document["points"] if p["error"] > 0.0]
         seconds = np.array([p["seconds"] for p in points], float)
         error = np.array([p["error"] for p in points], float)
-        axes.plot(
-            seconds,
-            error,
-            "os"[number],
-            mfc="none" if number else None,
-            ms=5,
-            color=figures.SERIES_COLORS[number],
-            label=label,
-        )
+        mark = {"mfc": "none" if number else None, "color": figures.SERIES_COLORS[number]}
+        axes.plot(seconds, error, "os"[number], ms=5, label=label, **mark)
         places.append(
             {
                 str(p["knobs"]): (s, e)
@@ -176,12 +184,7 @@ def compared_fronts(
     for knobs in sorted(places[0].keys() & places[1].keys()):
         (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.margins(x=0.15, y=0.2)
-    figures.plain_numbers(axes.xaxis, axes.yaxis)
-    axes.set_xlabel("seconds, warm, median")
-    axes.set_ylabel("\n".join(textwrap.wrap(a[1]["error_name"], 36)))
-    axes.set_title(stage, fontsize=10)
+    _dress(axes, stage, a[1]["error_name"])
     axes.legend(fontsize=7, frameon=False)
     return figures.finished(figure, f"{stage}: {'; '.join(told)}")
