@@ -8,7 +8,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Limit, Point, StageBenchmark
 
 STAGES_TABLE = resources.files("skinrig").joinpath("data/benchmarks.toml")
 

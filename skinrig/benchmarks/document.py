@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Limit, Point, StageBenchmark
 from skinrig.evaluating import skin_bands
 
 SCHEMA: Final = "skinrig.bench/2"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from model import metrics
 from skinrig.arrays import BoolArray, FloatArray
-from skinrig.benchmarks.measurement import BandError
+from skinrig.benchmarks.results import BandError
 
 N_BOOTSTRAP_DRAWS = 200
 TILE_PX = 16

@@ -14,7 +14,7 @@ from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.description import descriptions
 from skinrig.benchmarks.document import to_document
-from skinrig.benchmarks.measurement import StageBenchmark
+from skinrig.benchmarks.results import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 

@@ -19,16 +19,9 @@ from reconstruction.diffuse_albedo import estimation as diffuse_albedo
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome import brdf_truth
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Point,
-    StageBenchmark,
-    Timing,
-    measure,
-    measure_and_keep,
-    once,
-)
+from skinrig.benchmarks.measurement import measure, measure_and_keep, once
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
 
 FIT_CORES = 2
 """Cores that the fit shares its points out to."""

@@ -13,7 +13,8 @@ from rigsim.population.population import table_1
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 WAYS: Final[tuple[Literal["shares", "brdf"], ...]] = ("shares", "brdf")
 SPACE_RANKS: Final = (1, 2, 3, 4, 6, 8, 12)

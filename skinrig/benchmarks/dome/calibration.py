@@ -19,15 +19,9 @@ from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import (
-    Knobs,
-    Point,
-    StageBenchmark,
-    Timing,
-    measure,
-    measure_and_keep,
-)
+from skinrig.benchmarks.measurement import measure, measure_and_keep
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import Knobs, Point, StageBenchmark, Timing
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.targets import TargetScene

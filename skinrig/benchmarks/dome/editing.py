@@ -13,8 +13,9 @@ from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population.population import Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import mean_error, squares
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.editing import albedo as editing_albedo
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.fitting import traits

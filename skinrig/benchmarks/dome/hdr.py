@@ -11,13 +11,8 @@ import numpy as np
 from capture import hdr
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Point,
-    StageBenchmark,
-    Timing,
-    measure_and_keep,
-)
+from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
 
 GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
 N_FRAMES, FULL_SIDE_PX = 23, 1024

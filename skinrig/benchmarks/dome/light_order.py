@@ -11,7 +11,8 @@ from capture.plan.light_order import LIGHT_ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 
 DWELL_S = 1.0 / 12.0
 DARK_TIME_FRACTION = 0.3

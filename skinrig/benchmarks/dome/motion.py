@@ -18,8 +18,9 @@ from rigsim.subject import make_subject
 from rigsim.subject.head_motion import head_motion as drawn
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, StageBenchmark, measured
+from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import BandError, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 TRACKING_EXPOSURE_S = 0.03

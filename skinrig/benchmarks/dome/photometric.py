@@ -14,16 +14,9 @@ from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 SAMPLE_NOISE = 0.005

@@ -18,8 +18,9 @@ from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.benchmarks.description import described
 from skinrig.benchmarks.dome import texture as bench_texture
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.photographs.errors import luminance
 

@@ -18,8 +18,9 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.arrays import FloatArray
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measured
+from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import tiled_rms
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior

@@ -24,8 +24,9 @@ from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing, measured
+from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
 
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
 N_FULL_SAMPLES = 500_000 * 16 * 150

@@ -15,8 +15,9 @@ from model.texture_statistics.histograms import distance
 from model.texture_statistics.space import TextureSpace
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 MIN_SPEEDUP_OVER_PYRTOOLS = 10.0
 FULL_SIDE_PX, FULL_ITERATIONS = 1024, 4

@@ -20,7 +20,7 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
-from skinrig.benchmarks.measurement import Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Knobs, Point, StageBenchmark, Timing
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
 from skinrig.traits import truth as trait_truth

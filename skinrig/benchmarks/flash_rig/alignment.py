@@ -16,7 +16,8 @@ from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Points = dict[str, tuple[float, float]]

@@ -12,8 +12,9 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
 from skinrig.benchmarks.resampling import median_error
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 CHANNEL_NOISE = 0.01

@@ -21,7 +21,8 @@ from reconstruction import chromophores, diffuse_albedo, photometric_stereo, sub
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 

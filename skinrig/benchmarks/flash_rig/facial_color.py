@@ -14,14 +14,8 @@ from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, his
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import measure, processor_seconds
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""

@@ -19,8 +19,9 @@ from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import rms_of_draws
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0

@@ -17,16 +17,9 @@ from reconstruction.facial_color import shared_melanin
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
 from skinrig.benchmarks.resampling import median_error
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 STATE_NAMES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")

@@ -14,15 +14,9 @@ from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.sensor import vignetting_map
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure_and_keep,
-    once,
-)
+from skinrig.benchmarks.measurement import measure_and_keep, once
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 SPHERE_SEED = 7
 

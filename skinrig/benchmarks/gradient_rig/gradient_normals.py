@@ -22,16 +22,9 @@ from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]

@@ -17,16 +17,9 @@ from reconstruction.normal_integration.height_errors import expected_rms
 from reconstruction.normal_integration.height_filters import high_pass
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again, squares
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0

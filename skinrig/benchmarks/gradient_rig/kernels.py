@@ -19,17 +19,9 @@ from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure, measured, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88

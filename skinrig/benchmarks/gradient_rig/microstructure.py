@@ -32,16 +32,9 @@ from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure,
-    measure_and_keep,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure, measure_and_keep, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import Knobs, Point, StageBenchmark
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)

@@ -15,14 +15,8 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure,
-    measure_and_keep,
-)
+from skinrig.benchmarks.measurement import measure, measure_and_keep
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384

@@ -20,17 +20,9 @@ from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure,
-    measured,
-    once,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import measure, measured, once, processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws, squares
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 
 ZONE_CENTERS_UV = (
     *((x, y) for y in (0.12, 0.3) for x in (0.3, 0.7)),

@@ -26,7 +26,8 @@ from skinrig.benchmarks.intervals import probe as interval_trials_probe
 from skinrig.benchmarks.intervals import sequence as interval_trials_sequence
 from skinrig.benchmarks.intervals import trials as interval_trials
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
-from skinrig.benchmarks.measurement import Point, StageBenchmark, Timing, once
+from skinrig.benchmarks.measurement import once
+from skinrig.benchmarks.results import Point, StageBenchmark, Timing
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05

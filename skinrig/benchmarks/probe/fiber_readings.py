@@ -17,8 +17,9 @@ from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
 from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 
 PROBE_SEED = 5
 LIGHT_DECADES = 7.0

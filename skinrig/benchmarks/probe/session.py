@@ -13,8 +13,9 @@ from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, measure
+from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.skin_bands import MELANIN_BANDS

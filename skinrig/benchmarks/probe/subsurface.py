@@ -15,15 +15,9 @@ from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure_and_keep,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import measure_and_keep, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again, median_error
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)

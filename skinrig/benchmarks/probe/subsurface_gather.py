@@ -16,18 +16,9 @@ from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    Timing,
-    measure,
-    measure_and_keep,
-    measured,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import measure, measure_and_keep, measured, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 FULL_SIDE_PX = 512

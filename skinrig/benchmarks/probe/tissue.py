@@ -11,15 +11,9 @@ from model.tissue_optics import layers as tissue_optics
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure_and_keep,
-    measured,
-)
+from skinrig.benchmarks.measurement import measure_and_keep, measured
 from skinrig.benchmarks.resampling import median_error
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 BAND_TABLE_SIZE = 64

@@ -18,14 +18,9 @@ from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    BandError,
-    Point,
-    StageBenchmark,
-    measure,
-    processor_seconds,
-)
+from skinrig.benchmarks.measurement import measure, processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 Way = Literal["sigma_tr", "profiles"]

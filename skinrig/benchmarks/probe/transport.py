@@ -17,14 +17,8 @@ from rigsim.render import RenderError, look_at, radiance
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import (
-    LIMIT_CORES,
-    BandError,
-    Knobs,
-    Point,
-    StageBenchmark,
-    measure_and_keep,
-)
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_and_keep
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 RED_MEDIUM_PER_MM = (

@@ -9,8 +9,8 @@ import numpy as np
 from capture.rig import load_rig
 from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
 from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import BandError, Point, StageBenchmark, Timing
 from skinrig.benchmarks.resampling import drawn_again, tiled_rms
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 if TYPE_CHECKING:

@@ -17,8 +17,9 @@ from rigsim.scenes.flash.polarizer_reference import (
 )
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, StageBenchmark, measured
+from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import tiled_rms
+from skinrig.benchmarks.results import BandError, StageBenchmark
 
 REFERENCE_RAYS = 144
 

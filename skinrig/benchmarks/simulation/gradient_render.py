@@ -21,7 +21,7 @@ from rigsim.skin_patch.microrelief import MicroSkin
 from skinrig.arrays import Float64Array, Int64Array
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
 
 N_LIT_CONDITIONS = 14
 """Of the 16 conditions two are dark; Mitsuba is not asked to render those."""

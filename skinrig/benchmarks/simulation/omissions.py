@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rigsim.needs.flash import LATERAL_EFFECT
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import BandError, Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
 

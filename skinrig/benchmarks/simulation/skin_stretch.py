@@ -11,8 +11,9 @@ from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import Point, StageBenchmark, measure_and_keep
+from skinrig.benchmarks.measurement import measure_and_keep
 from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import Point, StageBenchmark
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""

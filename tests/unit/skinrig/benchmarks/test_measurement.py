@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import knee, pareto_front, to_document
-from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks.measurement import measure
+from skinrig.benchmarks.results import BandError, Limit, Point, StageBenchmark, Timing
 
 
 def point(seconds, error):

@@ -10,7 +10,7 @@ import pytest
 from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import stages as bench_stages
 from skinrig.benchmarks import table as bench_table
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.console import Console
 from skinrig.errors import MissingExtra
 

@@ -8,7 +8,7 @@ from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig import report
 from skinrig.benchmarks.document import to_document
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.reporting import page
 from skinrig.reporting.folders import discover
 from skinrig.reporting.sections import population

@@ -7,7 +7,7 @@ from reconstruction.anisotropy import estimation as anisotropy
 from skinrig.benchmarks.intervals import coverage_stage as intervals
 from skinrig.benchmarks.intervals import probe as interval_trials_probe
 from skinrig.benchmarks.intervals.coverage import Covered
-from skinrig.benchmarks.measurement import Timing
+from skinrig.benchmarks.results import Timing
 
 ONCE = Timing(1.0, (1.0, 1.0), 1.0, None)
 

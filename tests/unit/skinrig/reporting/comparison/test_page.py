@@ -10,7 +10,7 @@ from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import report
 from skinrig.benchmarks.document import to_document
-from skinrig.benchmarks.measurement import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.report import ReportError
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
