@@ -15,18 +15,8 @@ from reconstruction import normal_integration, polarization
 from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from rigsim import render
-from skinrig.extremes.expectations import (
-    Real,
-    Unexpected,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-    rising,
-    within,
-)
-from skinrig.extremes.inputs import ring
+from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
+from skinrig.extremes.inputs import Real, as_real, ring
 
 NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from skinrig.extremes.expectations import Case, Real, Unexpected
+from skinrig.extremes.expectations import Case, Unexpected
+from skinrig.extremes.inputs import Real
 
 SCHEMA = "skinrig.extremes.cases/1"
 

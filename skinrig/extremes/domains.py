@@ -9,9 +9,8 @@ from model import fresnel, microstructure, photon_table
 from model.texture_statistics import masks as texture_masks
 from model.tissue_optics import adding_doubling, layered_diffusion
 from reconstruction import photometric_stereo as stereo
-from skinrig.extremes.expectations import Real, Unexpected, as_real, clean, masked, near, refused
-from skinrig.extremes.expectations import within as within_bounds
-from skinrig.extremes.inputs import ring, sheet_faces, stretched_sheet
+from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
+from skinrig.extremes.inputs import Real, as_real, ring, sheet_faces, stretched_sheet
 
 INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
@@ -59,7 +58,7 @@ def _one_photon(real: Real) -> str:
     off = np.arccos(np.clip(bright.normals[..., 2], -1.0, 1.0))
     # of two alike Gaussian errors 68.27 % are within 1.0714 of the root mean square
     held = float(np.mean(off <= 1.0714 * bright.stderr_rad))
-    return f"{dark.valid.sum()} of 2000 given a normal; of 100 photons " + within_bounds(
+    return f"{dark.valid.sum()} of 2000 given a normal; of 100 photons " + within(
         held, 0.60, 0.76, what="share inside"
     )
 
@@ -122,4 +121,4 @@ def _index_of_nothing(real: Real) -> str:
         if not 0.0 <= float(fresnel.reflectance(real(cosine), eta)) <= 1.0:
             raise Unexpected(f"eta {eta:g}: expected a reflectance from 0 to 1")
     matched = [float(fresnel.reflectance(real(c), 1.0)) for c in (0.0, 1e-3, 1.0)]
-    return within_bounds(matched, 0.0, 1e-12, what="matched: reflectance")
+    return within(matched, 0.0, 1e-12, what="matched: reflectance")

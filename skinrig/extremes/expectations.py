@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skinrig.arrays import Float64Array
-
-Real = type[np.float32] | type[np.float64]
+from skinrig.extremes.inputs import Real
 
 
 class Unexpected(AssertionError):
@@ -99,11 +97,6 @@ def clean(values: ArrayLike, valid: ArrayLike, *, what: str = "values") -> str:
     if not np.all(np.isfinite(shown)):
         raise Unexpected(f"{what}: got NaN or infinity at a valid place")
     return f"{what} finite where valid"
-
-
-def as_real(values: ArrayLike, real: Real) -> NDArray[Any]:
-    """Return values as an array of a precision."""
-    return np.asarray(values, real)
 
 
 def _short(value: Float64Array) -> str:

@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 from capture import hdr
 from model import color_table
 from reconstruction import chromophores, polarization
-from skinrig.extremes.expectations import (
-    Real,
-    Unexpected,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-    within,
-)
+from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
+from skinrig.extremes.inputs import Real, as_real
 
 if TYPE_CHECKING:
     from model.color_table import ColorTable

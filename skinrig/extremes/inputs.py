@@ -1,10 +1,20 @@
-"""What several groups of cases hand over: rings of lights, sheets of triangles."""
+"""What cases hand over: arrays of a precision, rings of lights, sheets of triangles."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from skinrig.arrays import Float64Array, Int64Array
+
+Real = type[np.float32] | type[np.float64]
+
+
+def as_real(values: ArrayLike, real: Real) -> NDArray[Any]:
+    """Return values as an array of a precision."""
+    return np.asarray(values, real)
 
 
 def ring(count: int, tilt_rad: float) -> Float64Array:

@@ -8,16 +8,8 @@ import numpy as np
 
 from model.dipole.gather import GatherError, exitance
 from model.dipole.maps import DipoleMaps
-from skinrig.extremes.expectations import (
-    Real,
-    Unexpected,
-    as_real,
-    masked,
-    near,
-    refused,
-    rising,
-    within,
-)
+from skinrig.extremes.expectations import Unexpected, masked, near, refused, rising, within
+from skinrig.extremes.inputs import Real, as_real
 
 
 def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]

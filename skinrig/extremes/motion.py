@@ -6,8 +6,8 @@ import numpy as np
 
 from model import facial_color, microstructure, wrinkles
 from model.facial_color import FacialColorError, HemoglobinRig
-from skinrig.extremes.expectations import Real, as_real, clean, masked, near, refused, within
-from skinrig.extremes.inputs import sheet_faces, stretched_sheet
+from skinrig.extremes.expectations import clean, masked, near, refused, within
+from skinrig.extremes.inputs import Real, as_real, sheet_faces, stretched_sheet
 
 
 def _near_constant(real: Real) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 
 from model import tissue_optics
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
-from skinrig.extremes.expectations import Real, Unexpected, as_real, near, within
+from skinrig.extremes.expectations import Unexpected, near, within
+from skinrig.extremes.inputs import Real, as_real
 
 Matter = tuple[float, float, float, float]
 """Thickness, sigma_a, sigma_s (mm, 1/mm) and g."""

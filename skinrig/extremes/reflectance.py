@@ -7,7 +7,8 @@ import numpy as np
 from model import dipole, merl
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
-from skinrig.extremes.expectations import Real, as_real, masked, near, refused, rising, within
+from skinrig.extremes.expectations import masked, near, refused, rising, within
+from skinrig.extremes.inputs import Real, as_real
 
 
 def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]

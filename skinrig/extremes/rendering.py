@@ -16,8 +16,8 @@ from rigsim.light import surface_brdf
 from rigsim.render import Caster, visibility
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.extremes.expectations import Real, Unexpected, as_real, near, refused, within
-from skinrig.extremes.inputs import sheet_faces
+from skinrig.extremes.expectations import Unexpected, near, refused, within
+from skinrig.extremes.inputs import Real, as_real, sheet_faces
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor

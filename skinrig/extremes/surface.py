@@ -12,17 +12,8 @@ from reconstruction import diffuse_albedo, kernel_fit, normal_histogram, normal_
 from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.extremes.expectations import (
-    Real,
-    Unexpected,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-    within,
-)
-from skinrig.extremes.inputs import ring
+from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
+from skinrig.extremes.inputs import Real, as_real, ring
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 

@@ -11,17 +11,8 @@ from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.arrays import Float64Array
-from skinrig.extremes.expectations import (
-    Real,
-    Unexpected,
-    as_real,
-    clean,
-    masked,
-    near,
-    refused,
-    rising,
-    within,
-)
+from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
+from skinrig.extremes.inputs import Real, as_real
 
 
 def _layers(
