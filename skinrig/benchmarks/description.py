@@ -52,20 +52,20 @@ def described(
     words
         Fill the braces of the description.
     """
-    told = descriptions()[name]
+    entry = descriptions()[name]
     return StageBenchmark(
         name,
-        told["error_name"],
-        told["reference"].format(**words),
-        told.get("reference_error", 0.0) if reference_error is None else reference_error,
+        entry["error_name"],
+        entry["reference"].format(**words),
+        entry.get("reference_error", 0.0) if reference_error is None else reference_error,
         tuple(points),
-        tuple(_limit(told["limits"], key, found, words) for key, found in (limits or {}).items()),
-        (*((what, why) for what, why in told.get("left_out", ())), *left_out),
+        tuple(_limit(entry["limits"], key, found, words) for key, found in (limits or {}).items()),
+        (*((what, why) for what, why in entry.get("left_out", ())), *left_out),
         by_band or {},
-        told.get("no_bands", ""),
-        tuple(told.get("condition", ())),
-        told["interval_of"],
-        told.get("squared", False),
+        entry.get("no_bands", ""),
+        tuple(entry.get("condition", ())),
+        entry["interval_of"],
+        entry.get("squared", False),
     )
 
 
@@ -76,9 +76,9 @@ def _limit(
     words: Mapping[str, object],
 ) -> Limit:
     first, *parts = (key,) if isinstance(key, str) else key
-    told = table[first]
-    name, unit = told["name"].format(*parts, **words), told.get("unit", "")
+    entry = table[first]
+    name, unit = entry["name"].format(*parts, **words), entry.get("unit", "")
     got, bound = found if isinstance(found, tuple) else (found, None)
-    if "at_most" in told:
-        return Limit(name, got, told["at_most"] if bound is None else bound, "<=", unit)
-    return Limit(name, got, told["at_least"] if bound is None else bound, ">=", unit)
+    if "at_most" in entry:
+        return Limit(name, got, entry["at_most"] if bound is None else bound, "<=", unit)
+    return Limit(name, got, entry["at_least"] if bound is None else bound, ">=", unit)

@@ -80,12 +80,12 @@ def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[t
 
 
 SMALL_S: Final[dict[str, float]] = {
-    name: told["small_s"] for name, told in descriptions().items() if "small_s" in told
+    name: entry["small_s"] for name, entry in descriptions().items() if "small_s" in entry
 }
 """Processor seconds at small size of the stages that take more than about one."""
 
 FULL_S: Final[dict[str, float]] = {
-    name: told["full_s"] for name, told in descriptions().items() if "full_s" in told
+    name: entry["full_s"] for name, entry in descriptions().items() if "full_s" in entry
 }
 """About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
 the processor seconds of the main thread and half of those of all others, which share two cores.

@@ -55,12 +55,17 @@ class Point:
         cls,
         knobs: Mapping[str, Knob],
         timing: Timing,
-        told: BandError,
+        outcome: BandError,
         also: Mapping[str, Knob] | None = None,
     ) -> Point:
         """Return the point of an error with interval and bound."""
         return cls(
-            knobs, timing, told.error, told.error_interval, told.cramer_rao_bound, also or {}
+            knobs,
+            timing,
+            outcome.error,
+            outcome.error_interval,
+            outcome.cramer_rao_bound,
+            also or {},
         )
 
     def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:

@@ -18,7 +18,7 @@ from skinrig.benchmarks.results import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
-STAGES: dict[str, str] = {name: told["run"] for name, told in descriptions().items()}
+STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 

@@ -62,15 +62,15 @@ def albedo(*, toy: bool) -> StageBenchmark:
                     # 68 % interval of a median of `count` errors of this spread
                     half = 1.2533 * float(np.std(np.abs(channel))) / np.sqrt(count)
                     error = float(worst.max())
-                    told = BandError(error, (max(error - half, 0.0), error + half))
+                    outcome = BandError(error, (max(error - half, 0.0), error + half))
                     knobs = {"skin": skin, "noise": noise, "samples": p.f.shape[1]}
                     also = {
                         "bias_percent": round(float(np.median(channel)), 2),
                         "spread_percent": round(float(np.std(channel)), 2),
                     }
-                    points.append(Point.of(knobs | {"method": method}, timing, told, also))
+                    points.append(Point.of(knobs | {"method": method}, timing, outcome, also))
                     if method == "envelope" and noise == 0.02 and (toy or samples == 900):
-                        bands[skin] = told
+                        bands[skin] = outcome
                         limits["error", skin] = error
     return described("diffuse-albedo", points, limits, by_band=bands)
 

@@ -47,13 +47,13 @@ def space(*, toy: bool) -> StageBenchmark:
             )
             inside, error = float(found.error[0]), 100.0 * float(found.held_out[0])
             half = 100.0 * float(found.held_out_stderr[0])
-            told = BandError(error, (max(error - half, 0.0), error + half))
+            outcome = BandError(error, (max(error - half, 0.0), error + half))
             knobs: Knobs = {"set": data.name, "way": method, "rank": rank, "points": found.points}
             also = {
                 "own_points_error_percent": round(100.0 * inside, 3),
                 "noise_percent": round(100.0 * data.noise, 1),
             }
-            points.append(Point.of(knobs, timing, told, also))
+            points.append(Point.of(knobs, timing, outcome, also))
             if method == "shares" and rank == NOISE_RANK:
                 beyond = max(beyond, inside / data.noise)
         shares, brdf = (

@@ -47,11 +47,11 @@ def merging(*, toy: bool) -> StageBenchmark:
         spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
         least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
         worst = max(worst, error / least)
-        told = BandError.around(error, spread, least)
-        points.append(Point.of({"frames": count}, timing, told))
+        outcome = BandError.around(error, spread, least)
+        points.append(Point.of({"frames": count}, timing, outcome))
     ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
-    points.append(Point.of({"frames": N_FRAMES, "way": "beside"}, ours, told))
+    points.append(Point.of({"frames": N_FRAMES, "way": "beside"}, ours, outcome))
     limits: Findings = {("speed_up", side, theirs): ratio, "over_bound": worst}
     return described("hdr", points, limits)
 

@@ -137,11 +137,11 @@ def _mean_bound_deg(scene: Scene, noise: float) -> float:
     places = np.flatnonzero(scene.inside)[:: max(1, scene.inside.sum() // 2000)]
     flat = scene.matte.reshape(len(scene.lights), -1)[:, places].astype(np.float64)
     A = np.einsum("np,ni,nj->pij", flat, scene.lights, scene.lights)
-    told = np.linalg.eigvalsh(A)[:, 0] > 1e-3
-    C = np.linalg.inv(A[told])
-    n = scene.normals.reshape(-1, 3)[places][told]
+    solvable = np.linalg.eigvalsh(A)[:, 0] > 1e-3
+    C = np.linalg.inv(A[solvable])
+    n = scene.normals.reshape(-1, 3)[places][solvable]
     across = np.trace(C, axis1=1, axis2=2) - np.einsum("pi,pij,pj->p", n, C, n)
-    rms = noise * np.sqrt(across) / scene.albedo.reshape(-1)[places][told]
+    rms = noise * np.sqrt(across) / scene.albedo.reshape(-1)[places][solvable]
     return float(np.degrees(np.sqrt(np.pi) / 2 * rms.mean()))
 
 

@@ -146,14 +146,14 @@ def model(*, toy: bool) -> StageBenchmark:
 
             timing, made = measure_and_keep(reduced, repeats=1, memory=not toy)
             surface, everything = _errors(p, *made, albedo.r_d)
-            told = BandError(float(np.median(surface)), drawn_again(surface, rng=rng))
+            outcome = BandError(float(np.median(surface)), drawn_again(surface, rng=rng))
             total = float(np.median(everything))
             knobs: Knobs = {"part": "lobes", "rank": rank, "subject": subject}
             knobs |= {"points": len(surface), "samples": samples}
             also = {"all_light_error_percent": round(total, 3)}
-            points.append(Point.of(knobs, timing, told, also))
+            points.append(Point.of(knobs, timing, outcome, also))
             if rank == USUAL_RANK:
-                bands |= {b: told for b, one in MELANIN_BANDS.items() if one.preset == subject}
+                bands |= {b: outcome for b, one in MELANIN_BANDS.items() if one.preset == subject}
                 usual.append(total)
     texture = [
         dataclasses.replace(point, knobs={"part": "texture", **point.knobs})

@@ -58,8 +58,10 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
         rate = spent / (count * len(cameras) * len(names))
         # samples of a point err alike: blocks of points are drawn
         blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
-        told = BandError(float(off.mean()), blocks.error_interval)
-        points.append(Point.of({"points": count, "tables": kind}, Timing.single(spent, peak), told))
+        outcome = BandError(float(off.mean()), blocks.error_interval)
+        points.append(
+            Point.of({"points": count, "tables": kind}, Timing.single(spent, peak), outcome)
+        )
     return described("lumitexels", points, {"memory": peak, "hours": rate * N_FULL_SAMPLES / 3600})
 
 

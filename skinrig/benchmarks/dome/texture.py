@@ -102,8 +102,8 @@ def _point(
         ).image
 
     timing = measure(lambda: run(sources[0]), repeats=repeats)
-    told = _error([run(s) for s in sources], describe(target, space=full), full)
-    return Point.of({"side": side, **knobs}, timing, told)
+    outcome = _error([run(s) for s in sources], describe(target, space=full), full)
+    return Point.of({"side": side, **knobs}, timing, outcome)
 
 
 def points(toy: bool) -> tuple[Point, ...]:

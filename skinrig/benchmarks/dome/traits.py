@@ -123,7 +123,7 @@ def _drawn(
     most = min(group, *(len(side) for side in sides))
     whole = most == min(len(side) for side in sides)
     rng = np.random.default_rng(5)
-    seconds, errors, told, kept = [], [], [], []
+    seconds, errors, expected, kept = [], [], [], []
     groups = [
         np.sort(np.concatenate([s if whole else rng.choice(s, most, replace=False) for s in sides]))
         for _ in range(1 if whole else N_GROUP_DRAWS)
@@ -135,7 +135,7 @@ def _drawn(
         space = fit(rows)
         seconds.append(time.perf_counter() - start)
         errors.append(1.0 - judged(space))
-        told.append(space.trait("trait").confidence.expected_cosine)
+        expected.append(space.trait("trait").confidence.expected_cosine)
         kept.append(len(space.basis))
     low, middle, high = (float(v) for v in np.quantile(errors, (0.16, 0.5, 0.84)))
     if whole:
@@ -144,7 +144,10 @@ def _drawn(
     spread = min(seconds), max(seconds)
     timing = Timing(float(np.median(seconds)), spread, seconds[0], rise.mb, "resident")
     shown = {**knobs, "people": 2 * most if not whole else len(label)}
-    also = {"components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4)}
+    also = {
+        "components": int(np.median(kept)),
+        "expected_cosine": round(float(np.median(expected)), 4),
+    }
     return Point(shown, timing, middle, (low, high), also=also)
 
 

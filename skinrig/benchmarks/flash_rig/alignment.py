@@ -300,12 +300,12 @@ def misaligned(*, toy: bool) -> StageBenchmark:
             for radius in (0.0, 16.0) if toy else (0.0, 8.0, 16.0, 32.0):
                 timing, found = measure_and_keep(lambda: blended(radius), repeats=1, memory=False)
                 error = (found - truth)[mask] / size
-                told = _rms(error[np.isfinite(error)], side)
-                errors[radius, off_px, state] = told.error
+                outcome = _rms(error[np.isfinite(error)], side)
+                errors[radius, off_px, state] = outcome.error
                 way = "blended" if radius else "interpolated"
                 knobs: Knobs = {"state": state, "way": way, "off_px": off_px}
                 knobs |= {"radius_px": radius} if radius else {}
-                points.append(Point.of(knobs, timing, told))
+                points.append(Point.of(knobs, timing, outcome))
     limits: Findings = {}
     if not toy:
         for state in ("exercise", "smile"):

@@ -78,8 +78,8 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             knobs: Knobs = {"estimator": name, "subject": subject}
             knobs["noise_percent"] = round(100 * trial.noise, 2)
             judged = trial.clear >= MIN_EVALUATED_SIGMAS
-            told = BandError.around(ratio, spread, 1.0)
-            points.append(Point.of(knobs, timing, told, {"judged": judged}))
+            outcome = BandError.around(ratio, spread, 1.0)
+            points.append(Point.of(knobs, timing, outcome, {"judged": judged}))
             if judged:
                 ratios[str(melanin_band(SUBJECT_CHROMOPHORES[subject][0]))].append((ratio, spread))
         left_out += _left_out(name, points)
@@ -162,10 +162,10 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
     for subject, albedo in zip(SUBJECT_CHROMOPHORES, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
         # shot noise of 20,000 electrons at full scale, read noise of 5
         sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
-        told = light_selection.information(
+        information = light_selection.information(
             normal[None], lights, (sigma / (albedo * lit))[None] ** 2
         )
-        tilt = light_selection.predict(told, range(len(lights)), least=3).tilt_rad[0]
+        tilt = light_selection.predict(information, range(len(lights)), least=3).tilt_rad[0]
         noisy = albedo * lit[:, None] + sigma[:, None] * rng.standard_normal((len(lights), draws))
 
         def squared(noisy: Float64Array = noisy, sigma: Float64Array = sigma) -> Float64Array:

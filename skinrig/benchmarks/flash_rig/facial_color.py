@@ -47,8 +47,8 @@ def rig(*, toy: bool) -> StageBenchmark:
         for name in names:
             found = blood_errors.compare(predict(name), truths[name], neutral, valid=covered)
             left.append(100.0 * found.predicted / found.neutral_kept)
-        told = BandError(*metrics.median_with_interval(left, rng=rng))
-        points.append(Point.of({"misaligned_px": 0} | knobs, timing, told))
+        outcome = BandError(*metrics.median_with_interval(left, rng=rng))
+        points.append(Point.of({"misaligned_px": 0} | knobs, timing, outcome))
 
     def fitted(radius_px: float, stored: int | None, moved_px: int = 0) -> HemoglobinRig:
         return HemoglobinRig.from_maps(

@@ -127,11 +127,11 @@ def curves(*, toy: bool) -> StageBenchmark:
                 return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
 
             off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
-            told = rms_of_draws(off, bound=train.bound_s() if way == "five places" else None)
-            errors[way, train.captures] = told.error
+            outcome = rms_of_draws(off, bound=train.bound_s() if way == "five places" else None)
+            errors[way, train.captures] = outcome.error
             timing = measure(lambda: fitted_s(draws[0]))
             knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}
-            points.append(Point.of(knobs, timing, told))
+            points.append(Point.of(knobs, timing, outcome))
     bands = {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
     limits = {} if toy else _limits(runs, errors, trains)
     return described("perfusion-curves", points, limits, by_band=bands)

@@ -43,15 +43,15 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
             stated = 100 * (lights.intensities_stderr / lights.intensities)[good]
             # the median of a normal distribution's size is 0.674 of its deviation
             bound = float(0.674 * np.median(stated))
-            told = BandError(float(np.median(error)), drawn_again(error, draws=400), bound)
+            outcome = BandError(float(np.median(error)), drawn_again(error, draws=400), bound)
             knobs: Knobs = {"pixels": width_px, "readings": " ".join(map(str, readings))}
-            points.append(Point.of(knobs, timing, told))
+            points.append(Point.of(knobs, timing, outcome))
     aim = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.degrees(np.linalg.norm(lights.directions - aim, axis=1))
     zero = np.degrees(films.misalignment_rad) - scene.films.analyser_zero_deg
     limits = {
         "direction": float(np.median(off[lights.seen])),
-        "intensity": told.error,
+        "intensity": outcome.error,
         "misalignment": float(abs(zero) / np.degrees(films.misalignment_stderr_rad)),
     }
     return described("sphere-lights", points, limits)

@@ -151,16 +151,16 @@ def normals(*, toy: bool) -> StageBenchmark:
     patch = skin_patch(side, smooth=False)
     noisy = exposed(patch, rng)
     points: list[Point] = []
-    told = {"lights": patch.lights, **patch.geometry}
+    corrections = {"lights": patch.lights, **patch.geometry}
 
     def add(knobs: Knobs, images: Images, **options: Any) -> float:
         def error(found: NormalMaps) -> BandError:
-            told = _judged(found.normals, found.valid, patch.seen)
+            outcome = _judged(found.normals, found.valid, patch.seen)
             if "variance" not in options or {"wiener", "smooth_px"} & set(options):
-                return told
+                return outcome
             # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
             rms = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
-            return replace(told, cramer_rao_bound=rms)
+            return replace(outcome, cramer_rao_bound=rms)
 
         knobs.setdefault("noise", "the sensor's")
         repeats = 1 if toy else 3
@@ -176,7 +176,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         "8": ("full", "x", "y", "z"),
         "8, x and -x": ("x", "-x", "y", "z"),
     }
-    base = {**told, "variance": patch.noise, "wiener": True}
+    base = {**corrections, "variance": patch.noise, "wiener": True}
     worst = 0.0
     for label, names in subsets.items():
         some = {key: image for key, image in noisy.items() if key[0] in names}
@@ -184,7 +184,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         worst = error if label == "16" else worst
         if toy and label != "16":
             break
-    plain = {**told, "variance": patch.noise}
+    plain = {**corrections, "variance": patch.noise}
     add({"patterns": "16", "filter": "none"}, noisy, **plain)
     for sigma in (1.0,) if toy else (0.7, 1.0, 1.5):
         add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smooth_px=sigma, **plain)
@@ -194,7 +194,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         variance=patch.noise,
         wiener=True,
     )
-    add({"patterns": "16", "noise": "none"}, patch.images, **told)
+    add({"patterns": "16", "noise": "none"}, patch.images, **corrections)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
     bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
     limits = {} if toy else _limits(worst, rng)

@@ -162,13 +162,13 @@ def truth(*, toy: bool) -> StageBenchmark:
             )
             states_of = zip(made, pairs, strict=True)
             off, wrong = np.array([_slope_errors(one, state) for one, (_, state) in states_of]).T
-            told = mean_error(off.reshape(len(skins), -1).mean(axis=1))
+            outcome = mean_error(off.reshape(len(skins), -1).mean(axis=1))
             variance = float(np.mean(wrong))
-            found[name, across, sampling] = told.error, variance
+            found[name, across, sampling] = outcome.error, variance
             knobs: Knobs = {"kernels": name, "jaws_deg": angle}
             knobs |= {"across": across, "sampling": sampling}
             also = {"variance_error_percent": 100.0 * math.expm1(variance)}
-            points.append(Point.of(knobs, timing, told, also))
+            points.append(Point.of(knobs, timing, outcome, also))
     if toy:
         return described("microstructure", points)
     kept, by_volume = (
@@ -416,11 +416,11 @@ def passes(*, toy: bool) -> StageBenchmark:
                     rng=np.random.default_rng(seed),
                 )
                 found.append(100.0 * error)
-            told = mean_error(found)
-            errors[sigma_px, sampling, turn, growth] = told.error
+            outcome = mean_error(found)
+            errors[sigma_px, sampling, turn, growth] = outcome.error
             knobs: Knobs = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
             knobs |= {"sigma_px": sigma_px, "sampling": sampling}
-            points.append(Point.of(knobs, measure(call, repeats=1, memory=False), told))
+            points.append(Point.of(knobs, measure(call, repeats=1, memory=False), outcome))
     limits: Findings = {}
     if not toy:
         limits = {

@@ -303,8 +303,8 @@ def weighing(*, toy: bool) -> StageBenchmark:
             timing = measure(run, repeats=1, memory=False)
             miss = np.array([run(seed).weights - true for seed in range(draws)])
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
-            told = rms_of_draws(miss, bound=float(np.sqrt(np.mean(bound**2))))
-            points.append(Point.of({"side": side, "noise, mrad": 1e3 * noise}, timing, told))
+            outcome = rms_of_draws(miss, bound=float(np.sqrt(np.mean(bound**2))))
+            points.append(Point.of({"side": side, "noise, mrad": 1e3 * noise}, timing, outcome))
     # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
     limits = {"over_bound": float(np.mean(ratios))}
     return described("wrinkle-weights", points, {} if toy else limits)

@@ -147,9 +147,9 @@ def by_band(trials: Sequence[Trial], *, level: int, confidence: float) -> list[C
         As of `pooled`.
     """
     rows: list[Covered] = []
-    told = [trial for trial in trials if trial.deviation.size]
-    for quantity in dict.fromkeys(trial.quantity for trial in told):
-        of_it = [trial for trial in told if trial.quantity == quantity]
+    counted = [trial for trial in trials if trial.deviation.size]
+    for quantity in dict.fromkeys(trial.quantity for trial in counted):
+        of_it = [trial for trial in counted if trial.quantity == quantity]
         rows.append(pooled(of_it, level=level, confidence=confidence))
         bands = dict.fromkeys(trial.band for trial in of_it)
         if len(bands) > 1:

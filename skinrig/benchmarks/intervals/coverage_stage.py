@@ -76,14 +76,14 @@ def intervals(*, toy: bool) -> Iterator[StageBenchmark]:
 
 
 def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) -> StageBenchmark:
-    told = [trial for trial in trials if trial.deviation.size]
-    counted = len(by_band(told, level=68, confidence=0.95))
+    judged = [trial for trial in trials if trial.deviation.size]
+    counted = len(by_band(judged, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
     confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
     rows = [
         row
         for level in COVERAGE_RANGES
-        for row in by_band(told, level=level, confidence=confidence)
+        for row in by_band(judged, level=level, confidence=confidence)
     ]
     return described(
         "intervals",

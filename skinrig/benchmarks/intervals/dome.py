@@ -94,11 +94,17 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
     shape = valid_of(albedo).shape
     true = np.zeros((*shape, 3))
     true[pairs.rows, pairs.columns] = true_albedo
-    told = np.zeros(shape, bool)
-    told[pairs.rows, pairs.columns] = True
+    covered = np.zeros(shape, bool)
+    covered[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(CHANNEL_NAMES):
         yield of_map(
-            f"R_d, {color}", albedo, true, told, **who, channel=channel, factor_95=FACTORS_95["R_d"]
+            f"R_d, {color}",
+            albedo,
+            true,
+            covered,
+            **who,
+            channel=channel,
+            factor_95=FACTORS_95["R_d"],
         )
     off, stderr = lobe_strength(found, truth)
     yield of_errors(

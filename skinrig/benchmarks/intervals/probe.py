@@ -175,8 +175,8 @@ def of_coefficient(
     for entry in fitted["measurements"]:
         true = known[evaluation.name_of(entry)][f"{name}_per_mm"]
         for fit in entry["fits"]:
-            told = fit["valid"] and fit["coefficients_identified"]
-            if fit["method"] != evaluation.RECOMMENDED_METHOD or not told:
+            identified = fit["valid"] and fit["coefficients_identified"]
+            if fit["method"] != evaluation.RECOMMENDED_METHOD or not identified:
                 continue
             value = evaluation.number(fit[f"{name}_per_mm"])
             off.append(abs(value / true[CHANNEL_NAMES.index(fit["channel"])] - 1.0))

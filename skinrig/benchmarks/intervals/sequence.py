@@ -70,9 +70,9 @@ def sequences(
             calibration=folder / "calibration",
             landmarks=truth / "landmarks.csv",
         )
-        told = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
+        document = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
         who: dict[str, Any] = {"subject": f"{preset} {seed}", "band": _band(truth)}
-        fits = list(told["fits"].values())
+        fits = list(document["fits"].values())
         yield of_fits(f"time constant after {state}", fits, constant_s, **who)
         course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
         if "reaction_s" in course:

@@ -67,8 +67,8 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
             "exposed_s": round(float(bench.times[chosen].sum()), 1),
             "measured_percent": round(float(100 * valid.mean()), 1),
         }
-        told = BandError(float(np.median(miss)), _interval(miss.reshape(len(miss), -1)), least)
-        points.append(Point.of({"exposures": count}, timing, told, also))
+        outcome = BandError(float(np.median(miss)), _interval(miss.reshape(len(miss), -1)), least)
+        points.append(Point.of({"exposures": count}, timing, outcome, also))
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
     near = bench.truth.ravel() > 1e-5 * bench.truth.max()

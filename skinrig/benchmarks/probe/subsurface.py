@@ -103,11 +103,11 @@ def tiers(*, toy: bool) -> StageBenchmark:
                 for k, name in enumerate(MELANIN_BANDS)
             }
         error = np.abs(relative[:, spread])
-        told = BandError(float(np.median(error)), _over_media(error))
+        outcome = BandError(float(np.median(error)), _over_media(error))
         radius = FIBER_RADII_MM[part]
         knobs: Knobs = {"model": method, "fibres": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
-        points.append(Point.of(knobs, timing, told))
+        points.append(Point.of(knobs, timing, outcome))
         if part == slice(None):
             bias = np.median(relative[:, spread], axis=0)
             low, high = np.moveaxis(found.interval_per_mm, -1, 0)
@@ -207,8 +207,8 @@ def batches(*, toy: bool) -> StageBenchmark:
             # the bound is that of noise alone: an error that is allowed for is not in these data
             bound = float(np.median(drawn[:n])) if model_error == 0.0 else None
             own = "none" if model_error == 0.0 else "diffusion's"
-            told = median_error(error, bound=bound)
-            points.append(Point.of({"profiles": n, "model error": own}, timing, told))
+            outcome = median_error(error, bound=bound)
+            points.append(Point.of({"profiles": n, "model error": own}, timing, outcome))
             if not bands and n == count:
                 bands = {
                     name: median_error(error[some], bound=float(np.median(drawn[some])))

@@ -94,13 +94,13 @@ def table(*, toy: bool) -> StageBenchmark:
             ("bilinear", _bilinear(made, c_m, c_hd)),
         ):
             difference = metrics.delta_e_2000(_lab(color), reference)
-            told = _largest(difference)
-            points.append(Point.of({"size": size, "between nodes": between}, timing, told))
+            outcome = _largest(difference)
+            points.append(Point.of({"size": size, "between nodes": between}, timing, outcome))
             if (size, between) == (BAND_TABLE_SIZE, "spline"):
                 by_band = {
                     band: _largest(difference[melanin_band(c_m) == band]) for band in MELANIN_BANDS
                 }
-            if told.error < 0.5 and not np.isfinite(smallest[between]):
+            if outcome.error < 0.5 and not np.isfinite(smallest[between]):
                 smallest[between] = size
     return described(
         "color-table",

@@ -127,9 +127,9 @@ def directions(*, toy: bool) -> StageBenchmark:
         one = profiles[:, :3]  # three channels of one measurement
         for way in WAYS:
             timing = measure(lambda: _told(way, angle, one), repeats=1 if toy else 3, memory=False)
-            told = _ratio_error(_told(way, angle, profiles), _bound(count))
-            errors[way, count] = told.error
-            points.append(Point.of({"way": way, "directions": count}, timing, told))
+            outcome = _ratio_error(_told(way, angle, profiles), _bound(count))
+            errors[way, count] = outcome.error
+            points.append(Point.of({"way": way, "directions": count}, timing, outcome))
     bands = {
         name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
         for name, band in MELANIN_BANDS.items()
@@ -145,10 +145,10 @@ def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator
     return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(count, medium))
 
 
-def _ratio_error(told: anisotropy.Anisotropy, bound: float) -> BandError:
+def _ratio_error(outcome: anisotropy.Anisotropy, bound: float) -> BandError:
     """Return the error of the log of the ratio, of cases of which one is used up."""
-    off = np.log(told.ratio) - math.log(TRUE_RATIO)
-    return rms_of_draws(off, bound=bound, freedom=len(told.ratio) - 1)
+    off = np.log(outcome.ratio) - math.log(TRUE_RATIO)
+    return rms_of_draws(off, bound=bound, freedom=len(outcome.ratio) - 1)
 
 
 def _direction_limits(
@@ -220,8 +220,8 @@ def sites(*, toy: bool) -> StageBenchmark:
         )
         error, bound = (math.sqrt(float(np.mean(part))) for part in (squares, stated))
         spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
-        told = BandError.around(error, spread, bound)
-        points.append(Point.of({"sites": count, "side": size}, timing, told))
+        outcome = BandError.around(error, spread, bound)
+        points.append(Point.of({"sites": count, "side": size}, timing, outcome))
         if count == 3:
             within, three_sites = float(np.mean(inside)), error
     limits: Findings = {}

@@ -100,5 +100,5 @@ def _point(
     knobs: Knobs, seconds: float, error: float, memory_mb: float | None, pixels: int
 ) -> Point:
     timing = Timing.single(seconds, memory_mb, memory_of="resident")
-    told = BandError.around(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
-    return Point.of(knobs, timing, told)
+    outcome = BandError.around(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
+    return Point.of(knobs, timing, outcome)

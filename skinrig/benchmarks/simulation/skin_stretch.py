@@ -52,10 +52,10 @@ def stretched(*, toy: bool) -> StageBenchmark:
                 memory=not toy,
             )
             pairs = zip(states, truth, strict=True)
-            told = mean_error([100.0 * abs(_variance(s, half) / t - 1.0) for s, t in pairs])
+            outcome = mean_error([100.0 * abs(_variance(s, half) / t - 1.0) for s, t in pairs])
             evaluations = np.mean([s.convergence.evaluations for s in states])
             knobs = {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)}
-            points.append(Point.of(knobs, timing, told))
+            points.append(Point.of(knobs, timing, outcome))
     return described("skin-stretch", points, {} if toy else _limits())
 
 
