@@ -145,10 +145,10 @@ def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator
     return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(count, medium))
 
 
-def _ratio_error(outcome: anisotropy.Anisotropy, bound: float) -> BandError:
+def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> BandError:
     """Return the error of the log of the ratio, of cases of which one is used up."""
-    off = np.log(outcome.ratio) - math.log(TRUE_RATIO)
-    return rms_of_draws(off, bound=bound, freedom=len(outcome.ratio) - 1)
+    off = np.log(found.ratio) - math.log(TRUE_RATIO)
+    return rms_of_draws(off, bound=bound, freedom=len(found.ratio) - 1)
 
 
 def _direction_limits(

@@ -104,19 +104,19 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
     radii = np.array(probe.radius_mm)
     stack = _half_space(*RED_MEDIUM_PER_MM)
     points: list[Point] = []
-    outcome = partial(measure_and_keep, repeats=1, memory=None)
+    timed = partial(measure_and_keep, repeats=1, memory=None)
     for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
-        timing, run = outcome(lambda: _next_event(stack, radii, photons))
+        timing, run = timed(lambda: _next_event(stack, radii, photons))
         knobs: Knobs = {"quantity": "fibres", "score": "next event", "photons": photons}
         points.append(Point.of(knobs, timing, _worst(run.stderr / run.reflectance_per_mm2)))
     for photons in (1000, 2000) if toy else (80_000, 320_000):
-        timing, relative = outcome(lambda: _in_the_cone(radii, photons))
+        timing, relative = timed(lambda: _in_the_cone(radii, photons))
         knobs = {"quantity": "fibres", "score": "leaves in the cone", "photons": photons}
         points.append(Point.of(knobs, timing, _worst(relative)))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
         with suppress(ValueError):  # no LLVM on this machine
-            timing, total = outcome(
+            timing, total = timed(
                 lambda: transport(
                     medium,
                     photons=2000 if toy else 400_000,

@@ -66,9 +66,9 @@ def render(*, toy: bool) -> StageBenchmark:
 
 def _worse(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> BandError:
     """Return the larger of both images' relative errors, %, where the sphere fills pixels."""
-    outcome = []
+    errors = []
     for name, true in truth.items():
         whole = binary_erosion(true > 0.0, iterations=2)
         difference = (found[name].astype(np.float64) - true) * 100.0 / true[whole].mean()
-        outcome.append(tiled_rms(difference, whole, tile_px=8))
-    return max(outcome, key=lambda one: one.error)
+        errors.append(tiled_rms(difference, whole, tile_px=8))
+    return max(errors, key=lambda one: one.error)
