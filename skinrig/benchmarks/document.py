@@ -7,11 +7,12 @@ import math
 import os
 import platform
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
 
-from skinrig.benchmarks.results import BandError, Limit, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Point, StageBenchmark
 from skinrig.evaluating import skin_bands
 
 SCHEMA: Final = "skinrig.bench/2"
@@ -107,12 +108,9 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
     found = fronts(stage)
     on_front = {number for front in found for number in front["points"]}
     knees = {front["knee"] for front in found}
+    names = ("error_name", "reference", "reference_error", "reference_error_means", "interval_of")
     return {
-        "error_name": stage.error_name,
-        "reference": stage.reference,
-        "reference_error": stage.reference_error,
-        "reference_error_means": stage.reference_error_means,
-        "interval_of": stage.interval_of,
+        **{name: getattr(stage, name) for name in names},
         "points": [
             {
                 **_point(point, squared=stage.squared),
@@ -122,7 +120,7 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
             for number, point in enumerate(stage.points)
         ],
         "fronts": found,
-        "limits": [_limit(limit) for limit in stage.limits],
+        "limits": [asdict(limit) | {"passed": limit.passed} for limit in stage.limits],
         "left_out": [list(item) for item in stage.left_out],
         "by_band": [_band(name, error) for name, error in stage.by_band.items()],
         "darkest_over_lightest": _dark_over_light(stage.by_band),
@@ -150,39 +148,21 @@ def _point(point: Point, *, squared: bool) -> dict[str, Any]:
     }
 
 
-def _limit(limit: Limit) -> dict[str, Any]:
-    return {
-        "name": limit.name,
-        "got": limit.got,
-        "bound": limit.bound,
-        "sense": limit.sense,
-        "unit": limit.unit,
-        "passed": limit.passed,
-    }
+def _band(name: str, error: BandError) -> dict[str, Any]:
+    return {"band": name, **asdict(error), "error_interval": list(error.error_interval)}
 
 
-def _band(name: str, told: BandError | float) -> dict[str, Any]:
-    if not isinstance(told, BandError):
-        return {"band": name, "error": told, "error_interval": None, "cramer_rao_bound": None}
-    return {
-        "band": name,
-        "error": told.error,
-        "error_interval": list(told.error_interval),
-        "cramer_rao_bound": told.cramer_rao_bound,
-    }
-
-
-def _dark_over_light(by_band: Mapping[str, BandError | float]) -> dict[str, Any] | None:
+def _dark_over_light(by_band: Mapping[str, BandError]) -> dict[str, Any] | None:
     """Return the last band's error over the first's, with the ends that both intervals allow."""
-    told = [one for one in by_band.values() if isinstance(one, BandError)]
-    if len(told) < 2 or not told[0].error > 0.0:
+    skins = list(by_band.values())
+    if len(skins) < 2 or not skins[0].error > 0.0:
         return None
     (light_low, light_high), (dark_low, dark_high) = (
-        told[0].error_interval,
-        told[-1].error_interval,
+        skins[0].error_interval,
+        skins[-1].error_interval,
     )
     return {
-        "ratio": told[-1].error / told[0].error,
+        "ratio": skins[-1].error / skins[0].error,
         "interval": [
             max(dark_low, 0.0) / light_high,
             dark_high / light_low if light_low > 0.0 else math.inf,

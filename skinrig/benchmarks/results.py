@@ -142,7 +142,7 @@ class StageBenchmark:
     limits: tuple[Limit, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     """What this run did not measure, and why."""
-    by_band: Mapping[str, BandError | float] = field(default_factory=dict)
+    by_band: Mapping[str, BandError] = field(default_factory=dict)
     """Error by melanin band, from light to dark, same unit; see `skinrig.evaluating.skin_bands`."""
     no_bands: str = ""
     """Why errors do not depend on how dark skin is, where there are no bands."""
