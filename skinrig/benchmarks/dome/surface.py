@@ -76,15 +76,10 @@ def _gathered(
 ) -> tuple[float, float, list[FloatArray]]:
     """Gather some points; return seconds, MB held, and relative errors of the samples."""
     where = sphere.vertices[:count]
+    surface = Surface(where, where / SPHERE_RADIUS_MM)
     tracemalloc.start()
     start = time.perf_counter()
-    store = LumitexelStore(
-        Surface(where, where / SPHERE_RADIUS_MM),
-        cameras=cameras,
-        lights=lights,
-        caster=caster,
-        **table,
-    )
+    store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
     spent = time.perf_counter() - start
     for view, light in itertools.product(range(len(cameras)), range(len(lights.position_mm))):
         image = _image(seen[view], lights, light)
