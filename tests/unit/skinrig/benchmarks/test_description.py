@@ -1,0 +1,37 @@
+"""The table of stages: every entry is measured by a function and promises one bound a limit."""
+
+import ast
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from skinrig.benchmarks.description import described, descriptions
+
+
+@pytest.mark.parametrize("name", descriptions())
+def test_a_stage_has_a_function_and_limits_that_its_module_names(name):
+    entry = descriptions()[name]
+    module, function = entry["run"].rsplit(".", 1)
+    source = Path(find_spec(f"skinrig.benchmarks.{module}").origin).read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    assert function in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+    words = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
+    for key, limit in entry.get("limits", {}).items():
+        assert key in words
+        assert ("at_most" in limit) != ("at_least" in limit)
+
+
+def test_what_was_found_fills_the_names_and_bounds_of_limits():
+    found = {"over_own_walk": 5.0}
+    assert described("photon-transport", (), found).limits[0].passed
+    clean = described("gradient-normals", (), {("clean", "as it is"): 1.0}).limits[0]
+    assert clean.name == "mean error without noise on smooth relief, as it is"
+    assert (clean.sense, clean.bound, clean.unit, clean.passed) == ("<=", 0.3, "degrees", False)
+    rms = described("light-order", (), {"rms": (0.1, 0.2)}).limits[0]
+    assert (rms.got, rms.bound, rms.passed) == (0.1, 0.2, True)
+
+
+def test_a_limit_that_the_table_lacks_is_an_error():
+    with pytest.raises(KeyError, match="tea"):
+        described("hdr", (), {"tea": 1.0})
