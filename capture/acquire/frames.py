@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from capture import raw
-from capture.devices.camera import Camera, CameraError, Exposure, Frame
-from capture.plan import Step
+from capture.devices.camera import Camera, CameraError, Exposure, Frame, Trigger, next_frame
+from capture.plan import Step, Value
 from capture.rig import View
 from capture.session import Session
 
@@ -31,6 +32,34 @@ def configure(name: str, camera: Camera, want: Exposure) -> None:
         )
 
 
+def arm_cameras(
+    cameras: Mapping[str, Camera], want: Exposure, triggers: Mapping[str, Trigger]
+) -> dict[str, float]:
+    """Set cameras and arm each for one frame; return each one's time of that, s, by view."""
+    armed_s = {}
+    for name, camera in cameras.items():
+        configure(name, camera, want)
+        camera.arm(1, triggers[name])
+        armed_s[name] = camera.clock_s()
+    return armed_s
+
+
+def collect(
+    cameras: Mapping[str, Camera],
+    want: Exposure,
+    armed_s: Mapping[str, float],
+    timeouts_s: Mapping[str, float],
+) -> tuple[dict[str, Frame], int]:
+    """Return one believed frame a camera, by view, and how many stale ones were dropped."""
+    frames, stale = {}, 0
+    for name, camera in cameras.items():
+        frames[name], dropped = next_frame(
+            camera, seq=0, not_before_s=armed_s[name], want=want, timeout_s=timeouts_s[name]
+        )
+        stale += dropped
+    return frames, stale
+
+
 def frame_timeout_s(step: Step, view: View) -> float:
     """Return how long a step's frame may take to come, s."""
     return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
@@ -42,39 +71,38 @@ def encode(
     camera: Camera,
     step: Step,
     session: Session,
-    light: Mapping[str, str | float],
+    light: Mapping[str, Value],
 ) -> bytes:
     """Encode a frame as our DNG, with the step and the light in it."""
+    info = camera.info
     if isinstance(frame.image, bytes):
         # a maker's raw file is written anew: its own metadata can name people and places
-        picture = raw.decode(memoryview(frame.image), where=f"step {step.id}, view {view.name}")
-        cfa, pattern, black, white = picture.cfa, picture.pattern, picture.black, picture.white
-        matrix, profile, neutral = picture.color_matrix, picture.noise_profile, picture.neutral
+        where = f"step {step.id}, view {view.name}"
+        picture = raw.decode(memoryview(frame.image), where=where)
     else:
-        info = camera.info
-        cfa, pattern, black, white = frame.image, info.pattern, info.black, info.white
-        matrix, neutral = None, None
-        profile = raw.noise_profile(
-            view.gain_e_per_dn,
-            view.read_noise_e,
-            black=float(np.mean(info.black)),
-            white=float(info.white),
+        black, white = float(np.mean(info.black)), float(info.white)
+        noise = raw.noise_profile(view.gain_e_per_dn, view.read_noise_e, black=black, white=white)
+        picture = raw.RawFrame(
+            cfa=frame.image,
+            pattern=info.pattern,
+            black=tuple(map(float, info.black)),
+            white=int(info.white),
+            noise_profile=noise,
+            step_id=step.id,
         )
-    return raw.encode_dng(
-        cfa,
-        pattern=pattern,
-        black=black,
-        white=white,
-        exposure_s=frame.exposure.exposure_s,
-        iso=frame.exposure.iso,
-        camera_model=camera.info.model,
-        camera_serial=frame.serial,
-        color_matrix=matrix,
-        neutral=neutral,
-        noise_profile=profile,
-        f_number=view.f_number,
-        focal_mm=view.focal_mm,
-        step_id=step.id,
-        session_id=session.id,
-        light=light,
+    return raw.encode_frame(
+        replace(
+            picture,
+            exposure_s=frame.exposure.exposure_s,
+            iso=frame.exposure.iso,
+            camera_model=info.model,
+            camera_serial=frame.serial,
+            color_illuminant="D65",
+            f_number=view.f_number,
+            focal_mm=view.focal_mm,
+            captured_at=None,
+            step_id=step.id,
+            session_id=session.id,
+            light=light,
+        )
     )

@@ -1,16 +1,21 @@
-"""What a run of a plan comes to, on any rig: its account, its errors, its end in the dark."""
+"""A run of a plan, on any rig: what it uses, what it keeps, its account, its end in the dark."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+import secrets
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
-from capture.devices.camera import Camera
+from capture.acquire.frames import encode
+from capture.devices.box import Box
+from capture.devices.camera import Camera, CameraError, Frame, Trigger
+from capture.devices.led_box import Eyes
 from capture.devices.port import SYSTEM_CLOCK, Clock, DeviceError
-from capture.plan import Step
+from capture.plan import Plan, Step, Value
+from capture.rig import Rig
 from capture.session import Session
 
 log = logging.getLogger(__name__)
@@ -51,24 +56,45 @@ class Acquired:
     dead_lights: tuple[str, ...] = ()
 
 
+def _ignore(_: str) -> None:
+    """Do nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Who runs a plan: asked, told, and able to stop it."""
+    """Who runs a plan: asked, kept informed, and able to stop it.
 
-    progress: Callable[[str], None]
-    """Told what is going on, in one line."""
-    prompt: Callable[[str], None]
-    """Asked to make something ready; returns when it is."""
-    interrupted: Callable[[], bool]
-    """Asked whether to stop in good order."""
-    clock: Callable[[], float]
-    """The host's time, s since 1970."""
-    run_id: str
-    """Begins every token of this run."""
-    signal: Callable[[str], None] = lambda text: None
-    """Gives the subject a sound, and returns at once."""
+    Attributes
+    ----------
+    progress
+        Called with one line a step, or a second of a sequence.
+    prompt
+        Called before the first step that needs it with the state ("smile"), with the place of the
+        target on the dome ("pose 3"), with how skin is to be taped ("tape the skin at 45
+        degrees"), or with where the probe goes ("put the cap on the head", "place the head on the
+        cheek at 0 degrees"); returns when the subject or the target is ready. Called
+        too with what to press when only a hand can release a camera.
+    interrupted
+        Asked before each step, or each sequence; True stops in good order.
+    clock
+        The host's time, s since 1970, for the journal.
+    run_id
+        Begins the token of every flash or sequence of this run; drawn at random by default, so
+        that no two bear one token, also after a resume.
+    signal
+        Called in a sequence with the state that the subject shall change to, at the time; gives a
+        sound and returns at once.
+    timer
+        What the times of a sequence are kept by; the world's own where it is simulated.
+    """
+
+    progress: Callable[[str], None] = _ignore
+    prompt: Callable[[str], None] = _ignore
+    interrupted: Callable[[], bool] = lambda: False
+    clock: Callable[[], float] = time.time
+    run_id: str = field(default_factory=lambda: secrets.token_hex(4))
+    signal: Callable[[str], None] = _ignore
     timer: Clock = SYSTEM_CLOCK
-    """What the times of a sequence are kept by."""
 
     def stop_if_asked(self) -> None:
         """Raise `Interrupted` when the capture is to stop."""
@@ -76,42 +102,143 @@ class Operator:
             raise Interrupted
 
 
-class _Darkened(Protocol):
-    """The part of a driver that ends every capture."""
+@dataclass(slots=True)
+class CaptureRun:
+    """One run of a plan: what it uses, and what it has done so far.
 
-    def dark(self) -> None:
-        """Put all light out and disarm."""
+    Attributes
+    ----------
+    plan, rig, cameras, session, operator, eyes, force_limit_n, all_brackets
+        See `capture.acquire.run.run_plan`.
+    steps, frames, stale, retakes : int
+        What was done so far, see `Acquired`.
+    """
+
+    plan: Plan
+    rig: Rig
+    cameras: Mapping[str, Camera]
+    session: Session
+    operator: Operator
+    eyes: Eyes = "open"
+    force_limit_n: float | None = None
+    all_brackets: bool = False
+    steps: int = 0
+    frames: int = 0
+    stale: int = 0
+    retakes: int = 0
+    _attempts: dict[tuple[str, str], int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Look up the last attempt of each frame that is committed."""
+        records = self.session.frames()
+        self._attempts = {(record.step_id, record.camera): record.attempt for record in records}
+
+    def steps_to_do(self) -> list[Step]:
+        """Return the steps that lack a frame of any camera, once each, in the plan's order."""
+        return list({step.id: step for step, _ in self.session.todo()}.values())
+
+    def cameras_of(self, step: Step) -> dict[str, Camera]:
+        """Return the cameras of a step, by view."""
+        return {name: self.cameras[name] for name in step.cameras}
+
+    def camera_mask(self, step: Step) -> int:
+        """Return the trigger lines of a step's cameras, bit by bit in the order of the views."""
+        return sum(1 << k for k, view in enumerate(self.rig.views) if view.name in step.cameras)
+
+    def light_names(self, leds: Sequence[int]) -> str:
+        """Return the names of lights by number, joined by +."""
+        return "+".join(self.rig.lights[led].name for led in leds)
+
+    def encoded(self, step: Step, name: str, frame: Frame, light: Mapping[str, Value]) -> bytes:
+        """Return a frame of the view ``name`` as our DNG."""
+        view, camera = self.rig.view(name), self.cameras[name]
+        return encode(frame, view, camera, step, self.session, light)
+
+    def keep(
+        self,
+        step: Step,
+        frames: Mapping[str, Frame],
+        *,
+        light: Mapping[str, Value],
+        tries: int,
+        t_box_s: float | None,
+        noted: Mapping[str, Value],
+    ) -> None:
+        """Commit the frames of a step, one a camera.
+
+        Parameters
+        ----------
+        step, frames
+            The step and its frames by view.
+        light
+            What made the frames; written into each file.
+        tries
+            How often the step was shot until all cameras had it.
+        t_box_s
+            When the cameras were released, on the box's clock; None where no box did.
+        noted
+            What else the journal says of the frames.
+        """
+        for name, frame in frames.items():
+            # a step of which only some cameras were kept is shot again with all of them
+            attempt = self._attempts.get((step.id, name), 0) + 1
+            shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
+            self.session.commit(
+                step.id,
+                name,
+                self.encoded(step, name, frame, light),
+                settings=dict(step.settings),
+                actual={**shot, "serial": frame.serial, "tries": tries, **noted},
+                t_box_s=t_box_s,
+                t_host_s=self.operator.clock(),
+                attempt=attempt,
+            )
+            self._attempts[step.id, name] = attempt
+            self.frames += 1
+        self.steps += 1
+
+    def missed(self, step: Step, attempt: int, why: object) -> str:
+        """Note that a step must be taken again; return why."""
+        log.warning("step %s, attempt %d: %s", step.id, attempt, why)
+        self.retakes += 1
+        return str(why)
+
+    def leave_out(self, ids: Sequence[str], reason: str, about: Mapping[str, Value]) -> None:
+        """Note in the session that steps are not taken, and why."""
+        time_s = self.operator.clock()
+        self.session.leave_out(ids, reason=reason, about=about, t_host_s=time_s)
+
+    def given_up(self, what: str, why: str) -> AcquisitionError:
+        """Return the error of a step that failed too often, with what to do about it."""
+        safe = "what was captured is safe: mend the cause and run the same command with --resume"
+        again = "nothing was captured: mend the cause and start again"
+        advice = safe if self.session.frames() else again
+        return AcquisitionError(f"{what}: failed {MAX_ATTEMPTS} times ({why}); {advice}")
+
+    def account(self, dead_leds: Iterable[int] = ()) -> Acquired:
+        """Return what was done, with the numbers of the LEDs that drew no current."""
+        dead = tuple(self.rig.lights[led].name for led in sorted(dead_leds))
+        return Acquired(self.steps, self.frames, self.stale, self.retakes, dead)
+
+    def tear_down(self, box: Box) -> None:
+        """Put the light out and let the cameras go; nothing here hides the error that led here."""
+        try:
+            box.dark()
+        except DeviceError as error:
+            # the box's own lease puts the light out when the host is not heard
+            log.error("the box could not be told to go dark: %s; its lease ends the light", error)
+        for camera in self.cameras.values():
+            with contextlib.suppress(DeviceError):
+                camera.abort()
 
 
-def steps_to_do(session: Session) -> list[Step]:
-    """Return the steps that lack a frame of any camera, once each, in the plan's order."""
-    found: dict[str, Step] = {}
-    for step, _ in session.todo():
-        found.setdefault(step.id, step)
-    return list(found.values())
+def refuse_step(step: Step, what: str, *, done: str = "lit") -> AcquisitionError:
+    """Return the error of a step that asks for more than its box allows; nothing was ``done``."""
+    return AcquisitionError(f"step {step.id}: {what}; nothing was {done}: change the plan")
 
 
-def attempts_so_far(session: Session) -> dict[tuple[str, str], int]:
-    """Return the last attempt of each committed frame, by step and camera."""
-    return {(record.step_id, record.camera): record.attempt for record in session.frames()}
-
-
-def given_up(what: str, why: str, session: Session) -> AcquisitionError:
-    """Return the error of a step that failed too often, with what to do about it."""
-    safe = "what was captured is safe: mend the cause and run the same command with --resume"
-    return AcquisitionError(
-        f"{what}: failed {MAX_ATTEMPTS} times ({why}); "
-        + (safe if session.frames() else "nothing was captured: mend the cause and start again")
-    )
-
-
-def tear_down(box: _Darkened, cameras: Mapping[str, Camera]) -> None:
-    """Put the light out and let the cameras go; nothing here hides the error that led here."""
-    try:
-        box.dark()
-    except DeviceError as error:
-        # the box's own lease puts the light out when the host is not heard
-        log.error("the box could not be told to go dark: %s; its lease ends the light", error)
-    for camera in cameras.values():
-        with contextlib.suppress(DeviceError):
-            camera.abort()
+def require_trigger_line(name: str, camera: Camera, why: str) -> None:
+    """Raise where a box's line cannot release a camera; ``why`` names the line and the need."""
+    if Trigger.EDGE not in camera.info.triggers:
+        serial = camera.info.serial
+        raise CameraError(f"view {name!r}: the camera {serial} cannot be released by the {why}")

@@ -331,22 +331,6 @@ def _commit(
         settings["exposure_s"] = frame.exposure_s
     if frame.iso is not None:
         settings["iso"] = frame.iso
-    blob = raw.encode_dng(
-        frame.cfa,
-        pattern=frame.pattern,
-        black=frame.black,
-        white=frame.white,
-        exposure_s=frame.exposure_s,
-        iso=frame.iso,
-        camera_model=frame.camera_model,
-        camera_serial="unknown",
-        color_matrix=frame.color_matrix,
-        color_illuminant=frame.color_illuminant,
-        neutral=frame.neutral,
-        noise_profile=frame.noise_profile,
-        f_number=frame.f_number,
-        focal_mm=frame.focal_mm,
-        step_id=step.id,
-        session_id=session.id,
-    )
-    session.commit(step.id, "cam", blob, settings=settings, actual={}, t_host_s=clock().timestamp())
+    frame = replace(frame, camera_serial="unknown", step_id=step.id, session_id=session.id)
+    blob, now_s = raw.encode_frame(frame), clock().timestamp()
+    session.commit(step.id, "cam", blob, settings=settings, actual={}, t_host_s=now_s)

@@ -7,7 +7,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -378,28 +378,12 @@ def _assumptions(
 
 
 def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
-    photo = read_photo(entry.file)
-    frame = photo.frame
     (view,) = step.cameras
-    model = frame.camera_model
-    blob = raw.encode_dng(
-        frame.cfa,
-        pattern=frame.pattern,
-        black=frame.black,
-        white=frame.white,
-        exposure_s=frame.exposure_s,
-        iso=frame.iso,
-        camera_model=model,
+    frame = replace(
+        read_photo(entry.file).frame,
         camera_serial=session.rig.view(view).serial,
-        color_matrix=frame.color_matrix,
-        color_illuminant=frame.color_illuminant,
-        neutral=frame.neutral,
-        noise_profile=frame.noise_profile,
-        f_number=frame.f_number,
-        focal_mm=frame.focal_mm,
         step_id=step.id,
         session_id=session.id,
     )
-    session.commit(
-        step.id, view, blob, settings=step.settings, actual={}, t_host_s=clock().timestamp()
-    )
+    blob, now_s = raw.encode_frame(frame), clock().timestamp()
+    session.commit(step.id, view, blob, settings=step.settings, actual={}, t_host_s=now_s)

@@ -1,6 +1,6 @@
 """Raw frames: our own DNG written and read, foreign raw files read, linear values with variance."""
 
-from capture.raw.dng import encode_dng, write_dng
+from capture.raw.dng import encode_dng, encode_frame, write_dng
 from capture.raw.frame import RawError, RawFrame, noise_profile
 from capture.raw.linear import Demosaic, LinearImage, interpolate, linear_mono, linear_rgb
 from capture.raw.reading import decode, read
@@ -12,6 +12,7 @@ __all__ = [
     "RawFrame",
     "decode",
     "encode_dng",
+    "encode_frame",
     "interpolate",
     "linear_mono",
     "linear_rgb",

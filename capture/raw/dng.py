@@ -120,7 +120,12 @@ def encode_dng(
         light=dict(description.pop("light", None) or {}),
         **description,
     )
-    pixels = np.ascontiguousarray(cfa, dtype="<u2").tobytes()
+    return encode_frame(frame)
+
+
+def encode_frame(frame: RawFrame) -> bytes:
+    """Return the bytes of a DNG that holds a frame unchanged; see `encode_dng`."""
+    pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").tobytes()
     exif = _exif_entries(frame)
     # lay out once with zero offsets to learn the sizes, then with the true ones
     main = directory(_main_entries(frame, pixels, 0, 0), 8)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from capture.acquire import run_plan
+from capture.acquire import Operator, run_plan
 from capture.devices.box import Box
 from capture.devices.camera import Camera, open_camera
 from capture.devices.dome import Eyes
@@ -144,13 +144,15 @@ def _run(
                 boxes=boxes,
                 cameras=cameras,
                 session=session,
-                progress=console.progress,
-                prompt=partial(ask, console.progress),
-                interrupted=stopped,
+                operator=Operator(
+                    progress=console.progress,
+                    prompt=partial(ask, console.progress),
+                    interrupted=stopped,
+                    signal=partial(sound, console.progress),
+                ),
                 eyes=order.eyes,
                 force_limit_n=order.force_limit_n,
                 all_brackets=order.all_brackets,
-                signal=partial(sound, console.progress),
             )
         session.close()
         left_out = dict(session.left_out())

@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from capture.acquire import run_plan
+from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.devices.dome import Eyes
 from capture.plan import Plan
@@ -179,7 +178,15 @@ def drive(
         for kind in rig.boxes
     }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
-    hear = None if signal is None else partial(signal, world)
+    operator = Operator(
+        progress=order.progress or (lambda line: None),
+        prompt=lambda text: None if prompt is None else prompt(world, text),
+        signal=lambda state: None if signal is None else signal(world, state),
+        timer=world.clock,
+        clock=time.time if begun_s is None else lambda: begun_s + world.now,
+    )
+    if run_id:
+        operator = replace(operator, run_id=run_id)
     try:
         run_plan(
             session.plan,
@@ -187,15 +194,10 @@ def drive(
             boxes=boxes,
             cameras=cameras,
             session=session,
-            progress=order.progress,
-            prompt=lambda text: None if prompt is None else prompt(world, text),
+            operator=operator,
             eyes=eyes,
             force_limit_n=force_limit_n,
-            run_id=run_id,
             all_brackets=all_brackets,
-            signal=hear,
-            timer=world.clock,
-            clock=time.time if begun_s is None else lambda: begun_s + world.now,
         )
         session.close()
         return float(world.now)

@@ -49,7 +49,6 @@ LONG_FUNCTIONS = {
     "skinrig/exporting/sessions/stokes.py:_write": 92,
 }
 MANY_PARAMETERS = {
-    "capture/acquire/run.py:run_plan": 15,
     "model/displacement_synthesis/growth.py:lay_out": 13,
     "model/texture_statistics/description.py:match": 13,
     "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 15,

@@ -89,14 +89,7 @@ def capture(tmp_path, monkeypatch):
             subject=Subject("p"),
             source="simulated",
         ) as session:
-            run_plan(
-                plan,
-                rig,
-                boxes={"flash": box},
-                cameras={"cam": camera},
-                session=session,
-                prompt=lambda text: None,
-            )
+            run_plan(plan, rig, boxes={"flash": box}, cameras={"cam": camera}, session=session)
             session.close()
         box.close()
         world.unregister()

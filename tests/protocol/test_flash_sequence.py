@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from capture.acquire import run_plan
+from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port
@@ -57,11 +57,13 @@ def run(path, plan, *, faults=None, stop_after=None, resume=False, host_s=1e9):
             boxes={"flash": box},
             cameras={"cam": camera},
             session=session,
-            progress=progress,
-            signal=lambda state: heard.append((world.now, state)),
-            timer=world.clock,
-            clock=lambda: host_s + world.now,
-            run_id="run",
+            operator=Operator(
+                progress=progress,
+                signal=lambda state: heard.append((world.now, state)),
+                timer=world.clock,
+                clock=lambda: host_s + world.now,
+                run_id="run",
+            ),
         )
         session.close()
     except Stop:

@@ -2,82 +2,59 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
 from capture.acquire.flash.sequence import run_sequence
-from capture.acquire.flash.shot import Flash, expose, keep, let_go, set_light, token_of
+from capture.acquire.flash.shot import Moment, shoot
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
     Acquired,
     AcquisitionError,
-    Operator,
-    attempts_so_far,
-    given_up,
-    steps_to_do,
-    tear_down,
+    CaptureRun,
+    refuse_step,
 )
-from capture.devices.camera import Camera, FrameRefused, FrameTimeout
-from capture.devices.port import CommandRefused
-from capture.devices.wire import Code
+from capture.devices.flash import FlashBox
 from capture.plan import Plan, Step
 from capture.rig import Rig
-from capture.session import Session
-
-log = logging.getLogger(__name__)
 
 
-def run_flash(
-    plan: Plan,
-    rig: Rig,
-    *,
-    box: Flash,
-    cameras: Mapping[str, Camera],
-    session: Session,
-    operator: Operator,
-) -> Acquired:
+def run_flash(run: CaptureRun, box: FlashBox) -> Acquired:
     """Capture what the session still lacks of a plan of the flash rig; see `run_plan`."""
-    _check_limits(plan, box.limits)
-    lag_s = _sync_delay_s(rig, box.limits)
-    missing = steps_to_do(session)
-    steps = [step for step in missing if "start_s" not in step.settings]
-    timed = [step for step in missing if "start_s" in step.settings]
-    taken = attempts_so_far(session)
-    counts = {"steps": 0, "frames": 0, "stale": 0, "retakes": 0}
+    operator = run.operator
+    _check_limits(run.plan, box.limits)
+    lag_s = _sync_delay_s(run.rig, box.limits)
+    missing = run.steps_to_do()
     state: str | None = None
     try:
         box.dark()  # whatever was going on before
         if "sync_max_us" in box.limits:
             box.set_sync_delay(lag_s)
-        for number, step in enumerate(steps, start=1):
+        untimed = [step for step in missing if "start_s" not in step.settings]
+        for number, step in enumerate(untimed, start=1):
             operator.stop_if_asked()
             wanted = step.index.get("state")
             if wanted is not None and wanted != state:
                 state = str(wanted)
                 operator.prompt(state)
-            operator.progress(f"{number}/{len(missing)} {step.id} {step.kind} {_index_text(step)}")
-            prefix = f"{operator.run_id}.{number}"
-            _take(step, rig, box, cameras, session, taken, operator, counts, prefix)
-        if timed:
-            run_sequence(
-                timed,
-                plan,
-                rig,
-                box=box,
-                cameras=cameras,
-                session=session,
-                operator=operator,
-                taken=taken,
-                counts=counts,
-            )
+            index = " ".join(f"{name}={value}" for name, value in step.index.items())
+            operator.progress(f"{number}/{len(missing)} {step.id} {step.kind} {index}")
+            _take(run, box, step, f"{operator.run_id}.{number}")
+        if timed := [step for step in missing if "start_s" in step.settings]:
+            run_sequence(run, box, timed)
     finally:
-        tear_down(box, cameras)
-    return Acquired(counts["steps"], counts["frames"], counts["stale"], counts["retakes"])
+        run.tear_down(box)
+    return run.account()
 
 
-def _index_text(step: Step) -> str:
-    return " ".join(f"{name}={value}" for name, value in step.index.items())
+def _take(run: CaptureRun, box: FlashBox, step: Step, prefix: str) -> None:
+    """Take one step; it is shot again where it failed."""
+    why = ""
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        why = shoot(run, Moment(step, box), prefix, attempt)
+        if not why:
+            return
+    raise run.given_up(f"step {step.id}", why)
 
 
 def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
@@ -90,16 +67,12 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
         if step.kind == "dark" or power == 0.0:
             continue
         if not low <= power <= high:
-            raise AcquisitionError(
-                f"step {step.id}: got power {power:g}, the box allows {low:g} to {high:g}; "
-                "nothing was fired: change the plan"
-            )
+            what = f"got power {power:g}, the box allows {low:g} to {high:g}"
+            raise refuse_step(step, what, done="fired")
         angle_deg = float(step.settings.get("analyser_deg", first))
         if not first <= angle_deg <= last:
-            raise AcquisitionError(
-                f"step {step.id}: got analyser_deg {angle_deg:g}, the box allows {first:g} to "
-                f"{last:g}; nothing was fired: change the plan"
-            )
+            what = f"got analyser_deg {angle_deg:g}, the box allows {first:g} to {last:g}"
+            raise refuse_step(step, what, done="fired")
 
 
 def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:
@@ -112,47 +85,3 @@ def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:
             "from camera line to pop; nothing was fired: every lit frame would be dark"
         )
     return lag_s
-
-
-def _take(
-    step: Step,
-    rig: Rig,
-    box: Flash,
-    cameras: Mapping[str, Camera],
-    session: Session,
-    taken: Mapping[tuple[str, str], int],
-    operator: Operator,
-    counts: dict[str, int],
-    prefix: str,
-) -> None:
-    """Take one step with all its cameras, or none: a step with one bad frame is shot again."""
-    refusals: list[str] = []
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        try:
-            token = token_of(prefix, attempt, step)
-            set_light(step, box)
-            report, frames, stale = expose(step, rig, box, cameras, operator, token)
-        except (FrameRefused, FrameTimeout, CommandRefused) as error:
-            if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
-                raise
-            log.warning("step %s, attempt %d: %s", step.id, attempt, error)
-            refusals.append(str(error))
-            counts["retakes"] += 1
-            let_go(step, rig, cameras, error)
-            continue
-        counts["stale"] += stale
-        keep(
-            step,
-            rig,
-            cameras,
-            session,
-            frames,
-            report=report,
-            tries=attempt,
-            taken=taken,
-            t_host_s=operator.clock(),
-        )
-        counts["frames"] += len(frames)
-        counts["steps"] += 1
-        return
-    raise given_up(f"step {step.id}", refusals[-1], session)

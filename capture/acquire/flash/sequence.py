@@ -17,17 +17,12 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from capture.acquire.flash.shot import Flash, expose, keep, let_go, power_of, set_light, token_of
-from capture.acquire.outcome import MAX_ATTEMPTS, Operator, given_up
-from capture.devices.camera import Camera, FrameRefused, FrameTimeout
-from capture.devices.port import CommandRefused
-from capture.devices.wire import Code
-from capture.plan import Plan, Step
-from capture.rig import Rig
-from capture.session import Session
+from capture.acquire.flash.shot import Moment, power_of, set_light, shoot
+from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun, Operator
+from capture.devices.flash import FlashBox, FlashReport
+from capture.plan import Step, Value
 
 log = logging.getLogger(__name__)
 
@@ -41,18 +36,7 @@ TIME_ROUNDING_S = 1e-6
 """Rounding of times that are sums of periods."""
 
 
-def run_sequence(
-    steps: Sequence[Step],
-    plan: Plan,
-    rig: Rig,
-    *,
-    box: Flash,
-    cameras: Mapping[str, Camera],
-    session: Session,
-    operator: Operator,
-    taken: Mapping[tuple[str, str], int],
-    counts: dict[str, int],
-) -> None:
+def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
     """Capture the timed steps that a session still lacks; see `run_flash`.
 
     Each frame's ``actual`` gets ``time_s`` (s, when the flash popped, in the sequence's time),
@@ -61,12 +45,13 @@ def run_sequence(
     a prompted one ``phase_s`` (s since the last prompt of the expression was given), ``prompt``
     (what was asked for last).
     """
-    period_s = float(plan.limits.get("prompt_period_s", 0.0))
+    limits = run.plan.limits
+    period_s = float(limits.get("prompt_period_s", 0.0))
     if period_s > 0:
-        rhythm: _Rhythm = _Prompted(steps, plan, session, operator, period_s)
+        rhythm: _Rhythm = _Prompted(run, steps, period_s)
     else:
-        rhythm = _Once(steps, session, operator)
-    spacing_s = float(plan.limits.get("shot_period_s", 0.0))
+        rhythm = _Once(run, steps)
+    spacing_s = float(limits.get("shot_period_s", 0.0))
     waiting = deque((step, 1) for step in rhythm.possible(steps))
     free_s = -math.inf
     if waiting:
@@ -74,45 +59,21 @@ def run_sequence(
         rhythm.begin()
     number = 0
     while waiting:
-        operator.stop_if_asked()
+        run.operator.stop_if_asked()
         step, attempt = waiting.popleft()
         number += 1
         due_s = rhythm.due_s(step, free_s)
         free_s = due_s + spacing_s
-        operator.progress(f"{number}/{number + len(waiting)} {step.id} {step.kind} t={due_s:g} s")
-        moment = _Moment(step, rig, box, rhythm, due_s, waiting[0][0] if waiting else None)
-        token = token_of(f"{operator.run_id}.t{number}", attempt, step)
-        try:
-            report, frames, stale = expose(
-                step, rig, box, cameras, operator, token, before=moment.wait, meanwhile=moment.look
-            )
-        except (FrameRefused, FrameTimeout, CommandRefused) as error:
-            if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
-                raise
-            log.warning("step %s, attempt %d: %s", step.id, attempt, error)
-            counts["retakes"] += 1
-            let_go(step, rig, cameras, error)
+        count = f"{number}/{number + len(waiting)}"
+        run.operator.progress(f"{count} {step.id} {step.kind} t={due_s:g} s")
+        moment = _Timed(run, box, step, rhythm, due_s, waiting[0][0] if waiting else None)
+        why = shoot(run, moment, f"{run.operator.run_id}.t{number}", attempt)
+        if why:
             if attempt == MAX_ATTEMPTS:
-                raise given_up(f"step {step.id}", str(error), session) from error
-            waiting.extend(rhythm.again(step, attempt, str(error)))
+                raise run.given_up(f"step {step.id}", why)
+            waiting.extend(rhythm.again(step, attempt, why))
             if waiting:
                 set_light(waiting[0][0], box)
-            continue
-        counts["stale"] += stale
-        keep(
-            step,
-            rig,
-            cameras,
-            session,
-            frames,
-            report=report,
-            tries=attempt,
-            taken=taken,
-            t_host_s=operator.clock(),
-            noted=moment.noted,
-        )
-        counts["frames"] += len(frames)
-        counts["steps"] += 1
 
 
 class _Rhythm:
@@ -121,8 +82,9 @@ class _Rhythm:
     block = 0
     """How often the sequence was begun before."""
 
-    def __init__(self, operator: Operator) -> None:
-        self.operator = operator
+    def __init__(self, run: CaptureRun) -> None:
+        self._run = run
+        self.operator: Operator = run.operator
         self._zero = 0.0
 
     def possible(self, steps: Sequence[Step]) -> list[Step]:
@@ -157,7 +119,7 @@ class _Rhythm:
     def find_quiet(self, span_s: float) -> None:
         """Let time pass until nothing is due for a while, s."""
 
-    def noted_at(self, time_s: float) -> dict[str, str | float | int]:
+    def noted_at(self, time_s: float) -> dict[str, Value]:
         """Return what is to be noted of a shot at a time, s."""
         return {"time_s": time_s, "block": self.block}
 
@@ -165,15 +127,9 @@ class _Rhythm:
 class _Prompted(_Rhythm):
     """A subject who changes with every prompt."""
 
-    def __init__(
-        self,
-        steps: Sequence[Step],
-        plan: Plan,
-        session: Session,
-        operator: Operator,
-        period_s: float,
-    ) -> None:
-        super().__init__(operator)
+    def __init__(self, run: CaptureRun, steps: Sequence[Step], period_s: float) -> None:
+        super().__init__(run)
+        plan, session = run.plan, run.session
         self._period_s = period_s
         shown = {
             float(s.index["phase_s"]) < period_s: str(s.index["state"])
@@ -220,7 +176,7 @@ class _Prompted(_Rhythm):
         if (prompt_s := self._next * self._period_s) <= self.now_s() + span_s:
             self.wait(prompt_s)
 
-    def noted_at(self, time_s: float) -> dict[str, str | float | int]:
+    def noted_at(self, time_s: float) -> dict[str, Value]:
         before = [entry for entry in self._given if entry[0] <= time_s]
         onsets = [given_s for given_s, state in before if state == self._states[0]]
         noted = super().noted_at(time_s)
@@ -232,16 +188,15 @@ class _Prompted(_Rhythm):
 class _Once(_Rhythm):
     """What follows an event, which happens once."""
 
-    def __init__(self, steps: Sequence[Step], session: Session, operator: Operator) -> None:
-        super().__init__(operator)
+    def __init__(self, run: CaptureRun, steps: Sequence[Step]) -> None:
+        super().__init__(run)
         self._state = str(steps[0].index.get("state", "event"))
-        self._session = session
         self._elapsed_s = 0.0
         # the host's clock alone knows how long a run was interrupted
-        for record in session.frames("subject"):
+        for record in run.session.frames("subject"):
             if "time_s" in record.line.actual:
                 zero = record.line.t_host_s - float(record.line.actual["time_s"])
-                self._elapsed_s = operator.clock() - zero
+                self._elapsed_s = self.operator.clock() - zero
                 self.block = max(self.block, int(record.line.actual["block"]) + 1)
 
     def possible(self, steps: Sequence[Step]) -> list[Step]:
@@ -263,31 +218,40 @@ class _Once(_Rhythm):
     def _leave_out(self, ids: Sequence[str], why: str) -> None:
         if ids:
             log.warning("steps %s: %s", ", ".join(ids), why)
-            self._session.leave_out(ids, reason=why, t_host_s=self.operator.clock())
+            self._run.leave_out(ids, why, {})
 
 
-class _Moment:
+class _Timed(Moment):
     """One shot's time: waited for, kept, and compared with the box's."""
 
     def __init__(
-        self, step: Step, rig: Rig, box: Flash, rhythm: _Rhythm, due_s: float, then: Step | None
+        self,
+        run: CaptureRun,
+        box: FlashBox,
+        step: Step,
+        rhythm: _Rhythm,
+        due_s: float,
+        then: Step | None,
     ) -> None:
-        self._box, self._rhythm, self._due_s, self._then = box, rhythm, due_s, then
-        views = [rig.view(name) for name in step.cameras]
-        self._charged_s = rig.recycle_s * power_of(step)
+        super().__init__(step, box)
+        self._rhythm, self._due_s, self._then = rhythm, due_s, then
+        views = [run.rig.view(name) for name in step.cameras]
+        self._charged_s = run.rig.recycle_s * power_of(step)
         self._busy_s = float(step.settings["exposure_s"])
         self._busy_s += max(view.shutter_lag_s + view.readout_s for view in views)
-        self.noted: dict[str, str | float | int] = {}
+
+    def prepare(self) -> None:
+        """Do nothing: the light was set while the shot before was read out."""
 
     def wait(self) -> None:
         """Wait until the shot is due."""
         self._rhythm.wait(self._due_s)
 
-    def look(self, report: Any | None) -> None:
+    def look(self, report: FlashReport | None) -> None:
         """Find out when the flash popped; make the light ready for the next shot; go on in time."""
         timer = self._rhythm.operator.timer
         before = timer.monotonic()
-        box_s = self._box.ping()
+        box_s = self.box.ping()
         after = timer.monotonic()
         popped_s = before if report is None else 0.5 * (before + after) - box_s + report.t_box_s
         time_s = self._rhythm.since_zero(popped_s)
@@ -300,5 +264,5 @@ class _Moment:
             # waiting for the charge would keep a prompt waiting, and so would the commands
             self._rhythm.wait(time_s + self._charged_s)
             self._rhythm.find_quiet(COMMAND_LEAD_S)
-            set_light(self._then, self._box)
+            set_light(self._then, self.box)
         self._rhythm.wait(time_s + self._busy_s - PROMPT_LEAD_S)

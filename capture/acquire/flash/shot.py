@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
 
-from capture.acquire.frames import configure, encode, frame_timeout_s, wanted_exposure
-from capture.acquire.outcome import Operator
-from capture.devices.camera import Camera, CameraError, Exposure, Frame, Trigger, next_frame
+from capture.acquire.frames import arm_cameras, collect, frame_timeout_s, wanted_exposure
+from capture.acquire.outcome import CaptureRun, require_trigger_line
+from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout, Trigger
+from capture.devices.flash import FlashBox, FlashReport
 from capture.devices.port import CommandRefused
-from capture.plan import Step
-from capture.rig import Rig
-from capture.session import Session
+from capture.devices.wire import Code
+from capture.plan import Step, Value
 
 CHARGE_TIMEOUT_S = 60.0
 SHUTTER_PRESS_TIMEOUT_S = 60.0
@@ -21,153 +20,119 @@ MAX_TOKEN_CHARS = 48
 """Characters of the longest token that a box takes."""
 
 
-class FlashReport(Protocol):
-    """What the box says of a flash that it fired."""
+class Moment:
+    """One shot's time: before it, at it, and while the cameras read out; here at once."""
 
-    token: str
-    t_box_s: float
-    power: float
-    polarizer: str
-    analyser_deg: float
+    def __init__(self, step: Step, box: FlashBox) -> None:
+        self.step, self.box = step, box
+        self.noted: Mapping[str, Value] = {}
 
+    def prepare(self) -> None:
+        """Set the light of the shot."""
+        set_light(self.step, self.box)
 
-class Flash(Protocol):
-    """The part of the flash driver that a capture needs."""
+    def wait(self) -> None:
+        """Wait until the shot is due; all is ready but the flash not armed."""
 
-    @property
-    def limits(self) -> Mapping[str, Any]:
-        """What the box allows, in its own words and units."""
-
-    def arm(self) -> None:
-        """Allow light."""
-
-    def set_polarizer(self, polarizer: str) -> None:
-        """Turn the analyser to "parallel" or "crossed"."""
-
-    def set_analyser(self, angle_deg: float) -> None:
-        """Turn the analyser to an angle."""
-
-    def set_sync_delay(self, seconds: float) -> None:
-        """Set the time from the camera line to the pop."""
-
-    def set_power(self, power: float) -> None:
-        """Set the power, 0 to 1."""
-
-    def wait_charged(self, timeout_s: float) -> None:
-        """Wait until the packs are charged for the power that is set."""
-
-    def fire(self, token: str) -> Any:
-        """Fire once; a retry on the line never fires twice."""
-
-    def ping(self) -> float:
-        """Return the box's clock, s since its power-up."""
-
-    def trigger_cameras(self, token: str) -> float:
-        """Pulse the camera line without light."""
-
-    def dark(self) -> None:
-        """Put all light out and disarm."""
+    def look(self, report: FlashReport | None) -> None:
+        """Use the time while the cameras read out; the report is what the box says of the flash."""
 
 
-def expose(
-    step: Step,
-    rig: Rig,
-    box: Flash,
-    cameras: Mapping[str, Camera],
-    operator: Operator,
-    token: str,
-    *,
-    before: Callable[[], None] | None = None,
-    meanwhile: Callable[[Any | None], None] | None = None,
-) -> tuple[Any | None, dict[str, Frame], int]:
-    """Set the cameras, make the exposure, and collect one frame a camera; the light is set.
+def shoot(run: CaptureRun, moment: Moment, prefix: str, attempt: int) -> str:
+    """Take a step with all its cameras and keep it, or none: one bad frame spoils the step.
 
     Parameters
     ----------
-    step, rig, box, cameras, operator
-        See `capture.acquire.flash.run.run_flash`.
-    token
-        Name of the flash.
-    before
-        Called when all is ready but the flash not armed; returns when the time has come.
-    meanwhile
-        Called with the box's report while the cameras read out.
+    run
+        The run.
+    moment
+        The step, its box and its time.
+    prefix
+        Begins the name of the flash: the run, and the number in the run.
+    attempt
+        How often the step is tried, this time included.
 
     Returns
     -------
-    report, frames, stale
-        What the box says of the flash (None without one), the frames by view, and how many stale
-        frames were dropped.
+    str
+        Why the step can be tried again; nothing where it is kept.
     """
-    want = wanted_exposure(step)
-    power = power_of(step)
-    chosen = {name: cameras[name] for name in step.cameras}
-    lit_by_box = power > 0
-    triggers = {name: _parse_trigger(name, camera, lit_by_box) for name, camera in chosen.items()}
-    asked: dict[str, Exposure] = {}
-    not_before: dict[str, float] = {}
-    for name, camera in chosen.items():
-        configure(name, camera, want)
-        asked[name] = want
-        camera.arm(1, triggers[name])
-        not_before[name] = camera.clock_s()
-    if before is not None:
-        before()
+    step = moment.step
+    try:
+        moment.prepare()
+        # run, number in the run, try; then as much of the step as a box takes
+        token = f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN_CHARS]
+        report, frames = _expose(run, moment, token)
+    except (FrameRefused, FrameTimeout, CommandRefused) as error:
+        if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
+            raise
+        why = run.missed(step, attempt, error)
+        _let_go(run, step, error)
+        return why
+    light = _light_of(report)
+    run.keep(
+        step,
+        frames,
+        light=light,
+        tries=attempt,
+        t_box_s=None if report is None else float(report.t_box_s),
+        noted={**light, **moment.noted},
+    )
+    return ""
+
+
+def _expose(
+    run: CaptureRun, moment: Moment, token: str
+) -> tuple[FlashReport | None, dict[str, Frame]]:
+    """Set the cameras, make the exposure, and collect one frame a camera; the light is set."""
+    step, box = moment.step, moment.box
+    want, chosen = wanted_exposure(step), run.cameras_of(step)
+    lit = power_of(step) > 0
+    triggers = {name: _parse_trigger(name, camera, lit) for name, camera in chosen.items()}
+    armed_s = arm_cameras(chosen, want, triggers)
+    moment.wait()
     for name, camera in chosen.items():
         if triggers[name] is Trigger.SOFTWARE:
             camera.fire()
     report = None
-    if lit_by_box:
+    if lit:
         # armed for this pop only: a read-out may outlast any lease
         box.arm()
         report = box.fire(token)
         box.dark()
     elif Trigger.EDGE in triggers.values():
         box.trigger_cameras(token)
+    timeouts_s = {name: frame_timeout_s(step, run.rig.view(name)) for name in chosen}
     for name, camera in chosen.items():
         if triggers[name] is Trigger.HAND:
-            operator.prompt(
+            timeouts_s[name] += SHUTTER_PRESS_TIMEOUT_S
+            run.operator.prompt(
                 f"step {step.id}: press the shutter of camera {name} ({camera.info.serial}) once, "
                 f"at {want.exposure_s:g} s and ISO {want.iso}, without any light; within "
                 f"{SHUTTER_PRESS_TIMEOUT_S:g} s"
             )
-    if meanwhile is not None:
-        meanwhile(report)
-    frames: dict[str, Frame] = {}
-    stale = 0
-    for name, camera in chosen.items():
-        timeout_s = frame_timeout_s(step, rig.view(name))
-        timeout_s += SHUTTER_PRESS_TIMEOUT_S if triggers[name] is Trigger.HAND else 0.0
-        frames[name], dropped = next_frame(
-            camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
-        )
-        stale += dropped
-    return report, frames, stale
+    moment.look(report)
+    frames, stale = collect(chosen, want, armed_s, timeouts_s)
+    run.stale += stale
+    return report, frames
 
 
 def _parse_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
     """Return what releases a camera for a step: the box where there is light to meet."""
-    known = camera.info.triggers
     if not lit:
         for trigger in (Trigger.SOFTWARE, Trigger.EDGE, Trigger.HAND):
-            if trigger in known:
+            if trigger in camera.info.triggers:
                 return trigger
-    if Trigger.EDGE not in known:
-        # exposing on request would miss the flash: every lit frame would be dark
-        raise CameraError(
-            f"view {name!r}: the camera {camera.info.serial} cannot be released by the flash "
-            "box's trigger line; release it from the box and let a tethering program write "
-            "its files into a hot folder"
-        )
+    # exposing on request would miss the flash: every lit frame would be dark
+    why = (
+        "flash box's trigger line; release it from the box and let a tethering program write "
+        "its files into a hot folder"
+    )
+    require_trigger_line(name, camera, why)
     return Trigger.EDGE
 
 
-def token_of(prefix: str, attempt: int, step: Step) -> str:
-    """Name one flash: run, number in the run, try; then as much of the step as a box takes."""
-    return f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN_CHARS]
-
-
-def light_of(report: Any | None) -> dict[str, str | float]:
+def _light_of(report: FlashReport | None) -> dict[str, Value]:
     """Which light made a frame: what the box acknowledged, not what was asked for."""
     if report is None:
         return {"light": "none", "power": 0.0}
@@ -185,7 +150,7 @@ def power_of(step: Step) -> float:
     return 0.0 if step.kind == "dark" else float(step.settings.get("power", 1.0))
 
 
-def set_light(step: Step, box: Flash) -> None:
+def set_light(step: Step, box: FlashBox) -> None:
     """Turn the analyser, set the power, and wait until the flash could pop."""
     power = power_of(step)
     if power > 0:
@@ -197,49 +162,12 @@ def set_light(step: Step, box: Flash) -> None:
         box.wait_charged(CHARGE_TIMEOUT_S)
 
 
-def let_go(step: Step, rig: Rig, cameras: Mapping[str, Camera], error: Exception) -> None:
+def _let_go(run: CaptureRun, step: Step, error: Exception) -> None:
     """Make the cameras of a step that failed ready for the next one."""
-    for name in step.cameras:
+    for name, camera in run.cameras_of(step).items():
         if isinstance(error, CommandRefused):
             # a misfire has pulsed the camera line: a dark frame is being read out, and
             # until it has come the camera would miss the next pulse
             with contextlib.suppress(CameraError):
-                cameras[name].frame(frame_timeout_s(step, rig.view(name)))
-        cameras[name].abort()
-
-
-def keep(
-    step: Step,
-    rig: Rig,
-    cameras: Mapping[str, Camera],
-    session: Session,
-    frames: Mapping[str, Frame],
-    *,
-    report: Any | None,
-    tries: int,
-    taken: Mapping[tuple[str, str], int],
-    t_host_s: float,
-    noted: Mapping[str, str | float | int] | None = None,
-) -> None:
-    """Commit the frames of a step with the light that made them, and what else was noted."""
-    light = light_of(report)
-    for name, frame in frames.items():
-        blob = encode(frame, rig.view(name), cameras[name], step, session, light)
-        session.commit(
-            step.id,
-            name,
-            blob,
-            settings=dict(step.settings),
-            actual={
-                "exposure_s": frame.exposure.exposure_s,
-                "iso": frame.exposure.iso,
-                "serial": frame.serial,
-                "tries": tries,
-                **light,
-                **(noted or {}),
-            },
-            t_box_s=None if report is None else float(report.t_box_s),
-            t_host_s=t_host_s,
-            # a step of which only some cameras were kept is shot again with all of them
-            attempt=taken.get((step.id, name), 0) + 1,
-        )
+                camera.frame(frame_timeout_s(step, run.rig.view(name)))
+        camera.abort()

@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from capture.acquire.dome import check_safety
-from capture.acquire.outcome import AcquisitionError
+from capture.acquire.dome import check_dwell, check_safety, too_long
+from capture.acquire.outcome import AcquisitionError, CaptureRun, refuse_step
 from capture.acquire.pattern_scan import reading_deg
-from capture.devices.camera import Camera, CameraError, Trigger
-from capture.devices.gradient_sphere import Eyes
 from capture.plan import Plan
 from capture.plan.gradient import state_of
 from capture.plan.rows import passes
 from capture.rig import Rig
 
 
-def check_eyes(plan: Plan, rig: Rig, eyes: Eyes, *, skin: bool) -> None:
+def check_eyes(run: CaptureRun, *, skin: bool) -> None:
     """Raise where light would be too much; patterns on skin may come close to an eye."""
-    check_safety(plan, rig, eyes=eyes)
-    if skin and eyes == "open":
+    check_safety(run.plan, run.rig, eyes=run.eyes)
+    if skin and run.eyes == "open":
         raise AcquisitionError(
             "eyes: patterns change many times a second, and the patch may lie beside an eye; "
             "nothing was lit: have the eyes closed or shielded and say so with --eyes"
@@ -28,38 +26,26 @@ def check_eyes(plan: Plan, rig: Rig, eyes: Eyes, *, skin: bool) -> None:
 
 def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
     """Raise where the sphere's box is another one, or is asked for more than it allows."""
-    for name, what, count in (
-        ("leds", "lights", len(rig.lights)),
-        ("cameras", "cameras", len(rig.views)),
-    ):
+    counts = {"leds": ("lights", len(rig.lights)), "cameras": ("cameras", len(rig.views))}
+    for name, (what, count) in counts.items():
         if int(limits.get(name, 0)) != count:
             raise AcquisitionError(
                 f"{what}: the sphere's box has {limits.get(name)}, the rig {count}; nothing was "
                 "lit: use the rig file of this box"
             )
     settle_s = float(limits["settle_us"]) / 1e6
-    low_s, high_s = float(limits["row_min_us"]) / 1e6, float(limits["row_max_us"]) / 1e6
+    low_deg, high_deg = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
     for step in plan.steps:
         dwell_s, exposure_s = float(step.settings["dwell_s"]), float(step.settings["exposure_s"])
-        if not low_s <= dwell_s <= high_s:
-            raise AcquisitionError(
-                f"step {step.id}: got dwell_s {dwell_s:g}, the box allows {low_s:g} to "
-                f"{high_s:g}; nothing was lit: change the plan"
-            )
+        check_dwell(step, dwell_s, limits)
         views = [rig.view(name) for name in step.cameras]
         over_s = max(view.shutter_lag_s + view.readout_s for view in views) + exposure_s
         if settle_s + exposure_s > dwell_s or over_s > dwell_s:
-            raise AcquisitionError(
-                f"step {step.id}: exposure_s {exposure_s:g} and the read-out do not fit into "
-                f"dwell_s {dwell_s:g}; nothing was lit: change the plan"
-            )
+            raise too_long(step, dwell_s)
         angle_deg = reading_deg(step)
-        low_deg, high_deg = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
         if not low_deg <= angle_deg <= high_deg:
-            raise AcquisitionError(
-                f"step {step.id}: got analyser_deg {angle_deg:g}, the box turns from {low_deg:g} "
-                f"to {high_deg:g}; nothing was lit: change the plan"
-            )
+            what = f"got analyser_deg {angle_deg:g}, the box turns from {low_deg:g} to {high_deg:g}"
+            raise refuse_step(step, what)
     longest = max(len(piece) for piece in passes(plan.steps))
     if longest > int(limits["max_rows"]):
         raise AcquisitionError(
@@ -106,13 +92,3 @@ def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
             f"force limit: got {limit_n:g} N, the caliper's sensor tells {low:g} to {high:g} N; "
             "nothing has moved"
         )
-
-
-def check_cameras(cameras: Mapping[str, Camera]) -> None:
-    """Raise where a camera cannot be released by the sphere."""
-    for name, camera in cameras.items():
-        if Trigger.EDGE not in camera.info.triggers:
-            raise CameraError(
-                f"view {name!r}: the camera {camera.info.serial} cannot be released by the "
-                "sphere's trigger line, and no other way keeps pace with its patterns"
-            )

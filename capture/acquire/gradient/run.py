@@ -3,77 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
-from capture.acquire.gradient.checks import (
-    check_caliper,
-    check_cameras,
-    check_eyes,
-    check_force,
-    check_sphere,
-)
-from capture.acquire.gradient.skin_states import CaliperDriver, SkinStates, let_go
-from capture.acquire.outcome import Acquired, AcquisitionError, Operator, steps_to_do, tear_down
-from capture.acquire.pattern_scan import Scanner, Sphere
-from capture.devices.camera import Camera
-from capture.devices.gradient_sphere import Eyes
-from capture.plan import Plan
+from capture.acquire.dome import begin_lit_run
+from capture.acquire.gradient.checks import check_caliper, check_eyes, check_force, check_sphere
+from capture.acquire.gradient.skin_states import SkinStates, let_go
+from capture.acquire.outcome import Acquired, AcquisitionError, CaptureRun, require_trigger_line
+from capture.acquire.pattern_scan import Scanner
+from capture.devices.caliper import CaliperBox
+from capture.devices.gradient_sphere import GradientSphereBox
 from capture.plan.gradient import state_of
 from capture.plan.rows import passes
-from capture.rig import Rig
-from capture.session import Session
 
 SPHERE_LEASE_S = 2.0
 
 
-def run_gradient(
-    plan: Plan,
-    rig: Rig,
-    *,
-    boxes: Mapping[str, Any],
-    cameras: Mapping[str, Camera],
-    session: Session,
-    operator: Operator,
-    eyes: Eyes = "open",
-    force_limit_n: float | None = None,
-) -> Acquired:
+def run_gradient(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     """Capture what the session still lacks of a plan of the gradient sphere; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or moves.
     """
-    skin = any(state_of(step) is not None for step in plan.steps)
-    sphere = cast(Sphere, boxes["gradient_sphere"])
-    caliper = cast(CaliperDriver | None, boxes.get("caliper")) if skin else None
-    check_eyes(plan, rig, eyes, skin=skin)
-    check_sphere(plan, rig, sphere.limits)
-    check_cameras(cameras)
+    skin = any(state_of(step) is not None for step in run.plan.steps)
+    sphere: GradientSphereBox = boxes["gradient_sphere"]
+    caliper: CaliperBox | None = boxes.get("caliper") if skin else None
+    check_eyes(run, skin=skin)
+    check_sphere(run.plan, run.rig, sphere.limits)
+    for name, camera in run.cameras.items():
+        why = "sphere's trigger line, and no other way keeps pace with its patterns"
+        require_trigger_line(name, camera, why)
     if skin:
         if caliper is None:
             raise AcquisitionError("box 'caliper': no port was given; add --port caliper=URL")
-        check_caliper(plan, rig, caliper.limits)
-        check_force(force_limit_n, caliper.limits)
-    keep_alive = caliper.ping if caliper is not None else _nothing
-    scanner = Scanner(rig, sphere, cameras, session, operator, keep_alive=keep_alive)
+        check_caliper(run.plan, run.rig, caliper.limits)
+        check_force(run.force_limit_n, caliper.limits)
+    scanner = Scanner(run, sphere, caliper.ping if caliper is not None else lambda: None)
     try:
-        sphere.dark()  # whatever was going on before
-        sphere.set_lease(SPHERE_LEASE_S)
-        sphere.set_cameras((1 << len(rig.views)) - 1)
-        if not session.frames():
-            sphere.new_subject(session.id[:32])
-        sphere.set_eyes(eyes)
-        flat = [step for step in steps_to_do(session) if state_of(step) is None]
-        for piece in passes(flat):
-            operator.stop_if_asked()
+        begin_lit_run(run, sphere, SPHERE_LEASE_S)
+        for piece in passes([step for step in run.steps_to_do() if state_of(step) is None]):
+            run.operator.stop_if_asked()
             scanner.commit(scanner.scan(piece), {})
-        if caliper is not None and force_limit_n is not None:
-            SkinStates(rig, caliper, scanner, session, operator, force_limit_n).run()
+        if caliper is not None and run.force_limit_n is not None:
+            SkinStates(run, caliper, scanner, run.force_limit_n).scan()
     finally:
         if caliper is not None:
             let_go(caliper)
-        tear_down(sphere, cameras)
-    dead = tuple(rig.lights[led].name for led in sorted(sphere.failed_leds))
-    return Acquired(scanner.steps, scanner.frames, scanner.stale, scanner.retakes, dead)
-
-
-def _nothing() -> None:
-    """Do nothing."""
+        run.tear_down(sphere)
+    return run.account(sphere.failed_leds)

@@ -10,21 +10,21 @@ once, the jaws walk the same way, and the state is scanned anew.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Protocol, cast
+from typing import cast
 
 from capture.acquire.gradient.travel_limit import End, EndOfSkin, ForceWatch
-from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator, given_up, steps_to_do
+from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, CaptureRun
 from capture.acquire.pattern_scan import Scanner, Taken
-from capture.devices.caliper import CaliperStatus, MoveReport
+from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.port import CommandRefused, DeviceError
 from capture.devices.wire import Code
 from capture.plan import Plan, Step, Value
 from capture.plan.gradient import state_name, state_of
 from capture.plan.rows import passes
-from capture.rig import Caliper, Rig
+from capture.rig import Caliper
 from capture.session import Session
 
 log = logging.getLogger(__name__)
@@ -32,53 +32,6 @@ log = logging.getLogger(__name__)
 CALIPER_LEASE_S = 5.0
 """A camera's frames may keep the host busy for a while; after this silence the skin is let go."""
 N_FORCE_READINGS = 8
-
-
-class CaliperDriver(Protocol):
-    """The part of the caliper's driver that a capture needs."""
-
-    @property
-    def limits(self) -> Mapping[str, Any]:
-        """What the box allows, in its own words and units."""
-
-    def arm(self) -> None:
-        """Allow moves."""
-
-    def dark(self) -> None:
-        """Let the skin go and disarm."""
-
-    def ping(self) -> float:
-        """Return the box's clock, s; renews the lease."""
-
-    def set_lease(self, lease_s: float) -> None:
-        """Set after how much silence the box lets the skin go."""
-
-    def set_force_limit(self, newton: float) -> None:
-        """Set the greatest force between the jaws, N."""
-
-    def status(self) -> CaliperStatus:
-        """Return the status bits."""
-
-    def home(self) -> MoveReport:
-        """Find the home mark and stand at step 0."""
-
-    def set_angle(self, angle_deg: float) -> None:
-        """Turn the jaws."""
-
-    def attach(self) -> None:
-        """Pass on that a person has taped the jaws to the skin."""
-
-    def attached(self) -> bool:
-        """Tell whether the box holds skin."""
-
-    def move_to(self, step: int) -> MoveReport:
-        """Move the jaws to a step."""
-
-    def force_n(self) -> float:
-        """Return the force between the jaws, N."""
-
-    def release(self) -> None:
-        """Let the skin go."""
 
 
 class _LetGo(Exception):
@@ -102,26 +55,18 @@ class SkinStates:
     """The states of one run: what is held, how far it went, what is left."""
 
     def __init__(
-        self,
-        rig: Rig,
-        caliper: CaliperDriver,
-        scanner: Scanner,
-        session: Session,
-        operator: Operator,
-        force_limit_n: float,
+        self, run: CaptureRun, caliper: CaliperBox, scanner: Scanner, force_limit_n: float
     ) -> None:
-        self._drawn = cast(Caliper, rig.caliper)
-        self._caliper = caliper
-        self._scanner = scanner
-        self._session = session
-        self._operator = operator
+        self._run, self._session, self._operator = run, run.session, run.operator
+        self._caliper, self._scanner = caliper, scanner
+        self._drawn = cast(Caliper, run.rig.caliper)
         self._force_limit_n = force_limit_n
-        self._states = list(_states(session.plan))
-        self._attachment = _attachments_so_far(session)
+        self._states = list(_states(run.session.plan))
+        self._attachment = _attachments_so_far(run.session)
         self._position = 0
         self._reading_mm = self._force_n = 0.0
 
-    def run(self) -> None:
+    def scan(self) -> None:
         """Scan what is missing, angle by angle, in the plan's order."""
         for angle_deg in dict.fromkeys(state.angle_deg for state in self._states):
             self._angle(angle_deg)
@@ -132,7 +77,7 @@ class SkinStates:
         frames: dict[str, set[object]] = {}
         for record in self._session.frames("gradient"):
             frames.setdefault(record.step_id, set()).add(record.actual.get("attachment"))
-        undone = {step.id for step in steps_to_do(self._session)}
+        undone = {step.id for step in self._run.steps_to_do()}
         found = []
         for state in self._states:
             ids = [step.id for step in state.steps]
@@ -151,7 +96,7 @@ class SkinStates:
             tries = tries + 1 if len(missing) == before else 1
             before = len(missing)
             if tries > MAX_ATTEMPTS:
-                raise given_up(f"state {missing[0].name}", why, self._session)
+                raise self._run.given_up(f"state {missing[0].name}", why)
             try:
                 self._attach(angle_deg)
                 self._scan_angle(angle_deg)
@@ -317,9 +262,7 @@ class SkinStates:
                 "force_n": end.end.force_n,
                 "attachment": self._attachment,
             }
-            self._session.leave_out(
-                ids, reason=reason, about=about, t_host_s=self._operator.clock()
-            )
+            self._run.leave_out(ids, reason, about)
 
 
 def _states(plan: Plan) -> Iterator[_State]:
@@ -338,7 +281,7 @@ def _attachments_so_far(session: Session) -> int:
     return max((int(line.get("attachment", 0)) for line in lines), default=0)
 
 
-def let_go(caliper: CaliperDriver) -> None:
+def let_go(caliper: CaliperBox) -> None:
     """Release the skin and disarm; nothing here hides the error that led here."""
     try:
         caliper.dark()

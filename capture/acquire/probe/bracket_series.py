@@ -9,71 +9,59 @@ one saturates nowhere is known only when it is there, and it costs a read-out.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from capture import raw
-from capture.acquire.frames import encode
-from capture.acquire.outcome import MAX_ATTEMPTS, Operator, attempts_so_far, given_up, steps_to_do
-from capture.acquire.probe.driver import ProbeDriver
+from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
 from capture.acquire.probe.fiber_signal import FiberSignal, describe_fibers, why_enough
 from capture.acquire.probe.head import Head, HeadLost, NotHeld
 from capture.acquire.probe.mask_choice import masks_not_needed
-from capture.acquire.probe.source_exposure import Exposed, ShutterFault, expose, expose_dark
-from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout
+from capture.acquire.probe.source_exposure import (
+    Exposed,
+    ShutterFault,
+    expose,
+    expose_dark,
+    readout_s,
+)
+from capture.devices.camera import Frame, FrameRefused, FrameTimeout
+from capture.devices.probe import ProbeBox
 from capture.plan import Step, Value
 from capture.plan.probe import all_series
 from capture.plan.suction import Placement
-from capture.rig import Probe, Rig
+from capture.rig import Probe
 from capture.session import Session
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """An exposure that is to be kept."""
+
+    exposed: Exposed
+    actual: dict[str, Value]
+    tries: int
+
+
 class BracketSeries:
-    """The series of one run.
+    """The series of one run."""
 
-    Parameters
-    ----------
-    rig, box, cameras, session, operator
-        As of the run.
-    all_brackets
-        Whether exposures are taken that can show no more.
-
-    Attributes
-    ----------
-    steps, frames, stale, retakes : int
-        What was done so far, see `capture.acquire.outcome.Acquired`.
-    """
-
-    def __init__(
-        self,
-        rig: Rig,
-        box: ProbeDriver,
-        cameras: Mapping[str, Camera],
-        session: Session,
-        operator: Operator,
-        *,
-        all_brackets: bool,
-    ) -> None:
-        self._rig = rig
-        self._probe: Probe = rig.probe  # type: ignore[assignment]
+    def __init__(self, run: CaptureRun, box: ProbeBox) -> None:
+        self._run, self._session, self._operator = run, run.session, run.operator
         self._box = box
-        self._cameras = cameras
-        self._session = session
-        self._operator = operator
-        self._all_brackets = all_brackets
-        self._attempts = attempts_so_far(session)
-        self._head = Head(self._probe, box, operator, placements=_placements_so_far(session))
+        self._probe: Probe = run.rig.probe  # type: ignore[assignment]
+        placements = _placements_so_far(run.session)
+        self._head = Head(self._probe, box, run.operator, placements=placements)
         self._tokens = 0
-        self.steps = self.frames = self.stale = self.retakes = 0
 
     # darks ------------------------------------------------------------------------------------
 
     def darks(self) -> None:
         """Take the frames without light that are missing, with the head capped."""
-        missing = [step for step in steps_to_do(self._session) if step.kind == "dark"]
+        missing = [step for step in self._run.steps_to_do() if step.kind == "dark"]
         if missing:
             self._head.cap()
             self._box.cover(None)
@@ -81,9 +69,9 @@ class BracketSeries:
             self._operator.stop_if_asked()
             seconds = float(step.settings["exposure_s"])
             self._operator.progress(f"dark {number}/{len(missing)} {step.id} {seconds:.3g} s")
-            self._commit(self._dark(step), {})
+            self._keep(self._dark(step), {})
 
-    def _dark(self, step: Step) -> tuple[Exposed, dict[str, Value], int]:
+    def _dark(self, step: Step) -> _Taken:
         why = ""
         for attempt in range(1, MAX_ATTEMPTS + 1):
             before_c = self._head.temperature_c()
@@ -91,24 +79,24 @@ class BracketSeries:
             self._tokens += 1
             token = f"{self._operator.run_id}.{self._tokens}"
             try:
-                exposed = expose_dark(step, self._rig, self._box, self._cameras, token=token)
+                exposed = expose_dark(self._run, self._box, step, token=token)
             except (FrameRefused, FrameTimeout) as error:
                 why = self._not_taken(step, attempt, error)
                 continue
-            self.stale += exposed.stale
             if not self._box.status().placed:
                 why = self._not_taken(step, attempt, ShutterFault("the box has let go of the cap"))
                 continue
             after_c = self._head.temperature_c()
-            return exposed, {"light": "none", "camera_c": 0.5 * (before_c + after_c)}, attempt
-        raise given_up(f"step {step.id}", why, self._session)
+            actual: dict[str, Value] = {"light": "none", "camera_c": 0.5 * (before_c + after_c)}
+            return _Taken(exposed, actual, attempt)
+        raise self._run.given_up(f"step {step.id}", why)
 
     # series -----------------------------------------------------------------------------------
 
     def run(self) -> None:
         """Take the series that are missing, in the plan's order, with the head placed as needed."""
         for placement, steps in all_series(self._session.plan):
-            if steps[0].kind == "mask" and not self._all_brackets:
+            if steps[0].kind == "mask" and not self._run.all_brackets:
                 self._leave_out(*masks_not_needed(self._session))
             if self._is_missing(steps):
                 self._series(placement, steps)
@@ -131,27 +119,25 @@ class BracketSeries:
                 log.warning("%s, placement %d: %s", placement, attempt, lost)
                 why = str(lost)
                 self._head.lost(why)
-                self.retakes += 1
+                self._run.retakes += 1
                 continue
             for one in taken:
-                self._commit(one, {"placement": self._head.placements})
+                self._keep(one, {"placement": self._head.placements})
             self._leave_out(wanted[len(taken) :], reason)
             return
         raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
 
-    def _once(
-        self, placement: Placement, wanted: Sequence[Step]
-    ) -> tuple[list[tuple[Exposed, dict[str, Value], int]], str]:
+    def _once(self, placement: Placement, wanted: Sequence[Step]) -> tuple[list[_Taken], str]:
         """Take a series of one placement; return it, and why the rest of it is not needed."""
-        signal = FiberSignal(self._probe, self._rig.view(wanted[0].cameras[0]))
-        taken: list[tuple[Exposed, dict[str, Value], int]] = []
+        signal = FiberSignal(self._probe, self._run.rig.view(wanted[0].cameras[0]))
+        taken: list[_Taken] = []
         self._head.at(placement)
         fibre = wanted[0].settings.get("fibre")
         self._box.cover(None if fibre is None else int(fibre))
         for number, step in enumerate(wanted):
             self._operator.stop_if_asked()
             taken.append(self._exposure(placement, step))
-            exposed, actual, _ = taken[-1]
+            exposed, actual = taken[-1].exposed, taken[-1].actual
             self._operator.progress(
                 f"{placement}: {number + 1}/{len(wanted)} {step.id} "
                 f"{float(step.settings['exposure_s']):.3g} s, "
@@ -164,28 +150,24 @@ class BracketSeries:
             signal.look(_pixels(first, step), float(step.settings["exposure_s"]))
             if not left:
                 self._tell_what_is_missing(placement, signal)
-            elif not self._all_brackets and (reason := why_enough(signal, step, left)):
+            elif not self._run.all_brackets and (reason := why_enough(signal, step, left)):
                 return taken, f"{placement}: {reason}"
         return taken, ""
 
-    def _exposure(self, placement: Placement, step: Step) -> tuple[Exposed, dict[str, Value], int]:
+    def _exposure(self, placement: Placement, step: Step) -> _Taken:
         """Take one exposure with the head held before and after, or take it again."""
         why = ""
-        needs_s = float(step.settings["exposure_s"])
-        needs_s += max(self._rig.view(name).readout_s for name in step.cameras)
+        needs_s = float(step.settings["exposure_s"]) + readout_s(self._run, step)
         level = float(step.settings["level"])
         held = True
         for attempt in range(1, MAX_ATTEMPTS + 1):
             try:
                 self._head.hold(level, needs_s)
                 before_mbar, before_c = self._head.readings()
-                exposed = expose(step, self._rig, self._box, self._cameras)
+                exposed = expose(self._run, self._box, step)
                 after_mbar, after_c = self._head.readings()
             except NotHeld as error:
-                why, held = str(error), False
-                self._drop_frames(step)
-                log.warning("step %s, attempt %d: %s", step.id, attempt, error)
-                self.retakes += 1
+                why, held = self._not_taken(step, attempt, error), False
                 continue
             except HeadLost:
                 self._drop_frames(step)
@@ -193,7 +175,6 @@ class BracketSeries:
             except (FrameRefused, FrameTimeout) as error:
                 why, held = self._not_taken(step, attempt, error), True
                 continue
-            self.stale += exposed.stale
             actual: dict[str, Value] = {
                 "light": "source",
                 "level": level,
@@ -206,20 +187,18 @@ class BracketSeries:
             }
             if "fibre" in step.settings:
                 actual["fibre"] = step.settings["fibre"]
-            return exposed, actual, attempt
+            return _Taken(exposed, actual, attempt)
         if held:
-            raise given_up(f"step {step.id}", why, self._session)
+            raise self._run.given_up(f"step {step.id}", why)
         raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
 
-    def _not_taken(self, step: Step, attempt: int, error: CameraError) -> str:
-        log.warning("step %s, attempt %d: %s", step.id, attempt, error)
-        self.retakes += 1
+    def _not_taken(self, step: Step, attempt: int, error: Exception) -> str:
         self._drop_frames(step)
-        return str(error)
+        return self._run.missed(step, attempt, error)
 
     def _drop_frames(self, step: Step) -> None:
-        for name in step.cameras:
-            self._cameras[name].abort()
+        for camera in self._run.cameras_of(step).values():
+            camera.abort()
 
     # what is not needed -----------------------------------------------------------------------
 
@@ -240,44 +219,22 @@ class BracketSeries:
             return
         self._operator.progress(reason)
         log.info(reason)
-        self._session.leave_out(
-            [step.id for step in steps], reason=reason, t_host_s=self._operator.clock()
+        self._run.leave_out([step.id for step in steps], reason, {})
+
+    def _keep(self, one: _Taken, more: dict[str, Value]) -> None:
+        step = one.exposed.step
+        light: dict[str, Value] = {
+            "light": str(one.actual["light"]),
+            "level": float(step.settings["level"]),
+        }
+        self._run.keep(
+            step,
+            one.exposed.frames,
+            light=light,
+            tries=one.tries,
+            t_box_s=one.exposed.t_box_s,
+            noted={**one.actual, **more},
         )
-
-    # commit -----------------------------------------------------------------------------------
-
-    def _commit(
-        self, one: tuple[Exposed, dict[str, Value], int], more: Mapping[str, Value]
-    ) -> None:
-        exposed, actual, tries = one
-        step = exposed.step
-        for name, frame in exposed.frames.items():
-            view, camera = self._rig.view(name), self._cameras[name]
-            light: dict[str, str | float] = {
-                "light": str(actual["light"]),
-                "level": float(step.settings["level"]),
-            }
-            attempt = self._attempts.get((step.id, name), 0) + 1
-            self._session.commit(
-                step.id,
-                name,
-                encode(frame, view, camera, step, self._session, light),
-                settings=dict(step.settings),
-                actual={
-                    "exposure_s": frame.exposure.exposure_s,
-                    "iso": frame.exposure.iso,
-                    "serial": frame.serial,
-                    "tries": tries,
-                    **actual,
-                    **more,
-                },
-                t_box_s=exposed.t_box_s,
-                t_host_s=self._operator.clock(),
-                attempt=attempt,
-            )
-            self._attempts[step.id, name] = attempt
-            self.frames += 1
-        self.steps += 1
 
 
 def _pixels(frame: Frame, step: Step) -> np.ndarray:

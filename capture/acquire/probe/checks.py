@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from capture.acquire.outcome import AcquisitionError
-from capture.devices.camera import Camera, CameraError, Trigger
+from capture.acquire.outcome import AcquisitionError, CaptureRun, refuse_step, require_trigger_line
+from capture.devices.camera import CameraError
 from capture.plan import Plan
 from capture.plan.fiber_light import source_energy_ws
 from capture.rig import Rig
@@ -34,10 +34,8 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
     for step in plan.steps:
         exposure_s = float(step.settings["exposure_s"])
         if not low_s <= exposure_s <= high_s and step.kind != "dark":
-            raise AcquisitionError(
-                f"step {step.id}: got exposure_s {exposure_s:g}, the shutter opens for {low_s:g} "
-                f"to {high_s:g} s; nothing was lit: change the plan"
-            )
+            opens = f"the shutter opens for {low_s:g} to {high_s:g} s"
+            raise refuse_step(step, f"got exposure_s {exposure_s:g}, {opens}")
         mbar = float(step.settings.get("suction_mbar", probe.suction_mbar))
         if abs(mbar - probe.suction_mbar) > 1e-6:
             raise AcquisitionError(
@@ -46,10 +44,8 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
             )
         fibre = step.settings.get("fibre")
         if fibre is not None and not int(fibre) < len(probe.fibres):
-            raise AcquisitionError(
-                f"step {step.id}: got fibre {fibre}, the rig has {len(probe.fibres)}, counted "
-                "from 0; nothing was lit: change the plan"
-            )
+            has = f"the rig has {len(probe.fibres)}, counted from 0"
+            raise refuse_step(step, f"got fibre {fibre}, {has}")
     if probe.suction_mbar > most_mbar:
         raise AcquisitionError(
             f"suction_mbar: the rig file says {probe.suction_mbar:g}, the box draws at most "
@@ -69,15 +65,11 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         )
 
 
-def check_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> None:
+def check_cameras(run: CaptureRun) -> None:
     """Raise where a camera cannot be released by the probe, or opens after the light has begun."""
-    for view in rig.views:
-        camera = cameras[view.name]
-        if Trigger.EDGE not in camera.info.triggers:
-            raise CameraError(
-                f"view {view.name!r}: the camera {camera.info.serial} cannot be released by the "
-                "probe's trigger line; an exposure of its own would miss the shutter's light"
-            )
+    for view in run.rig.views:
+        why = "probe's trigger line; an exposure of its own would miss the shutter's light"
+        require_trigger_line(view.name, run.cameras[view.name], why)
         if view.shutter_lag_s > 0.0:
             raise CameraError(
                 f"view {view.name!r}: opens {view.shutter_lag_s:g} s after it is released, when "

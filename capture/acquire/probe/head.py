@@ -10,8 +10,8 @@ from __future__ import annotations
 import logging
 
 from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
-from capture.acquire.probe.driver import ProbeDriver
 from capture.devices.port import CommandRefused
+from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
 from capture.plan.probe import CAP_SITE
 from capture.plan.suction import WIRE_SLACK_S, Placement
@@ -57,12 +57,8 @@ class Head:
         How often it was placed, these included.
     """
 
-    def __init__(
-        self, probe: Probe, box: ProbeDriver, operator: Operator, *, placements: int
-    ) -> None:
-        self._probe = probe
-        self._box = box
-        self._operator = operator
+    def __init__(self, probe: Probe, box: ProbeBox, operator: Operator, *, placements: int) -> None:
+        self._probe, self._box, self._operator = probe, box, operator
         self._place: Placement | None = None
         self._again = ""
         self.placements = placements

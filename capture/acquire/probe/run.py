@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from capture.acquire.outcome import Acquired, Operator, tear_down
+from capture.acquire.outcome import Acquired, CaptureRun
 from capture.acquire.probe.bracket_series import BracketSeries
 from capture.acquire.probe.checks import check_cameras, check_probe
-from capture.acquire.probe.driver import PROBE_LEASE_S, ProbeDriver
-from capture.devices.camera import Camera
-from capture.plan import Plan
-from capture.rig import Rig
-from capture.session import Session
+from capture.devices.probe import ProbeBox
+
+PROBE_LEASE_S = 5.0
+"""A frame may keep the host busy for a while; after this silence the box lets go."""
 
 
-def run_probe(
-    plan: Plan,
-    rig: Rig,
-    *,
-    box: ProbeDriver,
-    cameras: Mapping[str, Camera],
-    session: Session,
-    operator: Operator,
-    all_brackets: bool = False,
-) -> Acquired:
+def run_probe(run: CaptureRun, box: ProbeBox) -> Acquired:
     """Capture what the session still lacks of a plan of the fibre probe; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or sucked at. The dark frames come
@@ -36,16 +24,16 @@ def run_probe(
         Where the suction cannot be held at a placement, three times; where the camera does not come
         to its temperature; or where a frame fails three times.
     """
-    check_probe(plan, rig, box.limits)
-    check_cameras(rig, cameras)
-    series = BracketSeries(rig, box, cameras, session, operator, all_brackets=all_brackets)
+    check_probe(run.plan, run.rig, box.limits)
+    check_cameras(run)
+    series = BracketSeries(run, box)
     try:
         box.dark()  # whatever was going on before
         box.set_lease(PROBE_LEASE_S)
-        if not session.frames():
-            box.new_subject(session.id[:32])
+        if not run.session.frames():
+            box.new_subject(run.session.id[:32])
         series.darks()
         series.run()
     finally:
-        tear_down(box, cameras)
-    return Acquired(series.steps, series.frames, series.stale, series.retakes)
+        run.tear_down(box)
+    return run.account()

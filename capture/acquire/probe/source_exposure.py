@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from capture.acquire.frames import configure, wanted_exposure
-from capture.acquire.probe.driver import LEASE_RENEWAL_S, ProbeDriver
+from capture.acquire.frames import arm_cameras, collect, wanted_exposure
+from capture.acquire.outcome import CaptureRun
 from capture.acquire.probe.head import HeadLost
-from capture.devices.camera import Camera, Frame, FrameRefused, Trigger, next_frame
+from capture.devices.camera import Frame, FrameRefused, Trigger
 from capture.devices.port import CommandRefused
-from capture.devices.probe import Opening
+from capture.devices.probe import Opening, ProbeBox
 from capture.devices.wire import Code
 from capture.plan import Step
-from capture.rig import Rig
 
+LEASE_RENEWAL_S = 1.0
+"""Silence between two renewals of the lease while nothing but time is waited for."""
 FRAME_TIMEOUT_S = 3.0
 """How long a frame may take after its read-out, s: the box waits a little longer for its host."""
 SHUTTER_REPORT_TIMEOUT_S = 0.2
@@ -44,18 +45,14 @@ class Exposed:
     """When the cameras were released, on the box's clock."""
     open_s: float
     """How long the light lasted, s; 0 in the dark."""
-    stale: int
-    """Stale frames that were dropped on the way."""
 
 
-def expose_dark(
-    step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera], *, token: str
-) -> Exposed:
+def expose_dark(run: CaptureRun, box: ProbeBox, step: Step, *, token: str) -> Exposed:
     """Expose without light; see `expose`."""
-    return _expose(step, rig, box, cameras, lambda: (box.trigger_camera(token), 0.0))
+    return _expose(run, box, step, lambda: (box.trigger_camera(token), 0.0))
 
 
-def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]) -> Exposed:
+def expose(run: CaptureRun, box: ProbeBox, step: Step) -> Exposed:
     """Open the shutter once, and collect one frame a camera.
 
     Raises
@@ -68,8 +65,6 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
         Where the box forbids it for another reason.
     """
     seconds = float(step.settings["exposure_s"])
-
-    readout_s = max(rig.view(name).readout_s for name in step.cameras)
 
     def release() -> tuple[float, float]:
         try:
@@ -85,14 +80,14 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
             return opening.t_open_s, _light_s(step, box, opening)
         except (ShutterFault, HeadLost):
             # the camera still exposes or reads out, and would miss the next pulse
-            over_s = opening.t_open_s + seconds + readout_s + SHUTTER_REPORT_TIMEOUT_S
+            over_s = opening.t_open_s + seconds + readout_s(run, step) + SHUTTER_REPORT_TIMEOUT_S
             box.listen(over_s - box.ping(), every_s=LEASE_RENEWAL_S)
             raise
 
-    return _expose(step, rig, box, cameras, release)
+    return _expose(run, box, step, release)
 
 
-def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
+def _light_s(step: Step, box: ProbeBox, opening: Opening) -> float:
     """Wait until the shutter has closed and return how long its light lasted, s."""
     seconds = float(step.settings["exposure_s"])
     box.listen(seconds, every_s=LEASE_RENEWAL_S)
@@ -114,7 +109,7 @@ def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
     return open_s
 
 
-def recover_shutter(box: ProbeDriver, step: Step) -> None:
+def recover_shutter(box: ProbeBox, step: Step) -> None:
     """Try to close a shutter that is stuck, and to light the LED again that was put out for it."""
     try:
         box.close_shutter()
@@ -124,30 +119,20 @@ def recover_shutter(box: ProbeDriver, step: Step) -> None:
             raise HeadLost("the box had let go of the head") from error
 
 
+def readout_s(run: CaptureRun, step: Step) -> float:
+    """Return the longest read-out of a step's cameras, s."""
+    return max(run.rig.view(name).readout_s for name in step.cameras)
+
+
 def _expose(
-    step: Step,
-    rig: Rig,
-    box: ProbeDriver,
-    cameras: Mapping[str, Camera],
-    release: Callable[[], tuple[float, float]],
+    run: CaptureRun, box: ProbeBox, step: Step, release: Callable[[], tuple[float, float]]
 ) -> Exposed:
-    want = wanted_exposure(step)
-    chosen = {name: cameras[name] for name in step.cameras}
-    not_before: dict[str, float] = {}
-    for name, camera in chosen.items():
-        configure(name, camera, want)
-        camera.arm(1, Trigger.EDGE)
-        not_before[name] = camera.clock_s()
+    want, chosen = wanted_exposure(step), run.cameras_of(step)
+    armed_s = arm_cameras(chosen, want, dict.fromkeys(chosen, Trigger.EDGE))
     t_box_s, open_s = release()
-    readout_s = max(rig.view(name).readout_s for name in chosen)
     # the lease is renewed up to the moment at which the frame should be there
     dark_s = 0.0 if open_s else want.exposure_s
-    box.listen(dark_s + readout_s, every_s=LEASE_RENEWAL_S)
-    frames: dict[str, Frame] = {}
-    stale = 0
-    for name, camera in chosen.items():
-        frames[name], dropped = next_frame(
-            camera, seq=0, not_before_s=not_before[name], want=want, timeout_s=FRAME_TIMEOUT_S
-        )
-        stale += dropped
-    return Exposed(step, frames, t_box_s, open_s, stale)
+    box.listen(dark_s + readout_s(run, step), every_s=LEASE_RENEWAL_S)
+    frames, stale = collect(chosen, want, armed_s, dict.fromkeys(chosen, FRAME_TIMEOUT_S))
+    run.stale += stale
+    return Exposed(step, frames, t_box_s, open_s)

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from fixtures.operators import by_operator
 
 from capture.acquire import AcquisitionError, Interrupted, run_plan
 from capture.acquire.dome import check_safety
@@ -69,8 +70,7 @@ class Bench:
             boxes={"dome": self.box},
             cameras=self.cameras,
             session=self.session,
-            clock=lambda: 1.0,
-            **{"eyes": "closed", **more},
+            **by_operator({"eyes": "closed", **more}),
         )
 
     def close(self):

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fixtures.operators import by_operator
 
 from capture.acquire import AcquisitionError, Interrupted, run_plan
 from capture.devices.camera import (
@@ -144,8 +145,7 @@ def run(plan, session, box, camera, **more):
         boxes={"flash": box},
         cameras={"cam": camera},
         session=session,
-        clock=lambda: 1.0,
-        **more,
+        **by_operator(more),
     )
 
 

@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from fixtures.operators import by_operator
 
 from capture import raw
 from capture.acquire import AcquisitionError, Interrupted, run_plan
@@ -86,8 +87,7 @@ class Bench:
             boxes={"gradient_sphere": self.sphere, "caliper": self.caliper},
             cameras=self.cameras,
             session=self.session,
-            clock=lambda: 1.0,
-            **words,
+            **by_operator(words),
         )
 
     def resume(self):

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from fixtures.operators import by_operator
 
 from capture.acquire import AcquisitionError, Interrupted, run_plan
 from capture.devices.camera import CameraError, Trigger, open_camera
@@ -117,8 +118,7 @@ class Bench:
             boxes={"probe": self.box},
             cameras=self.cameras,
             session=self.session,
-            clock=lambda: 1.0,
-            **words,
+            **by_operator(words),
         )
 
     def resume(self):
