@@ -58,7 +58,9 @@ NOT_DRIVEN = {
                 "reconstruction.pipeline.flash.facial_color": (
                     "alignment_document fit repeats_document"
                 ),
-                "reconstruction.pipeline.flash.stages": "diffuse_of_each graph inputs_of",
+                "reconstruction.pipeline.flash.stages": (
+                    "colors_of_skin diffuse_of_each graph inputs_of stderr_of"
+                ),
                 "reconstruction.pipeline.gradient.stages": "graph products",
                 "reconstruction.pipeline.recipes": "light_list recipe_of reconstruct",
                 "reconstruction.pipeline.probe.images": "measurement_name",
@@ -70,8 +72,10 @@ NOT_DRIVEN = {
                 "reconstruction.pipeline.flash.sequence": "graph products",
                 "reconstruction.pipeline.gradient.skin_strain": "measure_states skin_mask",
                 "reconstruction.pipeline.light_stack": "graph",
-                "reconstruction.pipeline.record": "record",
-                "reconstruction.pipeline.graph": "document_bytes input_hash order run",
+                "reconstruction.pipeline.masked_map": "masked_map",
+                "reconstruction.pipeline.graph": (
+                    "attributes_of document_bytes input_hashes order record run stage_maker"
+                ),
             },
         ),
         (
@@ -96,9 +100,9 @@ NOT_DRIVEN = {
                 "reconstruction.registration.strain": "measure_strain",
                 "reconstruction.surface.errors": "of_albedo of_normals",
                 "reconstruction.surface.estimates": (
-                    "albedo at_normals chunk_points collect lobe_weights "
+                    "albedo at_normals lobe_weights "
                     "normals_from_all_light normals_from_half_vectors "
-                    "normals_from_remainder normals_from_shading part_of "
+                    "normals_from_remainder normals_from_shading "
                     "rows_of sample_counts seen_enough surface_samples "
                     "transmitted"
                 ),

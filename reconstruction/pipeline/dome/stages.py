@@ -77,80 +77,47 @@ FILE_NAMES = (MESH_FILE, BASIS_FILE)
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(evidence)
-    base: dict[str, Any] = {
-        "revision": STAGE_REVISION,
-        "inputs": dict(sorted(evidence.hashes.items())),
-    }
+    stage = evidence.stage_maker(STAGE_REVISION)
     if evidence.hold_out:
-        base["held_out"] = evidence.hold_out.record()
-    weights_made = weight_names(evidence.rank or BASIS_RANK)
-
+        stage = partial(stage, held_out=evidence.hold_out.record())
+    weights = " ".join(weight_names(evidence.rank or BASIS_RANK))
     unscaled = (
-        ""
-        if dome.absolute
-        else (
-            "r_d: the lights are not calibrated and an albedo has no scale without them; run "
-            "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
-        )
+        "r_d: the lights are not calibrated and an albedo has no scale without them; run "
+        "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
     )
-
-    def stage(
-        name: str,
-        needs: tuple[str, ...],
-        makes: tuple[str, ...],
-        run: Any,
-        refused: str = "",
-        **more: Any,
-    ) -> stages.Stage:
-        return stages.Stage(name, needs, makes, run, {**base, **more}, refused)
-
-    known = ("surface", "lumitexels", "point_normals", "point_r_d")
+    refused = "" if dome.absolute else unscaled
+    known = "surface lumitexels point_normals point_r_d"
     return [
-        stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
-        stage("texture", ("surface",), ("texture", "position", MESH_FILE), partial(_texture, dome)),
-        stage(
-            "motion",
-            ("surface",),
-            ("motion",),
-            lambda surface: {"motion": _motion(evidence, dome, surface)},
-        ),
-        stage(
-            "lumitexels",
-            ("surface", "motion"),
-            ("lumitexels",),
-            lambda surface, motion: {"lumitexels": _lumitexels(dome, surface, motion)},
-        ),
-        stage("sample counts", ("lumitexels", "texture"), ("samples",), partial(_counts, dome)),
-        stage(
-            "half-vector normals",
-            ("lumitexels", "texture"),
-            ("half_vector_normals",),
-            partial(_half_vectors, dome),
-        ),
+        stage("surface", "", "surface", partial(_surface, evidence, dome)),
+        stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
+        stage("motion", "surface", "motion", partial(_motion, evidence, dome)),
+        stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, dome)),
+        stage("sample counts", "lumitexels texture", "samples", _counts),
+        stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
         stage(
             "normals",
-            ("surface", "lumitexels", "texture"),
-            ("point_normals", "normals"),
+            "surface lumitexels texture",
+            "point_normals normals",
             partial(_normals, dome),
         ),
         stage(
             "albedo",
-            ("surface", "lumitexels", "point_normals", "texture"),
-            ("point_r_d", "r_d"),
+            "surface lumitexels point_normals texture",
+            "point_r_d r_d",
             partial(_albedo, dome),
-            unscaled,
+            refused,
         ),
         stage(
             "lobes",
-            ("lumitexels", "point_normals", "point_r_d"),
-            ("basis", "weights", "basis_file"),
+            "lumitexels point_normals point_r_d",
+            "basis weights basis_file",
             partial(fit_lobes, evidence),
             ranks=list(RECORDED_RANKS),
         ),
         stage(
             "refined normals",
-            (*known, "basis", "weights", "basis_file", "texture"),
-            ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
+            f"{known} basis weights basis_file texture",
+            f"normals_refined {weights} lobe_residual {BASIS_FILE}",
             partial(refine_normals, dome),
         ),
     ]
@@ -216,16 +183,12 @@ def _require(dome: Dome) -> None:
     photometric_stereo.require_spread(unit_vectors(place))
 
 
-def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
+def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     side = 2 ** math.ceil(math.log2(math.sqrt(2.0 * len(surface.points_mm))))
     texture = SurfaceTexture.of(surface, size=int(np.clip(side, *TEXTURE_LIMITS)))
-    return {
-        "texture": texture,
-        "position": texture.map(
-            surface.points_mm, None, np.ones(len(surface.points_mm), bool), "mm", "rig frame"
-        ),
-        MESH_FILE: texture.wavefront(),
-    }
+    points = surface.points_mm
+    position = texture.map(points, None, np.ones(len(points), bool), "mm", "rig frame")
+    return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
 
 
 def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
@@ -261,32 +224,27 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
                 continue
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return Samples(store, folder, len(dome.table.names))
+    return Samples(store, folder, len(dome.table.names), dome.tell)
 
 
-def _counts(dome: Dome, lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+def _counts(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
+    found = lumitexels.collect("sample counts", estimates.sample_counts)
+    return texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")
+
+
+def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
     found = lumitexels.collect(
-        estimates.sample_counts, progress=partial(dome.tell, "sample counts")
+        "half-vector normals", lambda _, samples: estimates.normals_from_half_vectors(samples)
     )
-    return {"samples": texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")}
-
-
-def _half_vectors(
-    dome: Dome, lumitexels: Samples, texture: SurfaceTexture
-) -> Mapping[str, SkinMap]:
-    found = lumitexels.collect(
-        lambda _, samples: estimates.normals_from_half_vectors(samples),
-        progress=partial(dome.tell, "half-vector normals"),
-    )
-    return {"half_vector_normals": texture.normals(found, "as published, world frame")}
+    return texture.normals(found, "as published, world frame")
 
 
 def _normals(
     dome: Dome, surface: RefinedScan, lumitexels: Samples, texture: SurfaceTexture
 ) -> Mapping[str, Any]:
     found = lumitexels.collect(
+        "normals",
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
-        progress=partial(dome.tell, "normals"),
     )
     found = surface_errors.of_normals(found, surface, dome.pixel_mm)
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
@@ -302,19 +260,10 @@ def _albedo(
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
     found = lumitexels.collect(
-        lambda part, samples: estimates.albedo(
-            samples, estimates.part_of(point_normals, part), stderr_rad=typical
-        ),
-        progress=partial(dome.tell, "albedo"),
+        "albedo",
+        lambda part, samples: estimates.albedo(samples, point_normals[part], stderr_rad=typical),
     )
     found = surface_errors.of_albedo(found, point_normals, surface, dome.pixel_mm)
-    return {
-        "point_r_d": found,
-        "r_d": texture.map(
-            found.values,
-            found.stderr,
-            found.valid,
-            "1",
-            "diffuse reflectance, camera RGB over that of a perfect white",
-        ),
-    }
+    what = "diffuse reflectance, camera RGB over that of a perfect white"
+    r_d = texture.map(found.values, found.stderr, found.valid, "1", what)
+    return {"point_r_d": found, "r_d": r_d}

@@ -8,6 +8,7 @@ moved are laid over the face at rest. The curves take the times at which the fla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -59,21 +60,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "`skinrig capture flash --sequence smile` makes"
         )
 
-    def curves() -> Mapping[str, Any]:
-        return {CURVES_FILE: stages.document_bytes(_curves(evidence))}
-
-    return [
-        *flash_stages.graph(evidence),
-        stages.Stage(
-            CURVES_NAME,
-            (),
-            (CURVES_FILE,),
-            curves,
-            {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
-            | model_error.identity(),
-            refused=refused,
-        ),
-    ]
+    of_images = flash_stages.graph(evidence)
+    stage = evidence.stage_maker(STAGE_REVISION)
+    curves, identity = partial(_curves, evidence), model_error.identity()
+    return [*of_images, stage(CURVES_NAME, "", CURVES_FILE, curves, refused, **identity)]
 
 
 def _timed(session: Session) -> list[FrameRecord]:
@@ -84,7 +74,7 @@ def _timed(session: Session) -> list[FrameRecord]:
     ]
 
 
-def _curves(evidence: Evidence) -> dict[str, Any]:
+def _curves(evidence: Evidence) -> bytes:
     """Return the document of a sequence's curves."""
     session = evidence.session
     records = session.frames("subject", polarizer="crossed")
@@ -118,15 +108,9 @@ def _curves(evidence: Evidence) -> dict[str, Any]:
         "places_px": {name: list(place) for name, place in places.items()},
         "radius_px": radius_px,
         "frames": [
-            {
-                "step": record.step_id,
-                "time_s": time[k],
-                "phase_s": phase[k],
-                "late_s": actual[k].get("late_s"),
-                "time_error_s": actual[k].get("time_error_s"),
-                "block": actual[k].get("block"),
-                "moved": bool(moved[k]),
-            }
+            {"step": record.step_id, "time_s": time[k], "phase_s": phase[k]}
+            | {name: actual[k].get(name) for name in ("late_s", "time_error_s", "block")}
+            | {"moved": bool(moved[k])}
             for k, record in enumerate(records)
         ],
         "curves": {
@@ -143,7 +127,7 @@ def _curves(evidence: Evidence) -> dict[str, Any]:
         document |= _of_cycle(time, phase, blood, prompt_s, session, list(places))
     else:
         document |= _of_event(time, means, list(places))
-    return document
+    return stages.document_bytes(document)
 
 
 def _state(records: Sequence[FrameRecord]) -> str:
@@ -338,42 +322,24 @@ def _of_event(
 
 def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
     """Return a fit's document, and how many standard errors its levels lie apart."""
-    document = {
-        "time_constant_s": fit.time_constant_s,
-        "stderr_time_constant_s": fit.stderr_time_constant_s,
-        "interval_s": list(fit.interval_s),
-        "interval_68_s": list(fit.interval_68_s),
-        "known": fit.known,
-        "delay_s": fit.delay_s,
-        "stderr_delay_s": fit.stderr_delay_s,
-        "delay_interval_s": list(fit.delay_interval_s),
-        "text": str(fit),
-    }
+    names = "time_constant_s stderr_time_constant_s interval_s interval_68_s known delay_s"
+    document = stages.attributes_of(fit, f"{names} stderr_delay_s delay_interval_s")
+    document["text"] = str(fit)
     if curve is not None:
-        document |= {
-            "start": fit.start[curve],
-            "end": fit.end[curve],
-            "stderr_start": fit.stderr_start[curve],
-            "stderr_end": fit.stderr_end[curve],
-            "stderr_change": fit.stderr_change[curve],
-            "step_of_pose": fit.step[curve],
-            "stderr_step_of_pose": fit.stderr_step[curve],
-            "noise": fit.noise[curve],
-        }
+        names = "start end stderr_start stderr_end stderr_change step stderr_step noise"
+        of_curves = stages.attributes_of(fit, names)
+        titles = {"step": "step_of_pose", "stderr_step": "stderr_step_of_pose"}
+        document |= {titles.get(name, name): all_[curve] for name, all_ in of_curves.items()}
         apart = abs(float(fit.end[curve] - fit.start[curve]))
         document["levels_apart_sigmas"] = apart / max(float(fit.stderr_change[curve]), 1e-300)
     return document
 
 
 def _of_transition(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
+    names = "seen decided where tested false_alarm power high low noise"
+    document = stages.attributes_of(found, names)
     return {
         "seen": found.seen,
         "decided": found.decided,
-        "frames": indices[found.where],
-        "tested": found.tested,
-        "false_alarm": found.false_alarm,
-        "power": found.power,
-        "high": found.high,
-        "low": found.low,
-        "noise": found.noise,
-    }
+        "frames": indices[document.pop("where")],
+    } | document

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -53,6 +54,11 @@ class Patterns:
     values: Mapping[Key, Float32Array]
     variance: Mapping[Key, Float32Array]
     valid: BoolArray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the pictures."""
+        return self.valid.shape[0], self.valid.shape[1]
 
     def crossed(self) -> Float32Array:
         """Return the light from inside the skin: all crossed pictures together.
@@ -109,17 +115,10 @@ class GradientImages:
             index = record.index
             angle, step = float(index["angle"]), int(index["caliper"])
             name = state_name(angle, step)
-            actual = record.actual
-            found.setdefault(
-                name,
-                SkinState(
-                    name,
-                    angle,
-                    step,
-                    float(actual.get("aperture_mm", math.nan)),
-                    float(actual.get("force_n", math.nan)),
-                ),
+            aperture_mm, force_n = (
+                float(record.actual.get(key, math.nan)) for key in ("aperture_mm", "force_n")
             )
+            found.setdefault(name, SkinState(name, angle, step, aperture_mm, force_n))
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
@@ -170,21 +169,13 @@ class GradientImages:
         return Patterns(values, variance, valid)
 
     def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
-        total: Float32Array | None = None
-        for record in records:
-            frame = self._session.read(record)
-            noise = self._noise
-            value, spread, good = raw.linear_mono(
-                frame,
-                gain=None if noise is None else noise.gain,
-                read_noise=None if noise is None else noise.read_noise,
-            )
-            if total is None:
-                total, variance, valid = value, spread, good
-            else:
-                total, variance, valid = total + value, variance + spread, valid & good
-        if total is None:
+        if not records:
             raise EvidenceError("a pattern has no frame")
+        noise = {} if self._noise is None else dataclasses.asdict(self._noise)
+        frames = (raw.linear_mono(self._session.read(record), **noise) for record in records)
+        total, variance, valid = next(frames)
+        for value, spread, good in frames:
+            total, variance, valid = total + value, variance + spread, valid & good
         count = np.float32(len(records))
         return total / count, variance / count**2, valid
 
