@@ -1,7 +1,6 @@
 """The chromophore fit's inner loop: one damped Newton fit a pixel, all pixels in parallel.
 
-`reconstruction.chromophores` is the door; `reconstruction.chromophores.reference` does the same in
-plain NumPy and is what this is tested against.
+`reconstruction.chromophores` is the door; its tests do the same in plain NumPy.
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ likelihood, over the fold where dark skin takes the colors of lighter skin; betw
 lines the cost is interpolated by its values and slopes. Where it is known how blood and melanin
 are distributed over the face, the ridge is that of the product, and each line is looked at from
 the face's blood too. `reconstruction.chromophores.posterior` is the door;
-`reconstruction.chromophores.reference` sums the same over a dense plane and is what this is tested
-against.
+its tests sum the same over a dense plane.
 
 A pixel goes through `_weights`, `_follow`, `_lowest`, `_look_across` and `_sum_up`. These hand on:
 

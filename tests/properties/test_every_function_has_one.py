@@ -38,7 +38,6 @@ NOT_DRIVEN = {
                 "model.brdf.tensor_file": "read write",
                 "model.traits.storage": "from_bytes load",
                 "model.wrinkles.expressions": "read_table",
-                "reconstruction.correspondence.expression_alignment": "read_landmarks",
                 "reconstruction.correspondence.landmark_table": "read",
                 "reconstruction.scan.mesh": "load_ply",
                 "reconstruction.pipeline.flash.state_images": "read",
@@ -84,6 +83,7 @@ NOT_DRIVEN = {
                 "reconstruction.correspondence.common_parameterization": (
                     "chart correspond find_cylinder frame_around"
                 ),
+                "reconstruction.correspondence.splatting": "closed outermost splat",
                 "reconstruction.correspondence.common_regions": "region standard_frame",
                 "reconstruction.correspondence.expression_alignment": "align",
                 "reconstruction.registration.feature_matches": "match",
@@ -115,7 +115,6 @@ NOT_DRIVEN = {
                 "model.displacement_synthesis.growth": "grow lay_out",
                 "model.brdf.rgl": "of_brdf",
                 "reconstruction.brdf_basis.space": "curve",
-                "reconstruction.chromophores.reference": "estimate fit",
                 "reconstruction.kernel_fit.errors": (
                     "nearly_as_good of_grid of_kernel widths_of_best widths_of_pair"
                 ),

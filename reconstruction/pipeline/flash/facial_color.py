@@ -261,7 +261,7 @@ def _align(
         except expression_alignment.AlignmentError as error:
             left_out.append((image.name, str(error)))
             continue
-        found.append(_aligned(image, alignment.warp_map(diffuse, place=False), alignment))
+        found.append(_aligned(image, alignment.warp_map(diffuse), alignment))
     return found, left_out
 
 

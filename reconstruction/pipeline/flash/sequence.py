@@ -186,10 +186,7 @@ def _laid_over_rest(
     moved = np.array([_more_like(m, on, off, both) for m in maps])
     # all moved frames are laid by one alignment: what it is off by is no noise from frame to frame,
     # but part of the step between poses
-    laid = [
-        alignment.warp_map(m, place=False) if is_on else m
-        for m, is_on in zip(maps, moved, strict=True)
-    ]
+    laid = [alignment.warp_map(m) if is_on else m for m, is_on in zip(maps, moved, strict=True)]
     return moved, laid
 
 
