@@ -16,6 +16,11 @@ from numpy.typing import ArrayLike
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
+from reconstruction.chromophores.pixel_checks import (
+    ChromophoreError,
+    broadcast_variance,
+    checked_mask,
+)
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, Start, evaluate, start_for
 
 Shading = Literal["known"] | ArrayLike | None
@@ -25,10 +30,6 @@ DEFAULT_RELATIVE_NOISE = 0.01
 MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not seen."""
 _TASK_PIXELS = 8192
-
-
-class ChromophoreError(ValueError):
-    """Arguments of the chromophore fit that do not fit each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def invert(
         _usable(valid, shape),
         free,
         covariance.astype(np.float32),
-        _cells(table),
+        np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
         start.axes,
@@ -369,30 +370,14 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Arr
 
 
 def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Array:
-    if variance is None:
-        return np.zeros((1, 3), dtype=np.float32)
-    values = np.asarray(variance, dtype=np.float32)
-    if values.shape == (3,):
-        return np.ascontiguousarray(values).reshape(1, 3)
-    try:
-        values = np.broadcast_to(values, (*shape, 3))
-    except ValueError as error:
-        raise ChromophoreError(
-            f"variance: expected a shape that broadcasts to {(*shape, 3)}, got {values.shape}"
-        ) from error
-    return np.ascontiguousarray(values).reshape(-1, 3)
+    """Return the variance of each pixel (n, 3), or of all (1, 3)."""
+    values = np.zeros(3) if variance is None else np.asarray(variance)
+    if values.shape != (3,):
+        values = broadcast_variance(values, (*shape, 3))
+    return np.ascontiguousarray(values, np.float32).reshape(-1, 3)
 
 
 def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    if valid is None:
-        return np.ones(1, dtype=np.bool_)
-    usable = np.asarray(valid)
-    if usable.dtype != np.bool_ or usable.shape != shape:
-        raise ChromophoreError(
-            f"valid: expected bool of shape {shape}, got {usable.dtype} of {usable.shape}"
-        )
+    """Return which pixels may be used (n,), or that all may (1,)."""
+    usable = np.ones(1, np.bool_) if valid is None else checked_mask(valid, shape)
     return np.ascontiguousarray(usable).reshape(-1)
-
-
-def _cells(table: ColorTable) -> Float32Array:
-    return np.ascontiguousarray(table.cells, dtype=np.float32)

@@ -26,9 +26,9 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import polarization
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
-from reconstruction.chromophores import face as face_chromophores
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.detectability import detectable
+from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
@@ -340,37 +340,31 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(stderr_of(diffuse))
     errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
-    face = None
-    if has_white:  # of a face in light of unknown strength its pixels together say no more
-        face = face_chromophores.fit_with_white_reference(
-            rgb, table, variance=variance, model_error=errors
-        )
-    known = partial(chromophore_posterior.estimate, rgb, table, prior=prior)
-    found = by_face = known(face=face, variance=variance, model_error=errors)
-    noise_alone = known(face=face, variance=variance)
-    if face is not None:  # moles, lips and lids may be no skin of that face's usual kind
-        alone = known(variance=variance, model_error=errors)
-        spots = dark_spots.is_locally_dark(rgb, variance=variance)
-        spots |= dark_spots.is_lighter_than_face_prior(by_face, alone)
-        found = dark_spots.average_hypotheses(by_face, alone, spots)
+    whole = estimate_face(
+        rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
+    )
+    found, by_face = whole.found, whole.by_face
+    by_noise = partial(chromophore_posterior.estimate, rgb, table, prior=prior, variance=variance)
+    noise_alone = by_noise(face=whole.face)
+    if whole.face is not None:  # moles, lips and lids may be no skin of that face's usual kind
         noise_alone = dark_spots.average_hypotheses(
-            noise_alone, known(variance=variance, valid=spots), spots
+            noise_alone, by_noise(valid=whole.spots), whole.spots
         )
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:
         error = f"stderr_{name}"
-        by_noise = getattr(noise_alone, error)
+        noise = getattr(noise_alone, error)
         # spots are wide on purpose; they say nothing of what is known of the skin around them
         good = detectable(
-            getattr(by_face, name), getattr(by_face, error), usable & np.isfinite(by_noise)
+            getattr(by_face, name), getattr(by_face, error), usable & np.isfinite(noise)
         )
         values, stderr, unit = getattr(found, name), getattr(found, error), MAP_UNITS[name]
         why = "invalid where noise and model error leave it unknown"
         alone = "standard error that noise alone would leave, without model error"
         return {
             name: masked_map(values, stderr, good, unit, why),
-            name + NOISE_STDERR: masked_map(by_noise, None, good, unit, alone),
+            name + NOISE_STDERR: masked_map(noise, None, good, unit, alone),
         }
 
     what = "how far the color lies outside the model's, relative"
