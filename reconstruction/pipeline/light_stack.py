@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
@@ -64,32 +66,15 @@ class Lights:
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a session with a light list can go through; see `stages.run`."""
-    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    stage = evidence.stage_maker(STAGE_REVISION)
+    known = "stack lights normals gray_albedo"
     return [
-        stages.Stage("stack", (), ("stack",), lambda: {"stack": _stack(evidence.session)}, base),
-        stages.Stage(
-            "lights",
-            ("stack",),
-            ("lights",),
-            lambda stack: {"lights": _lights(evidence, stack)},
-            base,
+        stage("stack", "", "stack", partial(_stack, evidence.session)),
+        stage("lights", "stack", "lights", partial(_lights, evidence)),
+        stage(
+            "normals", "stack lights", "normals residual gray_albedo", partial(_normals, evidence)
         ),
-        stages.Stage(
-            "normals",
-            ("stack", "lights"),
-            ("normals", "residual", "gray_albedo"),
-            lambda stack, lights: _normals(evidence, stack, lights),
-            base,
-        ),
-        stages.Stage(
-            "albedo",
-            ("stack", "lights", "normals", "gray_albedo"),
-            ("albedo",),
-            lambda stack, lights, normals, gray_albedo: _albedo(
-                evidence.session, stack, lights, normals, gray_albedo
-            ),
-            base,
-        ),
+        stage("albedo", known, "albedo", partial(_albedo, evidence.session)),
     ]
 
 
@@ -121,20 +106,18 @@ def _stack(session: Session) -> Stack:
     if strength is not None:
         level = np.asarray(strength, np.float64)
         gain /= level / level.mean()
-    gray: Any = None
-    usable: Any = None
     folder: Any = None
     for number, record in enumerate(records):
         values, good = _linear(session.read(record))
-        if gray is None:
+        if number == 0:
             shape = (len(records), *good.shape)
-            if 4 * int(np.prod(shape)) > MEMORY_BYTES:
+            gray: Any = np.empty(shape, np.float32)
+            usable: Any = np.empty(shape, bool)
+            if gray.nbytes > MEMORY_BYTES:
                 folder = tempfile.TemporaryDirectory(prefix="skinrig-")
                 at = Path(folder.name)
                 gray = np.memmap(at / "gray", np.float32, "w+", shape=shape)
                 usable = np.memmap(at / "usable", np.bool_, "w+", shape=shape)
-            else:
-                gray, usable = np.empty(shape, np.float32), np.empty(shape, bool)
         factor = gain[number, : values.shape[2]].astype(np.float32)
         gray[number] = (values * factor).mean(axis=-1)
         usable[number] = good
@@ -252,25 +235,19 @@ def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, A
     n = np.where(valid[..., None], best.normals, 0.0)
     # isotropic across the normal: each component has its share of the angle's error
     each = best.stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
-    relative = np.where(valid, best.residual / np.where(valid, best.albedo, 1.0), 0.0)
+    relative = best.residual / np.where(valid, best.albedo, 1.0)
+    frame = "picture frame: x right, y up, z towards the camera"
+    misfit = "root mean square misfit over albedo"
     return {
-        "normals": SkinMap(
-            n,
-            MAP_UNITS["normals"],
-            np.where(valid[..., None], each, 0.0),
-            valid,
-            "picture frame: x right, y up, z towards the camera",
-        ),
-        "residual": SkinMap(
-            relative, MAP_UNITS["residual"], None, valid, "root mean square misfit over albedo"
-        ),
+        "normals": masked_map(n, each, valid, MAP_UNITS["normals"], frame),
+        "residual": masked_map(relative, None, valid, MAP_UNITS["residual"], misfit),
         "gray_albedo": best,
     }
 
 
 def _albedo(
     session: Session, stack: Stack, lights: Lights, normals: SkinMap, gray_albedo: NormalMaps
-) -> Mapping[str, SkinMap]:
+) -> SkinMap:
     """Fit each channel's albedo to the samples that agree with the gray fit."""
     n, gray = normals.values, gray_albedo
     above = np.zeros((), np.float64)
@@ -296,18 +273,10 @@ def _albedo(
         below += weight * shading
     valid = gray.valid & (below > 0)
     albedo = above / np.where(valid, below, 1.0)[..., None]
-    albedo = np.where(valid[..., None], albedo, 0.0)
     channels = albedo.shape[2]
     error = np.minimum(gray.stderr_albedo, gray.albedo) * np.sqrt(channels)
-    errors = np.broadcast_to(np.where(valid, error, 0.0)[..., None], albedo.shape)
+    errors = np.broadcast_to(error[..., None], albedo.shape)
     if channels == 1:
         albedo, errors = albedo[..., 0], errors[..., 0]
-    return {
-        "albedo": SkinMap(
-            albedo.astype(np.float32),
-            "1",
-            np.ascontiguousarray(errors, np.float32),
-            valid,
-            "over what the lights give a white surface, up to one factor",
-        )
-    }
+    what = "over what the lights give a white surface, up to one factor"
+    return masked_map(albedo, errors, valid, "1", what)

@@ -12,7 +12,6 @@ LONG_MODULES = {
     "reconstruction/brdf_basis/nnls_kernels.py": 568,
     "reconstruction/chromophores/posterior_kernels.py": 633,
     "reconstruction/correspondence/common_parameterization.py": 484,
-    "reconstruction/facial_color/repeatability.py": 457,
     "reconstruction/scan/registration.py": 502,
     "rigsim/boxes/caliper.py": 493,
     "rigsim/boxes/controller.py": 465,

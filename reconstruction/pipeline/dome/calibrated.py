@@ -14,6 +14,7 @@ from capture.calibration.lights import LightTable
 from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
 from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.graph import attributes_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,19 +139,11 @@ def split_exposures(dome: Dome) -> Dome:
 
 def reorder_lights(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
     """Return a table with the rows of another in a given order, also more than once."""
-    kept = {
-        field: getattr(lights, field)[order]
-        for field in (
-            "position_mm",
-            "intensity",
-            "exponent",
-            "axis",
-            "valid",
-            "position_stderr_mm",
-            "intensity_stderr",
-            "exponent_stderr",
-        )
-    }
+    per_light = (
+        "position_mm intensity exponent axis valid position_stderr_mm intensity_stderr "
+        "exponent_stderr"
+    )
+    kept = {field: values[order] for field, values in attributes_of(lights, per_light).items()}
     return dataclasses.replace(lights, names=tuple(names), **kept)
 
 
