@@ -175,9 +175,7 @@ def fit_cycle(
     return _fit_bent(data, straight, delays, constants, changes, bend)
 
 
-def fit_course(
-    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None, bend: float = 0.0
-) -> RelaxationFit:
+def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> RelaxationFit:
     """Fit blood that relaxes to a new level after an event at time 0.
 
     Parameters
@@ -186,8 +184,6 @@ def fit_course(
         s after the event; samples before it are not used.
     values : array_like, shape (N,) or (P, N)
         One curve, or several that share the time constant; NaN is left out.
-    stderr : array_like, optional
-        Standard errors of the values, their shape.
     bend : float
         Standard error of how the values are bent over the change, in [0, 1): a part s of it
         shows as s +- bend s (1 - s). The best constant is that of no bend; what both bends move it
@@ -207,9 +203,7 @@ def fit_course(
     time = np.asarray(time_s, np.float64)
     after = (time >= 0) & np.isfinite(time)
     time = time[after]
-    shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
-    errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
-    data = Samples.of(time, shown, errors)
+    data = Samples.of(time, np.atleast_2d(np.asarray(values, np.float64))[:, after], None)
 
     def course(delay: Float64Array, constant: Float64Array) -> Float64Array:
         """Part of the way to the new level."""

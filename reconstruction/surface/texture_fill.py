@@ -72,12 +72,10 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
     uv = np.ascontiguousarray(corner_uv, np.float64)
     if uv.ndim != 3 or uv.shape[1:] != (3, 2) or not np.isfinite(uv).all():
         raise ValueError(f"corner_uv: got shape {uv.shape}, expected (F, 3, 2) finite numbers")
-    if not FILL_SIZE_RANGE_PX[0] <= size <= FILL_SIZE_RANGE_PX[1]:
-        raise ValueError(
-            f"size: got {size}, expected {FILL_SIZE_RANGE_PX[0]} to {FILL_SIZE_RANGE_PX[1]} texels"
-        )
-    face, weight = _rasterize(uv, size)
-    return TexelMap(face, weight)
+    least, most = FILL_SIZE_RANGE_PX
+    if not least <= size <= most:
+        raise ValueError(f"size: got {size}, expected {least} to {most} texels")
+    return TexelMap(*_rasterize(uv, size))
 
 
 def texels_from_points(
@@ -222,11 +220,8 @@ def _interpolate(face, weight, corners, values, trust):  # type: ignore[no-untyp
             f = face[i, j]
             if f < 0:
                 continue
-            share = (
-                np.float32(1.0) - weight[i, j, 0] - weight[i, j, 1],
-                weight[i, j, 0],
-                weight[i, j, 1],
-            )
+            second, third = weight[i, j, 0], weight[i, j, 1]
+            share = np.float32(1.0) - second - third, second, third
             total = np.float32(0.0)
             for k in range(3):
                 w = max(share[k], np.float32(0.0)) * trust[corners[f, k]]
@@ -326,18 +321,10 @@ def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
                 for c in range(channels):
                     total = np.float32(0.0)
                     count = np.float32(0.0)
-                    if i > 0:
-                        total += filled[i - 1, j, c]
-                        count += np.float32(1.0)
-                    if i < height - 1:
-                        total += filled[i + 1, j, c]
-                        count += np.float32(1.0)
-                    if j > 0:
-                        total += filled[i, j - 1, c]
-                        count += np.float32(1.0)
-                    if j < width - 1:
-                        total += filled[i, j + 1, c]
-                        count += np.float32(1.0)
+                    for y, x in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                        if 0 <= y < height and 0 <= x < width:
+                            total += filled[y, x, c]
+                            count += np.float32(1.0)
                     if count > 0.0:
                         mean = total / count
                         goal = w * fine[i, j, c] + (np.float32(1.0) - w) * mean

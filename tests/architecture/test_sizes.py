@@ -30,7 +30,6 @@ LONG_FUNCTIONS = {
     "model/displacement_synthesis/growth.py:_choose": 89,
     "reconstruction/anisotropy/estimation.py:estimate": 96,
     "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 87,
-    "reconstruction/chromophores/face_distribution.py:fit": 84,
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
     "reconstruction/kernel_fit/outcome.py:summarize_search": 87,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,

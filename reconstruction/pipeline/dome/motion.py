@@ -106,19 +106,16 @@ def follow_head(
     order = np.argsort(times)
     frames = [[_gray(session, whole[k][view]) for view in images.views] for k in order]
     step = max(1, len(surface.points_mm) // TRACKED_POINTS)
-    reference = len(order) // 2
+    points = surface.points_mm[::step].astype(np.float64)
     found = head_motion.estimate(
         frames,
         [HalfPixels(camera) for camera in cameras],
-        surface.points_mm[::step].astype(np.float64),
+        points,
         surface.normals[::step].astype(np.float64),
         times[order],
-        reference=reference,
+        reference=len(order) // 2,
     )
-    view = images.views[0]
-    when = np.array(
-        [np.mean(images.times_s(view, light, exposure)) for light, exposure in images.captures]
-    )
+    when = np.array([np.mean(images.times_s(images.views[0], *key)) for key in images.captures])
     if not found.usable.any():
         raise EvidenceError(
             f"{session.path}: no tracking frame tells where the head was; is the scan of "
@@ -130,7 +127,6 @@ def follow_head(
     mean[:3, :3] = head_motion.rotation_matrix(turn.mean(axis=0))
     mean[:3, 3] = shift.mean(axis=0)
     poses = found.matrices(when) @ np.linalg.inv(mean)
-    points = surface.points_mm[::step].astype(np.float64)
     moved = np.einsum("nij,pj->npi", poses[:, :3, :3], points) + poses[:, None, :3, 3] - points
     apart = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
     usable = found.covered(when)

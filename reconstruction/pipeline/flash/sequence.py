@@ -100,6 +100,8 @@ def _curves(evidence: Evidence) -> bytes:
             "enough frames; "
             + ("check the landmarks" if inputs.white else "give it a calibration of white")
         )
+    curves = zip(means.mean, means.stderr, means.pixels, blood.stderr_of_pose, strict=True)
+    columns = ("hemoglobin", "stderr", "pixels", "stderr_of_pose")
     document: dict[str, Any] = {
         "schema": "skinrig.perfusion-curves/1",
         "state": _state(records),
@@ -114,13 +116,8 @@ def _curves(evidence: Evidence) -> bytes:
             for k, record in enumerate(records)
         ],
         "curves": {
-            name: {
-                "hemoglobin": means.mean[k],
-                "stderr": means.stderr[k],
-                "pixels": means.pixels[k],
-                "stderr_of_pose": blood.stderr_of_pose[k],
-            }
-            for k, name in enumerate(places)
+            name: dict(zip(columns, curve, strict=True))
+            for name, curve in zip(places, curves, strict=True)
         },
     }
     if prompt_s > 0:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -112,7 +111,6 @@ def read(
     sessions: Sequence[Path],
     *,
     calibration: Path | None,
-    on_date: date | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Subject:
     """Reconstruct every state and repeat of flash sessions.
@@ -123,8 +121,6 @@ def read(
         SESSION/ folders of one subject and one camera, with a neutral state among them.
     calibration
         CALIBRATION/ folder; None: everything is assumed.
-    on_date
-        The date that calibrations must be valid on; None: that of each session.
     progress
         Called with one line before each image.
 
@@ -155,16 +151,14 @@ def read(
         for state, repeat, since_s in pairs[number]:
             if progress is not None:
                 progress(f"{path.name}: {state}, repeat {repeat}")
-            evidence = Evidence.of(session, calibration, state=state, on_date=on_date)
+            evidence = Evidence.of(session, calibration, state=state)
             evidence.repeat = repeat
             found = stages.run(flash_stages.graph(evidence), list(maps)).products
-            images.append(
-                StateImage(state, repeat, number, began_s + since_s, MappingProxyType(dict(found)))
-            )
-            inputs |= {
-                f"session {number}" if key == "session" else key: value
-                for key, value in evidence.hashes.items()
-            }
+            kept = MappingProxyType(dict(found))
+            images.append(StateImage(state, repeat, number, began_s + since_s, kept))
+            hashes = dict(evidence.hashes)
+            inputs[f"session {number}"] = hashes.pop("session")
+            inputs |= hashes
             assumed |= dict.fromkeys(evidence.assumed)
             spectra = evidence.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
