@@ -68,21 +68,14 @@ class Patterns:
         EvidenceError
             When there is none.
         """
-        return self._sum("crossed")
-
-    def parallel(self) -> Float32Array:
-        """Return all pictures with parallel polarizers together, as `crossed`."""
-        return self._sum("parallel")
-
-    def _sum(self, polarizer: str) -> Float32Array:
-        chosen = [
+        lit = [
             picture
-            for (pattern, turned), picture in self.values.items()
-            if turned == polarizer and pattern != "dark"
+            for (pattern, polarizer), picture in self.values.items()
+            if polarizer == "crossed" and pattern != "dark"
         ]
-        if not chosen:
-            raise EvidenceError(f"state: has no lit picture with {polarizer} polarizers")
-        return np.mean(chosen, axis=0, dtype=np.float32)
+        if not lit:
+            raise EvidenceError("state: has no lit picture with crossed polarizers")
+        return np.mean(lit, axis=0, dtype=np.float32)
 
 
 class GradientImages:
