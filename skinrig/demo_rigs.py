@@ -16,7 +16,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import DomeOptions
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate

@@ -17,7 +17,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import DomeOptions
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as surface_evaluation

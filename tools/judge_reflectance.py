@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import DomeOptions
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.rendering.photographs.comparison import FULL_MODEL

@@ -20,7 +20,7 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 2
@@ -64,17 +64,15 @@ class Lights:
     alive: BoolArray
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session with a light list can go through; see `stages.run`."""
-    stage = evidence.stage_maker(STAGE_REVISION)
+    stage = inputs.stage_maker(STAGE_REVISION)
     known = "stack lights normals gray_albedo"
     return [
-        stage("stack", "", "stack", partial(_stack, evidence.session)),
-        stage("lights", "stack", "lights", partial(_lights, evidence)),
-        stage(
-            "normals", "stack lights", "normals residual gray_albedo", partial(_normals, evidence)
-        ),
-        stage("albedo", known, "albedo", partial(_albedo, evidence.session)),
+        stage("stack", "", "stack", partial(_stack, inputs.session)),
+        stage("lights", "stack", "lights", partial(_lights, inputs)),
+        stage("normals", "stack lights", "normals residual gray_albedo", partial(_normals, inputs)),
+        stage("albedo", known, "albedo", partial(_albedo, inputs.session)),
     ]
 
 
@@ -91,7 +89,7 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
 def _stack(session: Session) -> Stack:
     records = tuple(session.frames("olat"))
     if len(records) < 3:
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: has {len(records)} frames under a light each, expected 3"
         )
     exposures = [
@@ -128,17 +126,17 @@ def _stack(session: Session) -> Stack:
         data = np.frombuffer(session.attachment("mask.png"), np.uint8)
         mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape != inside.shape:
-            raise EvidenceError(f"{session.path}: its mask does not fit its pictures")
+            raise InputsError(f"{session.path}: its mask does not fit its pictures")
         inside = np.asarray(mask > 127)
     return Stack(gray, usable, inside, records, gain, folder)
 
 
-def _lights(evidence: Evidence, stack: Stack) -> Lights:
+def _lights(inputs: Inputs, stack: Stack) -> Lights:
     """Take the list's lights if the shading agrees, else the order that it agrees with."""
-    session = evidence.session
+    session = inputs.session
     listed = session.manifest.extra["light_list"]
     if not isinstance(listed, dict):
-        raise EvidenceError(f"{session.path}: its light list is no table")
+        raise InputsError(f"{session.path}: its light list is no table")
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )
@@ -151,33 +149,33 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
             stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
         )
     except PhotometricStereoError as error:
-        evidence.assumed.append(f"the lights belong to their pictures ({error})")
+        inputs.assumed.append(f"the lights belong to their pictures ({error})")
         return Lights(vectors, near, scale, alive)
     best = f"{100 * min(found.misfit.values()):.1f} %"
     as_listed = f"{100 * found.misfit['as listed']:.1f} %"
     if found.order == "unknown":
-        evidence.assumed.append(
+        inputs.assumed.append(
             "the light list is right, though no order of it explains the shading"
             f" (misfit {as_listed}): the object shines, or these are not its lights"
         )
     elif found.order != "as listed":
         vectors = vectors[found.permutation]
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"the light list is {found.order}: the shading's misfit is {as_listed} as listed and"
             f" {best} so; it was used so"
         )
     alive = ~found.dead
     for number in np.flatnonzero(found.dead):
-        evidence.assumed.append(f"light {number + 1} of the list gave no light and is left out")
+        inputs.assumed.append(f"light {number + 1} of the list gave no light and is left out")
     off = np.flatnonzero(alive & (np.abs(found.strength - 1) > MAX_STRENGTH_DEVIATION))
     if off.size and found.order != "unknown":
         worst = off[np.argmax(np.abs(found.strength[off] - 1))]
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"lights are of one strength, though {off.size} differ by more than "
             f"{MAX_STRENGTH_DEVIATION:.0%}, most"
             f" light {worst + 1} with {found.strength[worst]:.2f} of the middle one"
         )
-    evidence.noted["light_check"] = {
+    inputs.noted["light_check"] = {
         "order": found.order,
         "misfit": {name: round(value, 5) for name, value in found.misfit.items()},
         "dead": [int(k) for k in np.flatnonzero(found.dead)],
@@ -220,13 +218,13 @@ def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
     return float(np.median(curl[inner])) if inner.any() else float("inf")
 
 
-def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, Any]:
+def _normals(inputs: Inputs, stack: Stack, lights: Lights) -> Mapping[str, Any]:
     """Estimate normals both ways and keep those that are more of a surface's."""
     found = {robust: _estimate(stack, lights, robust=robust) for robust in (True, False)}
     both = found[True].valid & found[False].valid
     curl = {robust: _roughness_of_field(maps, both) for robust, maps in found.items()}
     robust = curl[True] <= curl[False]
-    evidence.noted["normals"] = {
+    inputs.noted["normals"] = {
         "estimator": "robust" if robust else "least squares weighted by intensity",
         "median_curl": {"robust": curl[True], "weighted": curl[False]},
     }

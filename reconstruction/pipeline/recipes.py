@@ -12,7 +12,7 @@ from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import DomeOptions, Evidence, EvidenceError
+from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Recipe:
 
     maps: tuple[str, ...]
     """Names of the maps."""
-    graph: Callable[[Evidence], list[stages.Stage]]
+    graph: Callable[[Inputs], list[stages.Stage]]
     files: tuple[str, ...] = ()
     """Names of what is no map and goes along: meshes, tables."""
     always: tuple[str, ...] = ()
@@ -89,7 +89,7 @@ def recipe_of(session: Session) -> Recipe:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When no step of its plan shows a subject.
     """
     if "light_list" in session.manifest.extra:
@@ -98,7 +98,7 @@ def recipe_of(session: Session) -> Recipe:
     for kind, recipe in RECIPE_OF_STEP.items():
         if kind in kinds:
             return recipe()
-    raise EvidenceError(
+    raise InputsError(
         f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
         f"{' or '.join(RECIPE_OF_STEP)}; `skinrig calibrate` takes sessions of targets"
     )
@@ -151,7 +151,7 @@ def reconstruct(
 
     Raises
     ------
-    EvidenceError, stages.StageError, SessionError, CalibrationError
+    InputsError, stages.StageError, SessionError, CalibrationError
         When frames are missing, a wanted map is unknown, or a file is damaged, of another rig
         or out of date.
     """
@@ -162,22 +162,22 @@ def reconstruct(
     _require_fitting_options(opened, recipe, options)
     for name, file in {"scan": options.scan, "landmarks": landmarks}.items():
         if file is not None and not Path(file).is_file():
-            raise EvidenceError(f"{name}: {file} is no file")
+            raise InputsError(f"{name}: {file} is no file")
     if options.rank is not None and recipe.maps_of_rank is not None:
         recipe = replace(recipe, maps=recipe.maps_of_rank(options.rank))
     _require_known(want, recipe.maps)
-    evidence = Evidence.of(
+    inputs = Inputs.of(
         opened, calibration, state=state, on_date=on_date, landmarks=landmarks, dome=options
     )
-    evidence.progress = progress
-    graph = recipe.graph(evidence)
+    inputs.progress = progress
+    graph = recipe.graph(inputs)
     products = _planned_products(graph, recipe, opened, want)
     previous = _Previous.of(Path(out))
     held = previous.held(graph)
     kept = {previous.keys[name]: contents for name, contents in held.items()}
     outcome = stages.run(graph, products, cache=kept, progress=progress)
     work = stages.record(graph, outcome, {name: previous.keys[name] for name in held})
-    outcome = replace(outcome, assumed=tuple(evidence.assumed), work=work)
+    outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
     # what the subject agreed to goes wherever the maps go
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
     current = previous.exists and previous.parameters.get("consent", []) == consent
@@ -190,7 +190,7 @@ def reconstruct(
         "truth": truth,
         "consent": consent,
     }
-    store.write(out, _appearance(evidence, graph, outcome, products, previous, parameters))
+    store.write(out, _appearance(inputs, graph, outcome, products, previous, parameters))
     return outcome
 
 
@@ -198,21 +198,21 @@ def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions
     options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
     given = [name for name, value in options.items() if value is not None]
     if given and recipe.maps_of_rank is None:
-        raise EvidenceError(
+        raise InputsError(
             f"{', '.join(given)}: {session.path} is no session of the dome; leave out what only it "
             "takes"
         )
     if dome.rank is not None and dome.rank < 1:
-        raise EvidenceError(f"rank: got {dome.rank}, expected 1 or more")
+        raise InputsError(f"rank: got {dome.rank}, expected 1 or more")
 
 
 def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
     known = ", ".join(maps)
     if not want:
-        raise EvidenceError(f"want: got nothing, expected names out of {known}")
+        raise InputsError(f"want: got nothing, expected names out of {known}")
     unknown = [name for name in want if name not in maps]
     if unknown:
-        raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
+        raise InputsError(f"want: got {unknown[0]!r}, expected names out of {known}")
 
 
 def _planned_products(
@@ -234,7 +234,7 @@ def _planned_products(
 
 
 def _appearance(
-    evidence: Evidence,
+    inputs: Inputs,
     graph: Sequence[stages.Stage],
     outcome: stages.Outcome,
     products: Sequence[str],
@@ -247,27 +247,27 @@ def _appearance(
     for stage, held in previous.held(graph).items():
         if previous.keys[stage] == keys[stage]:
             kept |= {name: value for name, value in held.items() if name not in kept}
-    noted = dict(evidence.noted)
-    if previous.exists and previous.inputs == evidence.hashes:
+    noted = dict(inputs.noted)
+    if previous.exists and previous.inputs == inputs.hashes:
         names = previous.parameters.get("noted", [])
         texts = [str(name) for name in names] if isinstance(names, list) else []
         noted |= {n: previous.parameters.get(n) for n in texts if n not in noted}
     return SkinAppearance(
         maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
-        source=evidence.session.source,
+        source=inputs.session.source,
         parameters={
             **parameters,
             "stages": {stage.name: keys[stage.name] for stage in graph},
             "work": [dict(entry) for entry in outcome.work],
-            "assumed": evidence.assumed,
+            "assumed": inputs.assumed,
             "noted": sorted(noted),
             **noted,
         },
-        inputs=evidence.hashes,
+        inputs=inputs.hashes,
         versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
         left_out=outcome.left_out,
         files={name: value for name, value in kept.items() if isinstance(value, bytes)},
-        seed=evidence.session.seed,
+        seed=inputs.session.seed,
     )
 
 
@@ -290,7 +290,7 @@ class _Previous:
         try:
             found = store.read(out)
         except store.StoreError as error:
-            raise EvidenceError(
+            raise InputsError(
                 f"{error}; nothing was written: remove {out}, or name another, to make all anew"
             ) from error
         recorded = found.parameters.get("stages", {})

@@ -135,7 +135,7 @@ def reconstruct(
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
     from reconstruction.pipeline import recipes as pipeline
-    from reconstruction.pipeline.evidence import DomeOptions
+    from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import truth_beside
 
     console = Console(json)

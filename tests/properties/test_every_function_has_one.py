@@ -58,7 +58,7 @@ NOT_DRIVEN = {
                     "alignment_document fit repeats_document"
                 ),
                 "reconstruction.pipeline.flash.stages": (
-                    "colors_of_skin diffuse_of_each graph inputs_of stderr_of"
+                    "colors_of_skin diffuse_of_each graph rig_of stderr_of"
                 ),
                 "reconstruction.pipeline.gradient.stages": "graph products",
                 "reconstruction.pipeline.recipes": "light_list recipe_of reconstruct",

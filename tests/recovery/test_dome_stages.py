@@ -22,9 +22,9 @@ from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import DomeOptions, EvidenceError
 from reconstruction.pipeline.graph import StageError
 from reconstruction.pipeline.hold_out import HoldOutError
+from reconstruction.pipeline.inputs import DomeOptions, InputsError
 from skinrig.simulating.dome import small_dome
 
 AXES_MM = np.array([58.0, 85.0, 66.0])
@@ -447,7 +447,7 @@ def test_as_many_lobes_are_made_as_are_asked_for(found):
 )
 def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
     folder, _ = found
-    with pytest.raises(EvidenceError, match=named):
+    with pytest.raises(InputsError, match=named):
         pipeline.reconstruct(
             folder / "session-ellipsoid",
             want=(want,),

@@ -17,7 +17,7 @@ from capture.rig import load_rig
 from model import store
 from model.skin_reflectance import assemble
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import DomeOptions
+from reconstruction.pipeline.inputs import DomeOptions
 from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map

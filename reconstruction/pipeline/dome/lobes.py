@@ -19,7 +19,7 @@ from reconstruction.arrays import Float64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline.dome.calibrated import Dome
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
@@ -98,15 +98,15 @@ class Samples:
 
 
 def fit_lobes(
-    evidence: Evidence, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
+    inputs: Inputs, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
 ) -> Mapping[str, Any]:
     """Fit basis BRDFs to all points, reduce them, and return basis, weights and file."""
-    folder = evidence.basis
+    folder = inputs.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
-    rank = evidence.rank or BASIS_RANK
+    rank = inputs.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
-        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
+        raise InputsError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
     fitted = []
     for part, samples in lumitexels.chunks():
@@ -119,7 +119,7 @@ def fit_lobes(
     shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * BASIS_RANK))
     most = min(shares.shape)
     if rank > most:
-        raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
+        raise InputsError(f"rank: got {rank}, expected at most {most}; the data hold no more")
     mixes = {
         k: brdf_basis.reduce(shares, k, basis=materials)[1:]
         for k in sorted({*RECORDED_RANKS, rank})
@@ -149,7 +149,7 @@ def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Fl
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
     if np.count_nonzero(kept) < least:
-        raise EvidenceError(
+        raise InputsError(
             f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
             f"reflects, expected at least {least}; more lights or views would show it"
         )

@@ -13,7 +13,7 @@ from capture.calibration.geometry import CameraPose
 from capture.session import Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.registration import head_motion
 from reconstruction.scan.mesh import RefinedScan
 
@@ -117,7 +117,7 @@ def follow_head(
     )
     when = np.array([np.mean(images.times_s(images.views[0], *key)) for key in images.captures])
     if not found.usable.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no tracking frame tells where the head was; is the scan of "
             "this subject, and are the cameras calibrated?"
         )
@@ -132,7 +132,7 @@ def follow_head(
     usable = found.covered(when)
     still = bool(usable.all() and apart.max(initial=0.0) < MAX_STILL_MOTION_PX * pixel_mm)
     if not usable.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no image lies between two tracking frames that tell where the "
             "head was; capture again, with the face at rest"
         )
@@ -142,7 +142,7 @@ def follow_head(
 def _time_s(record: Any) -> float:
     time = record.line.t_box_s
     if time is None:
-        raise EvidenceError(f"{record.file}: does not say when it was lit")
+        raise InputsError(f"{record.file}: does not say when it was lit")
     return float(time)
 
 

@@ -31,8 +31,8 @@ from reconstruction.pipeline.dome.lobes import (
 )
 from reconstruction.pipeline.dome.motion import Motion, follow_head
 from reconstruction.pipeline.dome.registration import register
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.hold_out import HoldOutError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan import mesh as scan_mesh
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
@@ -74,13 +74,13 @@ FILE_NAMES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
-    dome = _dome(evidence)
-    stage = evidence.stage_maker(STAGE_REVISION)
-    if evidence.hold_out:
-        stage = partial(stage, held_out=evidence.hold_out.record())
-    weights = " ".join(weight_names(evidence.rank or BASIS_RANK))
+    dome = _dome(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    if inputs.hold_out:
+        stage = partial(stage, held_out=inputs.hold_out.record())
+    weights = " ".join(weight_names(inputs.rank or BASIS_RANK))
     unscaled = (
         "r_d: the lights are not calibrated and an albedo has no scale without them; run "
         "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
@@ -88,9 +88,9 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     refused = "" if dome.absolute else unscaled
     known = "surface lumitexels point_normals point_r_d"
     return [
-        stage("surface", "", "surface", partial(_surface, evidence, dome)),
+        stage("surface", "", "surface", partial(_surface, inputs, dome)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
-        stage("motion", "surface", "motion", partial(_motion, evidence, dome)),
+        stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
         stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, dome)),
         stage("sample counts", "lumitexels texture", "samples", _counts),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
@@ -111,7 +111,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "lobes",
             "lumitexels point_normals point_r_d",
             "basis weights basis_file",
-            partial(fit_lobes, evidence),
+            partial(fit_lobes, inputs),
             ranks=list(RECORDED_RANKS),
         ),
         stage(
@@ -123,11 +123,11 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     ]
 
 
-def _dome(evidence: Evidence) -> Dome:
+def _dome(inputs: Inputs) -> Dome:
     """Return the dome with the images that may be fitted to."""
-    images = DomeImages(evidence.session)
-    held = evidence.hold_out = evidence.hold_out.within(images.lights, images.views)
-    evidence.noted["held_out"] = held.record()
+    images = DomeImages(inputs.session)
+    held = inputs.hold_out = inputs.hold_out.within(images.lights, images.views)
+    inputs.noted["held_out"] = held.record()
     if held:
         for field, there, least in (
             ("lights", images.lights, estimates.MIN_LIGHTS),
@@ -139,24 +139,24 @@ def _dome(evidence: Evidence) -> Dome:
                     f"hold-out: leaves {left} of {len(there)} {field}, expected at least {least}; "
                     "hold out fewer"
                 )
-        images = DomeImages(evidence.session, without=held)
-    return calibrated(evidence, images)
+        images = DomeImages(inputs.session, without=held)
+    return calibrated(inputs, images)
 
 
-def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
+def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
-    session = evidence.session
-    if evidence.scan is None and SCAN_FILE not in session.attachments():
-        raise EvidenceError(
+    session = inputs.session
+    if inputs.scan is None and SCAN_FILE not in session.attachments():
+        raise InputsError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
-    mesh = session.attachment(SCAN_FILE) if evidence.scan is None else evidence.scan
+    mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
     scan = scan_mesh.prepare(mesh, points=points)
     fit = register(dome, scan.coarse)
-    evidence.noted["registration"] = {
+    inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
         "stderr_rad_mm": fit.stderr.tolist(),
@@ -172,11 +172,9 @@ def _require(dome: Dome) -> None:
     """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
     if views < estimates.MIN_VIEWS:
-        raise EvidenceError(
-            f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}"
-        )
+        raise InputsError(f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}")
     if lights < estimates.MIN_LIGHTS:
-        raise EvidenceError(
+        raise InputsError(
             f"lights: got {lights} that can be used, expected at least {estimates.MIN_LIGHTS}"
         )
     place = dome.lights.position_mm[dome.lights.valid]
@@ -191,11 +189,11 @@ def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
 
 
-def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
+def _motion(inputs: Inputs, dome: Dome, surface: RefinedScan) -> Motion | None:
     images = dome.images.apart()
-    found = follow_head(evidence.session, images, dome.cameras, surface, dome.pixel_mm)
+    found = follow_head(inputs.session, images, dome.cameras, surface, dome.pixel_mm)
     # without tracking frames nobody knows whether the head held still
-    evidence.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
+    inputs.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
 

@@ -22,9 +22,9 @@ from reconstruction.correspondence import expression_alignment, landmark_table
 from reconstruction.facial_color import perfusion_curves, perfusion_fit
 from reconstruction.facial_color.perfusion_samples import PoseStep
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.flash import sequence_blood
 from reconstruction.pipeline.flash import stages as flash_stages
+from reconstruction.pipeline.inputs import Inputs, InputsError
 
 STAGE_REVISION = 6
 CURVES_NAME = "perfusion_curves"
@@ -50,9 +50,9 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
     return {CURVES_NAME: (CURVES_FILE,)}
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    session = evidence.session
+    session = inputs.session
     refused = ""
     if not _timed(session):
         refused = (
@@ -60,9 +60,9 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "`skinrig capture flash --sequence smile` makes"
         )
 
-    of_images = flash_stages.graph(evidence)
-    stage = evidence.stage_maker(STAGE_REVISION)
-    curves, identity = partial(_curves, evidence), model_error.identity()
+    of_images = flash_stages.graph(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    curves, identity = partial(_curves, inputs), model_error.identity()
     return [*of_images, stage(CURVES_NAME, "", CURVES_FILE, curves, refused, **identity)]
 
 
@@ -74,12 +74,12 @@ def _timed(session: Session) -> list[FrameRecord]:
     ]
 
 
-def _curves(evidence: Evidence) -> bytes:
+def _curves(inputs: Inputs) -> bytes:
     """Return the document of a sequence's curves."""
-    session = evidence.session
+    session = inputs.session
     records = session.frames("subject", polarizer="crossed")
-    inputs = flash_stages.inputs_of(evidence)
-    maps = list(flash_stages.diffuse_of_each(inputs, records))
+    rig = flash_stages.rig_of(inputs)
+    maps = list(flash_stages.diffuse_of_each(rig, records))
     actual = [record.line.actual for record in records]
     time = np.array([float(a.get("time_s", np.nan)) for a in actual])
     phase = np.array([float(a.get("phase_s", np.nan)) for a in actual])
@@ -88,17 +88,17 @@ def _curves(evidence: Evidence) -> bytes:
     moved, warped = np.zeros(len(maps), bool), maps
     if prompt_s > 0:
         phase = phase % (2 * prompt_s)
-        moved, warped = _laid_over_rest(maps, phase, prompt_s, evidence)
-    places = _places(evidence, maps, ~moved)
+        moved, warped = _laid_over_rest(maps, phase, prompt_s, inputs)
+    places = _places(inputs, maps, ~moved)
     radius_px = RADIUS_SHARE * maps[0].values.shape[1]
-    light = sequence_blood.Light.of(inputs)
+    light = sequence_blood.Light.of(rig)
     blood = sequence_blood.blood_of_discs(warped, places, radius_px, light, moved=moved)
     means = blood.means
     if not means.valid.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no place of {', '.join(places)} shows a color of skin in "
             "enough frames; "
-            + ("check the landmarks" if inputs.white else "give it a calibration of white")
+            + ("check the landmarks" if rig.white else "give it a calibration of white")
         )
     curves = zip(means.mean, means.stderr, means.pixels, blood.stderr_of_pose, strict=True)
     columns = ("hemoglobin", "stderr", "pixels", "stderr_of_pose")
@@ -134,31 +134,31 @@ def _state(records: Sequence[FrameRecord]) -> str:
 
 
 def _places(
-    evidence: Evidence, maps: Sequence[SkinMap], at_rest: BoolArray
+    inputs: Inputs, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
     """Return where the places lie on the face at rest, px."""
     skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
-    if evidence.landmarks is None:
-        evidence.assumed.append(
+    if inputs.landmarks is None:
+        inputs.assumed.append(
             "places: by the face's outline; a table of landmarks says where they are"
         )
         return perfusion_curves.usual_places(skin)
-    table = landmark_table.read(evidence.landmarks)
+    table = landmark_table.read(inputs.landmarks)
     found = {}
     for name in perfusion_curves.FACE_PLACES:
         named = name if name in table else LANDMARK_ALIASES.get(name, name)
         if named in table:
             found[name] = table[named]
     if not found:
-        raise EvidenceError(
-            f"{evidence.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
+        raise InputsError(
+            f"{inputs.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
             f"{', '.join((*perfusion_curves.FACE_PLACES, *LANDMARK_ALIASES.values()))}"
         )
     return found
 
 
 def _laid_over_rest(
-    maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, evidence: Evidence
+    maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, inputs: Inputs
 ) -> tuple[BoolArray, list[SkinMap]]:
     """Tell in which frames the face has moved, and lay those over the face at rest."""
     settled_on = (phase > 0.5 * prompt_s) & (phase < prompt_s)
@@ -173,7 +173,7 @@ def _laid_over_rest(
             on, off, valid_moving=on_valid, valid_neutral=off_valid
         )
     except expression_alignment.AlignmentError as error:
-        evidence.assumed.append(f"the face does not move with the expression ({error})")
+        inputs.assumed.append(f"the face does not move with the expression ({error})")
         return still, list(maps)
     rows, columns = np.indices(off_valid.shape)
     shift = np.hypot(alignment.source_px[..., 0] - columns, alignment.source_px[..., 1] - rows)

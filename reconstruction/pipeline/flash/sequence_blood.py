@@ -44,10 +44,10 @@ class Light:
     """Relative covariance of the table's colors."""
 
     @staticmethod
-    def of(inputs: flash_stages.Inputs) -> Light:
+    def of(rig: flash_stages.FlashRig) -> Light:
         """Return that of a session."""
-        has_white = inputs.white is not None
-        colors = flash_stages.colors_of_skin(inputs.camera, inputs.illuminant, has_white=has_white)
+        has_white = rig.white is not None
+        colors = flash_stages.colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
         return Light(*colors, np.asarray(model_error.load()))
 
 

@@ -31,7 +31,7 @@ from reconstruction.chromophores.detectability import detectable
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 7
@@ -65,10 +65,10 @@ class Image:
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class FlashRig:
     """What the stages read, and what they have to assume for want of a calibration."""
 
-    evidence: Evidence
+    inputs: Inputs
     sensor: SensorCalibration | None
     white: WhiteReference | None
     polarization: PolarizationCalibration | None
@@ -82,7 +82,7 @@ class Inputs:
     @property
     def session(self) -> Session:
         """The session."""
-        return self.evidence.session
+        return self.inputs.session
 
     @property
     def imported(self) -> bool:
@@ -90,27 +90,27 @@ class Inputs:
         return "photographs" in self.session.manifest.extra
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    inputs = inputs_of(evidence)
-    stage = evidence.stage_maker(STAGE_REVISION)
-    table = {"camera": inputs.camera, "illuminant": inputs.illuminant}
+    rig = rig_of(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    table = {"camera": rig.camera, "illuminant": rig.illuminant}
     return [
         stage(
             "frames",
             "",
             "parallel crossed",
-            partial(_frames, inputs),
-            state=evidence.state,
-            repeat=evidence.repeat,
+            partial(_frames, rig),
+            state=inputs.state,
+            repeat=inputs.repeat,
         ),
-        stage("separation", "parallel crossed", "diffuse specular", partial(_separate, inputs)),
+        stage("separation", "parallel crossed", "diffuse specular", partial(_separate, rig)),
         stage(
             "chromophores",
             "diffuse",
             "melanin hemoglobin shading residual gamut_distance melanin_noise_stderr "
             "hemoglobin_noise_stderr",
-            partial(_chromophores, inputs),
+            partial(_chromophores, rig),
             **table,
             **model_error.identity(),
         ),
@@ -119,20 +119,20 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "pictures",
             "diffuse specular",
             "picture specular_picture",
-            partial(_pictures, inputs),
+            partial(_pictures, rig),
             **table,
         ),
     ]
 
 
-def inputs_of(evidence: Evidence) -> Inputs:
+def rig_of(inputs: Inputs) -> FlashRig:
     """Return what the stages of a flash session read, and note what is assumed."""
-    session = evidence.session
-    shots = session.frames("subject", state=evidence.state)
+    session = inputs.session
+    shots = session.frames("subject", state=inputs.state)
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
 
     def load(kind: str, otherwise: str) -> Calibration | None:
-        return evidence.load(kind, [view.serial], otherwise)
+        return inputs.load(kind, [view.serial], otherwise)
 
     sensor = load("sensor", "the frames are as noisy as they say of themselves")
     white = load(
@@ -144,9 +144,9 @@ def inputs_of(evidence: Evidence) -> Inputs:
     malus = load("polarization", "the polarizers are perfect")
     matrix = load("color", "pictures show balanced camera RGB as if it were linear sRGB")
     illuminant = session.rig.lights[0].illuminant
-    evidence.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
-    return Inputs(
-        evidence,
+    inputs.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
+    return FlashRig(
+        inputs,
         SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
         WhiteReference.from_calibration(white, view.serial) if white else None,
         PolarizationCalibration.from_calibration(malus, view.serial) if malus else None,
@@ -174,10 +174,10 @@ def colors_of_skin(
     return table, prior if has_white else prior.broadened(EXPOSURE_SPREAD)
 
 
-def _frames(inputs: Inputs) -> Mapping[str, Any]:
+def _frames(rig: FlashRig) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
-    session, state, repeat = inputs.session, inputs.evidence.state, inputs.evidence.repeat
-    mean_image = _image_reader(inputs)
+    session, state, repeat = rig.session, rig.inputs.state, rig.inputs.repeat
+    mean_image = _image_reader(rig)
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
         which: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
@@ -189,20 +189,20 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
         crossed = session.frames("subject", polarizer="crossed")
         states = sorted({str(record.index.get("state")) for record in crossed})
         # nobody was asked for the polarizers of photographs
-        what = "photograph" if inputs.imported else "crossed frame"
+        what = "photograph" if rig.imported else "crossed frame"
         there = "none at all: is it finished?"
         if states:
             there = f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
-        raise EvidenceError(f"{session.path}: has no {what} of state {state!r}; it has {there}")
+        raise InputsError(f"{session.path}: has no {what} of state {state!r}; it has {there}")
     return images
 
 
-def _image_reader(inputs: Inputs) -> Callable[[Sequence[FrameRecord]], Image]:
+def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
     """Return what averages frames of one polarizer state and subtracts the darks."""
-    session = inputs.session
+    session = rig.session
     # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
-    demosaic: raw.Demosaic = "superpixel" if inputs.imported else "centered"
-    gain, read_noise = _noise(inputs.sensor)
+    demosaic: raw.Demosaic = "superpixel" if rig.imported else "centered"
+    gain, read_noise = _noise(rig.sensor)
 
     def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
         frames = (session.read(record) for record in records)
@@ -226,7 +226,7 @@ def _image_reader(inputs: Inputs) -> Callable[[Sequence[FrameRecord]], Image]:
     def mean_image(records: Sequence[FrameRecord]) -> Image:
         linear = linear_light(records)
         if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
-            raise EvidenceError(
+            raise InputsError(
                 f"{records[0].index['polarizer']} frames: differ in size, expected one camera "
                 "setting"
             )
@@ -242,11 +242,11 @@ def _image_reader(inputs: Inputs) -> Callable[[Sequence[FrameRecord]], Image]:
     return mean_image
 
 
-def diffuse_of_each(inputs: Inputs, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
+def diffuse_of_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
     """Yield the diffuse reflectance that each of some crossed frames shows alone."""
-    mean_image = _image_reader(inputs)
+    mean_image = _image_reader(rig)
     for record in records:
-        yield _separate(inputs, None, mean_image([record]))["diffuse"]
+        yield _separate(rig, None, mean_image([record]))["diffuse"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
@@ -261,16 +261,16 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
     return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
 
 
-def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
+def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
     """Split into diffuse and specular light, relative to a white tile in the same place."""
-    white = inputs.white
+    white = rig.white
     if parallel is None:
         diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
         specular = np.zeros_like(crossed.rgb)
         specular_error = np.zeros_like(crossed.rgb)
         specular_valid = np.zeros(crossed.valid.shape, bool)
     else:
-        leak = inputs.polarization.crossed_leak() if inputs.polarization is not None else None
+        leak = rig.polarization.crossed_leak() if rig.polarization is not None else None
         separated = polarization.separate(
             np.where(parallel.valid[..., None], parallel.rgb, np.nan),
             np.where(crossed.valid[..., None], crossed.rgb, np.nan),
@@ -278,7 +278,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
             variance=(parallel.variance, crossed.variance),
         )
         if separated.stderr is None or separated.stderr_specular is None:
-            raise EvidenceError("separation: gave no standard errors; give it variances")
+            raise InputsError("separation: gave no standard errors; give it variances")
         specular = separated.specular.astype(np.float32)
         specular_error = separated.stderr_specular.astype(np.float32)
         specular_valid = np.asarray(separated.valid)
@@ -291,7 +291,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
         reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
         level = white.signal
     else:
-        level = np.full_like(diffuse.rgb, _assumed_white(inputs))
+        level = np.full_like(diffuse.rgb, _assumed_white(rig))
         reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
         valid = np.ones(diffuse.valid.shape, bool)
     dim = (reflectance < MIN_SIGNAL_SIGMAS * np.sqrt(variance)).any(axis=-1)
@@ -313,9 +313,9 @@ ASSUMED_WHITE = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
 
 
-def _assumed_white(inputs: Inputs) -> Float32Array:
-    record = inputs.session.frames("subject", state=inputs.evidence.state)[0]
-    neutral = inputs.session.read(record).neutral
+def _assumed_white(rig: FlashRig) -> Float32Array:
+    record = rig.session.frames("subject", state=rig.inputs.state)[0]
+    neutral = rig.session.read(record).neutral
     level = np.full(3, ASSUMED_WHITE)
     if neutral is not None:
         level = ASSUMED_WHITE * np.asarray(neutral, float) / max(neutral)
@@ -334,9 +334,9 @@ def stderr_of(skin_map: SkinMap) -> Float32Array:
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
 
-def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    has_white = inputs.white is not None
-    table, prior = colors_of_skin(inputs.camera, inputs.illuminant, has_white=has_white)
+def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    has_white = rig.white is not None
+    table, prior = colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(stderr_of(diffuse))
     errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
@@ -393,11 +393,11 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
     }
 
 
-def _pictures(inputs: Inputs, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+def _pictures(rig: FlashRig, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
     """Show diffuse and specular light in linear sRGB."""
     picture = diffuse.values.astype(np.float64)
-    if inputs.color is not None and inputs.neutral is not None:
-        picture = inputs.color.to_linear_srgb(picture * inputs.neutral)
+    if rig.color is not None and rig.neutral is not None:
+        picture = rig.color.to_linear_srgb(picture * rig.neutral)
     return {
         "picture": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
         "specular_picture": SkinMap(specular.values, "1", valid=specular.valid),

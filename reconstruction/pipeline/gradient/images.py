@@ -13,7 +13,7 @@ from capture import raw
 from capture.plan.gradient import state_name
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 Key = tuple[str, str]
@@ -65,7 +65,7 @@ class Patterns:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When there is none.
         """
         lit = [
@@ -74,7 +74,7 @@ class Patterns:
             if polarizer == "crossed" and pattern != "dark"
         ]
         if not lit:
-            raise EvidenceError("state: has no lit picture with crossed polarizers")
+            raise InputsError("state: has no lit picture with crossed polarizers")
         return np.mean(lit, axis=0, dtype=np.float32)
 
 
@@ -95,7 +95,7 @@ class GradientImages:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session holds no such frames, or no neutral state to compare with.
     """
 
@@ -115,11 +115,11 @@ class GradientImages:
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
-            raise EvidenceError(f"{session.path}: has no frames of kind 'gradient'")
+            raise InputsError(f"{session.path}: has no frames of kind 'gradient'")
         states = list(found.values())
         first = next((state for state in states if state.step == 0), None)
         if first is None:
-            raise EvidenceError(
+            raise InputsError(
                 f"{session.path}: has no neutral state, caliper step 0, that the others "
                 "could be compared with"
             )
@@ -139,7 +139,7 @@ class GradientImages:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When frames differ in size.
         """
         values: dict[Key, Float32Array] = {}
@@ -156,14 +156,14 @@ class GradientImages:
             variance[key] = spread + np.float32(self._dark_variance)
             valid = good if valid is None else valid & good
             if mean.shape != next(iter(values.values())).shape:
-                raise EvidenceError(f"state {state.name}: its frames differ in size")
+                raise InputsError(f"state {state.name}: its frames differ in size")
         if valid is None:
-            raise EvidenceError(f"state {state.name}: has no lit picture")
+            raise InputsError(f"state {state.name}: has no lit picture")
         return Patterns(values, variance, valid)
 
     def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
         if not records:
-            raise EvidenceError("a pattern has no frame")
+            raise InputsError("a pattern has no frame")
         noise = {} if self._noise is None else dataclasses.asdict(self._noise)
         frames = (raw.linear_mono(self._session.read(record), **noise) for record in records)
         total, variance, valid = next(frames)

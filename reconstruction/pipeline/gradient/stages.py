@@ -27,7 +27,6 @@ from reconstruction.normal_integration.lens_restoration import Aperture, Restore
 from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.gradient.images import GradientImages, Patterns, SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
@@ -35,6 +34,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
     fit_kernels,
     histogram_document,
 )
+from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 STAGE_REVISION = 7
@@ -105,15 +105,15 @@ class Rig:
         return Perspective(self.focal_px, ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session of the gradient sphere can go through."""
-    rig = _rig(evidence)
-    stage = evidence.stage_maker(STAGE_REVISION)
+    rig = _rig(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
     neutral = rig.images.neutral.name
     heights = " ".join(f"height_{state.name}" for state in rig.images.states)
     made = [
-        stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, evidence, rig)),
-        stage("facets", "", "_facets", partial(_facets, evidence, rig)),
+        stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, inputs, rig)),
+        stage("facets", "", "_facets", partial(_facets, inputs, rig)),
         stage(
             f"diffuse normals {neutral}", "", f"diffuse_normals_{neutral}", partial(_diffuse, rig)
         ),
@@ -127,7 +127,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "kernels",
             f"_strains _histograms {heights}",
             KERNEL_FILE,
-            partial(_kernels, evidence, rig),
+            partial(_kernels, inputs, rig),
         ),
     ]
     for state in rig.images.states:
@@ -150,11 +150,11 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     return made
 
 
-def _rig(evidence: Evidence) -> Rig:
-    session = evidence.session
+def _rig(inputs: Inputs) -> Rig:
+    session = inputs.session
     shots = session.frames("gradient")
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
-    sensor = evidence.load(
+    sensor = inputs.load(
         "sensor", [view.serial], "the frames are as noisy as they say of themselves"
     )
     noise = None
@@ -162,15 +162,15 @@ def _rig(evidence: Evidence) -> Rig:
         known = SensorCalibration.from_calibration(sensor, view.serial)
         noise = SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
     pixel_um = view.pixel_um * view.distance_mm / view.focal_mm
-    evidence.noted["pixel_um"] = pixel_um
+    inputs.noted["pixel_um"] = pixel_um
     images = GradientImages(session, noise=noise)
-    evidence.noted["states"] = [state.name for state in images.states]
+    inputs.noted["states"] = [state.name for state in images.states]
     return Rig(
         images,
         pixel_um,
         view.focal_px,
         np.array(view.position_mm),
-        _lights(evidence, view.serial),
+        _lights(inputs, view.serial),
         Aperture.of(
             f_number=view.f_number,
             magnification=view.pixel_um / pixel_um,
@@ -180,15 +180,15 @@ def _rig(evidence: Evidence) -> Rig:
     )
 
 
-def _lights(evidence: Evidence, serial: str) -> SphereLights:
+def _lights(inputs: Inputs, serial: str) -> SphereLights:
     """Return the sphere's lights as calibrated, or as the rig's file describes them."""
-    rig = evidence.session.rig
+    rig = inputs.session.rig
     names = [light.name for light in rig.lights]
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     nominal = SphereLightTable.nominal(rig)
-    found = evidence.load("lights", names, "the lights stand and shine as the rig file says")
+    found = inputs.load("lights", names, "the lights stand and shine as the rig file says")
     table = nominal if found is None else SphereLightTable.from_calibration(found, rig)
-    leak = evidence.load(
+    leak = inputs.load(
         "polarization", [*names, serial], "crossed polarizers stop all that the surface reflects"
     )
     leakage = np.zeros(len(names))
@@ -211,11 +211,11 @@ def _lights(evidence: Evidence, serial: str) -> SphereLights:
     )
 
 
-def _strain(evidence: Evidence, rig: Rig) -> Mapping[str, Any]:
+def _strain(inputs: Inputs, rig: Rig) -> Mapping[str, Any]:
     found = measure_states(rig.images)
     lost = [each.state.name for each in found if not each.usable]
     if lost:
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"strain of {', '.join(lost)}: no texture could be followed; these states are left out "
             "of histograms and kernels"
         )
@@ -261,7 +261,7 @@ def _patterns_normals(
     )
 
 
-def _facets(evidence: Evidence, rig: Rig) -> Roughness:
+def _facets(inputs: Inputs, rig: Rig) -> Roughness:
     """Estimate the roughness of facets below a pixel, once: strain turns facets, not their own."""
     patterns = rig.images.of(rig.images.neutral)
     found = estimate_roughness(
@@ -272,7 +272,7 @@ def _facets(evidence: Evidence, rig: Rig) -> Roughness:
         valid=patterns.valid,
         smooth_px=SMOOTH_PX,
     )
-    evidence.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
+    inputs.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
     return found
 
 
@@ -368,13 +368,13 @@ def _histograms(rig: Rig, _strains: list[StateStrain], **heights: SkinMap) -> Ma
 
 
 def _kernels(
-    evidence: Evidence,
+    inputs: Inputs,
     rig: Rig,
     _strains: list[StateStrain],
     _histograms: Mapping[str, NormalStatistics],
     **heights: SkinMap,
 ) -> bytes:
-    tell = partial(evidence.tell, "kernels")
+    tell = partial(inputs.tell, "kernels")
     document = fit_kernels(
         _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, tell=tell
     )

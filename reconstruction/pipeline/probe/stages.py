@@ -21,7 +21,7 @@ from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
 from reconstruction.anisotropy.one_direction_bias import one_direction_bias
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages
 from reconstruction.pipeline.probe.profile_fits import (
     METHOD_NAMES,
@@ -59,25 +59,23 @@ def products(_: Session) -> Mapping[str, tuple[str, ...]]:
     }
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session of the fibre probe can go through.
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session's rig has no probe, or the table of landmarks cannot be read.
     """
-    probe = evidence.session.rig.probe
+    probe = inputs.session.rig.probe
     if probe is None:
-        raise EvidenceError(
-            f"{evidence.session.path}: its rig has no probe, expected one with fibres"
-        )
-    view = evidence.session.rig.views[0]
+        raise InputsError(f"{inputs.session.path}: its rig has no probe, expected one with fibres")
+    view = inputs.session.rig.views[0]
     nominal = "the camera's gain and read noise are those of the rig file"
-    sensor = evidence.load("sensor", [view.serial], nominal)
-    fibres = _fibres(evidence)
-    places = _places(evidence)
-    stage = evidence.stage_maker(STAGE_REVISION)
+    sensor = inputs.load("sensor", [view.serial], nominal)
+    fibres = _fibres(inputs)
+    places = _places(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
     noise = CameraNoise.of_view(view)
     if sensor is not None:
         noise = CameraNoise.of_sensor(SensorCalibration.from_calibration(sensor, view.serial))
@@ -90,7 +88,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "profiles",
             "",
             f"_profiles {PROFILE_FILE}",
-            partial(_profiles, evidence, fibres, noise),
+            partial(_profiles, inputs, fibres, noise),
             "" if fibres is not None else uncalibrated,
         ),
         stage(
@@ -100,29 +98,29 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             partial(_subsurface, probe),
         ),
         stage("anisotropy", "_fits", ANISOTROPY_FILE, _anisotropy),
-        stage("translucency", "_sites", "translucency", partial(_translucency, places, evidence)),
+        stage("translucency", "_sites", "translucency", partial(_translucency, places, inputs)),
     ]
 
 
-def _fibres(evidence: Evidence) -> FiberCalibration | None:
-    rig = evidence.session.rig
+def _fibres(inputs: Inputs) -> FiberCalibration | None:
+    rig = inputs.session.rig
     serial = rig.views[0].serial
-    found = evidence.load("fibre", [serial], "nothing of the fibres")
+    found = inputs.load("fibre", [serial], "nothing of the fibres")
     if found is None:
-        evidence.assumed.remove("nothing of the fibres")
+        inputs.assumed.remove("nothing of the fibres")
         return None
     return FiberCalibration.from_calibration(found, rig, serial)
 
 
 def _profiles(
-    evidence: Evidence, fibres: FiberCalibration | None, noise: CameraNoise
+    inputs: Inputs, fibres: FiberCalibration | None, noise: CameraNoise
 ) -> Mapping[str, Any]:
     if fibres is None:
-        raise EvidenceError("the fibres are not calibrated")
-    images = ProbeImages(evidence.session, noise=noise)
+        raise InputsError("the fibres are not calibrated")
+    images = ProbeImages(inputs.session, noise=noise)
     found = []
     for number, measurement in enumerate(images.measurements):
-        evidence.tell("profiles", number / len(images.measurements))
+        inputs.tell("profiles", number / len(images.measurements))
         merged = images.merged(measurement)
         # the camera may have moved against the fibres since they were calibrated
         spots, _ = fibres.spots.moved(merged, noise.pattern)
@@ -286,25 +284,25 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
     )
 
 
-def _places(evidence: Evidence) -> Mapping[str, tuple[float, float]]:
+def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
     """Return where sites lie on a face's texture, u and v by name; a bad table is told at once."""
     places = dict(probe_sites.SITE_UV)
-    if evidence.landmarks is None:
+    if inputs.landmarks is None:
         return places
     try:
-        return places | probe_sites.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
+        return places | probe_sites.read_landmarks(inputs.landmarks, texture_px=MAP_SHAPE)
     except translucency.TranslucencyError as error:
-        raise EvidenceError(f"landmarks: {error}") from error
+        raise InputsError(f"landmarks: {error}") from error
 
 
 def _translucency(
-    places: Mapping[str, tuple[float, float]], evidence: Evidence, _sites: Sequence[SiteValue]
+    places: Mapping[str, tuple[float, float]], inputs: Inputs, _sites: Sequence[SiteValue]
 ) -> SkinMap:
     """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
     placed = [site for site in _sites if site.site in places]
     unplaced = [site.site for site in _sites if site.site not in places]
     if not placed:
-        raise EvidenceError(
+        raise InputsError(
             f"translucency: got measurements of {', '.join(unplaced)}, expected some of "
             f"{', '.join(places)}, whose places on a face are known; a table of landmarks may "
             "name others"
@@ -319,9 +317,9 @@ def _translucency(
     )
     left_out = [f"{site}: its place on a face is not known" for site in unplaced]
     left_out += [f"{site}: {why}" for site, why in found.left_out]
-    evidence.noted["translucency_left_out"] = left_out
-    evidence.assumed += [f"translucency goes without {text}" for text in left_out]
-    evidence.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
+    inputs.noted["translucency_left_out"] = left_out
+    inputs.assumed += [f"translucency goes without {text}" for text in left_out]
+    inputs.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
     what = "1/sigma_tr of red, green and blue light, between measured sites by kriging"
     return SkinMap(found.values, "mm", found.stderr, np.asarray(found.valid.all(axis=-1)), what)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.graph import Stage
+from reconstruction.pipeline.inputs import InputsError
 
 
 def graph(gain=2.0):
@@ -114,9 +114,9 @@ def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, mon
     # a folder that lost a map, or holds another than was written, is neither used nor replaced
     (out / "melanin.exr").write_bytes(b"x" + (out / "melanin.exr").read_bytes()[1:])
     damaged = standing()
-    with pytest.raises(EvidenceError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
+    with pytest.raises(InputsError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
         pipeline.reconstruct(session, want=["melanin"], out=out)
     assert standing() == damaged
     (out / "melanin.exr").unlink()
-    with pytest.raises(EvidenceError, match=r"melanin\.exr: is missing.*remove"):
+    with pytest.raises(InputsError, match=r"melanin\.exr: is missing.*remove"):
         pipeline.reconstruct(session, want=["melanin"], out=out)

@@ -22,7 +22,7 @@ PROGRESS_INTERVAL_S = 5.0
 """Seconds between two lines about the same stage."""
 
 
-class EvidenceError(ValueError):
+class InputsError(ValueError):
     """A session that cannot be reconstructed as asked."""
 
 
@@ -43,7 +43,7 @@ class DomeOptions:
 
 
 @dataclass(slots=True)
-class Evidence:
+class Inputs:
     """A session and a folder of calibrations; keeps account of what was read and what assumed.
 
     Attributes
@@ -104,17 +104,17 @@ class Evidence:
         on_date: date | None = None,
         landmarks: str | Path | None = None,
         dome: DomeOptions | None = None,
-    ) -> Evidence:
+    ) -> Inputs:
         """Begin with what the session itself says that it assumed.
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When ``calibration`` or ``basis`` is no folder, the first holds no calibration or
             those of other rigs alone, or ``scan`` is no PLY.
         """
         dome = dome or DomeOptions()
-        found = Evidence(
+        found = Inputs(
             session,
             None if calibration is None else Path(calibration),
             state,
@@ -128,7 +128,7 @@ class Evidence:
         if dome.scan is not None:
             found.scan = Path(dome.scan).read_bytes()
             if not found.scan.startswith(b"ply"):
-                raise EvidenceError(
+                raise InputsError(
                     f"scan: got no PLY mesh in {dome.scan}; `skinrig import mesh` takes .obj and "
                     ".ply"
                 )
@@ -193,10 +193,10 @@ class Evidence:
 def _require_some(folder: Path, rig: str) -> None:
     """Refuse a folder without a calibration of a rig: else everything would be assumed."""
     if not folder.is_dir():
-        raise EvidenceError(f"calibration: {folder} is no folder; `skinrig calibrate` makes one")
+        raise InputsError(f"calibration: {folder} is no folder; `skinrig calibrate` makes one")
     files = [path for kind in CALIBRATION_KINDS if (path := folder / f"{kind}.json").is_file()]
     if not files:
-        raise EvidenceError(
+        raise InputsError(
             f"calibration: {folder} holds none, expected {', '.join(CALIBRATION_KINDS)} or some of "
             "them (.json); `skinrig calibrate` makes them"
         )
@@ -207,7 +207,7 @@ def _require_some(folder: Path, rig: str) -> None:
         except (ValueError, KeyError, TypeError):
             return  # what is wrong with it is said where it is needed
     if rig not in rigs:
-        raise EvidenceError(
+        raise InputsError(
             f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, the "
             f"session is of rig {rig}; leave --calibration out, or give that rig's folder"
         )
@@ -216,7 +216,7 @@ def _require_some(folder: Path, rig: str) -> None:
 def _digest_of(folder: Path) -> str:
     """Return the hash of a folder's tables, their names and contents."""
     if not folder.is_dir():
-        raise EvidenceError(f"basis: {folder} is no folder; give one with MERL .binary files")
+        raise InputsError(f"basis: {folder} is no folder; give one with MERL .binary files")
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.binary")):
         digest.update(path.name.encode() + b"\0")
