@@ -150,8 +150,9 @@ def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=CONTRACT)
-def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
+def _prior_cost(light, t):  # type: ignore[no-untyped-def]
     """Return -2 log p of a log shading; beyond the table its ends go on straight."""
+    prior, low, step = light
     y = (t - low) / step
     i = min(max(math.floor(y), 0), prior.shape[0] - 2)
     return prior[i] + (y - i) * (prior[i + 1] - prior[i])
@@ -307,7 +308,6 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
     blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
     spread, pull = ridge.spread, ridge.pull
-    prior, prior_low, prior_step = light
     first = min(max(int((begin[0] - _MIN_AXIS_FRACTION) / _STEP_A + 0.5), 0), N_LINES - 1)
     for side in range(2):
         b = float64(begin[1])
@@ -323,8 +323,8 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
                 # the same melanin may have the color with blood that the face has
                 other = _descend(log_rgb, by_b, k, blood_of_face[0], seen, w, blood_of_face)
                 o_after, o_least, o_more, o_t, o_held = _cost_after(w, s, other, blood_of_face)
-                better = least + _prior_cost(prior, prior_low, prior_step, t)
-                better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
+                better = least + _prior_cost(light, t)
+                better -= o_least + _prior_cost(light, o_t)
                 if better > 0.0:
                     second[k] = after if better < TAIL_COST else o_after
                     found, after, least = other, o_after, o_least
@@ -350,7 +350,6 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
 def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
     """Return the lowest cost along the ridge, and of colors alone; write it between the lines."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
-    prior, prior_low, prior_step = light
     lowest, color_lowest = np.inf, np.inf
     for k in range(N_LINES - 1):
         least = np.inf
@@ -361,7 +360,7 @@ def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-
             more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
             color_lowest = min(color_lowest, max(value - more, 0.0))
             t = shade[k] + x * (shade[k + 1] - shade[k])
-            value += _prior_cost(prior, prior_low, prior_step, t)
+            value += _prior_cost(light, t)
             value += _melanin_cost(melanin_of_face, k, x)
             least = min(least, value)
         between[k] = least
@@ -380,7 +379,6 @@ def _look_across(  # type: ignore[no-untyped-def]
     across_low, across_width = beside_ridge.low, beside_ridge.width
     l0, l1, l2 = seen
     s0, s1, s2 = s
-    prior, prior_low, prior_step = light
     b_low, b_high = 1.0, _MIN_AXIS_FRACTION
     for k in range(N_LINES):
         beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
@@ -402,7 +400,7 @@ def _look_across(  # type: ignore[no-untyped-def]
                 e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                 t = s0 * e0 + s1 * e1 + s2 * e2
                 value = _form(w, e0, e1, e2, e0, e1, e2)
-                value += _prior_cost(prior, prior_low, prior_step, t)
+                value += _prior_cost(light, t)
                 more, _, _ = _blood_cost(blood_of_face, _MIN_AXIS_FRACTION + (i + 0.5) * width)
                 value += more
                 coarse[i] = value
@@ -416,7 +414,7 @@ def _look_across(  # type: ignore[no-untyped-def]
         across_low[k], across_width[k] = low, width
         if beside < lowest + 10.0:
             b_low, b_high = min(b_low, low), max(b_high, high)
-        here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
+        here = cost[k] + _prior_cost(light, shade[k])
         deepest = 0.0
         for i in range(N_ACROSS):
             f0, f1, f2 = _color(log_rgb, by_b, k, low + (i + 0.5) * width)[:3]
@@ -424,7 +422,7 @@ def _look_across(  # type: ignore[no-untyped-def]
             t = s0 * e0 + s1 * e1 + s2 * e2
             more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
             more += _form(w, e0, e1, e2, e0, e1, e2) - here
-            more += _prior_cost(prior, prior_low, prior_step, t)
+            more += _prior_cost(light, t)
             across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE_COST))
             deepest = min(deepest, max(more, -NEGLIGIBLE_COST))
         if deepest < -RIDGE_JUMP_COST:
@@ -450,7 +448,6 @@ def _sum_up(  # type: ignore[no-untyped-def]
     across_low, across_width = beside_ridge.low, beside_ridge.width
     edges_a, total_a, bins = sums
     b_low, b_high = blood_ends
-    prior, prior_low, prior_step = light
     live = 0
     for k in range(N_LINES - 1):
         live += between[k] < lowest + NEGLIGIBLE_COST
@@ -473,7 +470,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
             value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
             t = shade[k] + x * (shade[k + 1] - shade[k])
             value = max(value, min(0.0, cost[k], cost[k + 1]))
-            value += _prior_cost(prior, prior_low, prior_step, t) - lowest
+            value += _prior_cost(light, t) - lowest
             value += _melanin_cost(melanin_of_face, k, x)
             mass = 0.0
             if value < NEGLIGIBLE_COST:

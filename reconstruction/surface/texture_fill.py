@@ -321,10 +321,18 @@ def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
                 for c in range(channels):
                     total = np.float32(0.0)
                     count = np.float32(0.0)
-                    for y, x in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-                        if 0 <= y < height and 0 <= x < width:
-                            total += filled[y, x, c]
-                            count += np.float32(1.0)
+                    if i > 0:
+                        total += filled[i - 1, j, c]
+                        count += np.float32(1.0)
+                    if i < height - 1:
+                        total += filled[i + 1, j, c]
+                        count += np.float32(1.0)
+                    if j > 0:
+                        total += filled[i, j - 1, c]
+                        count += np.float32(1.0)
+                    if j < width - 1:
+                        total += filled[i, j + 1, c]
+                        count += np.float32(1.0)
                     if count > 0.0:
                         mean = total / count
                         goal = w * fine[i, j, c] + (np.float32(1.0) - w) * mean
