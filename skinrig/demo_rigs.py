@@ -16,6 +16,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
@@ -173,7 +174,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
             out=appearance,
             calibration=calibration,
             truth=capture.truth.name if capture.truth else "",
-            hold_out=DOME_HELD_OUT,
+            dome=DomeOptions(hold_out=DOME_HELD_OUT),
         )
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):

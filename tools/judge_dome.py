@@ -17,6 +17,7 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as surface_evaluation
@@ -52,7 +53,7 @@ def main(arguments: list[str]) -> None:
                 want=WANT,
                 out=out / f"appearance-{name}",
                 calibration=out / "calibration",
-                scan=scan,
+                dome=DomeOptions(scan=scan),
                 truth="truth-dome",
                 progress=lambda stage: print(f"  {stage}", file=sys.stderr, flush=True),
             )

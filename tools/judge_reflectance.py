@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.rendering.photographs.comparison import FULL_MODEL
@@ -60,7 +61,7 @@ def main(arguments: list[str]) -> int:
             want=WANT,
             out=out / f"appearance-{subject}",
             calibration=calibration,
-            hold_out=HOLD_OUT,
+            dome=DomeOptions(hold_out=HOLD_OUT),
             truth=f"truth-{subject}",
         )
         fit_reflectance(out / f"appearance-{subject}", out=out / f"model-{subject}")

@@ -1,7 +1,6 @@
 """Chromophores: melanin and hemoglobin maps from linear camera RGB."""
 
 from reconstruction.chromophores.inversion import (
-    ChromophoreError,
     ChromophoreMaps,
     Identifiability,
     identifiability,
@@ -9,6 +8,7 @@ from reconstruction.chromophores.inversion import (
     model_covariance,
     without_brightness,
 )
+from reconstruction.chromophores.pixel_checks import ChromophoreError
 
 __all__ = [
     "ChromophoreError",

@@ -23,7 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array
-from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.chromophores.pixel_checks import (
+    ChromophoreError,
+    broadcast_variance,
+    checked_mask,
+    usable_colors,
+)
 from reconstruction.chromophores.posterior import ChromophorePosterior
 
 MIN_LOG_CONTRAST: Final = 0.1
@@ -76,21 +81,10 @@ def is_locally_dark(
     light = np.asarray(colors)
     if light.ndim != 3 or light.shape[-1] == 0:
         raise ChromophoreError(f"colors: expected shape (rows, columns, 3), got {light.shape}")
-    with np.errstate(invalid="ignore"):
-        good = (light > 0.0).all(axis=-1) & np.isfinite(light).all(axis=-1)
+    good = usable_colors(light)
     if valid is not None:
-        mask = np.asarray(valid, dtype=np.bool_)
-        if mask.shape != good.shape:
-            raise ChromophoreError(f"valid: expected shape {good.shape}, got {mask.shape}")
-        good &= mask
-    whole = None
-    if variance is not None:
-        try:
-            whole = np.broadcast_to(np.asarray(variance), light.shape)
-        except ValueError as problem:
-            raise ChromophoreError(
-                f"variance: expected to broadcast to {light.shape}, got {np.shape(variance)}"
-            ) from problem
+        good &= checked_mask(valid, good.shape)
+    whole = None if variance is None else broadcast_variance(variance, light.shape)
     log_light = np.full(good.shape, np.nan, dtype=np.float32)
     least = np.full(good.shape, MIN_LOG_CONTRAST, dtype=np.float32)
     for start in range(0, len(good), _BAND_ROWS):  # copies of a whole picture need gigabytes

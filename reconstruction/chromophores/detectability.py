@@ -16,14 +16,11 @@ MAX_RELATIVE_STDERR = 0.5
 
 
 def detectable(
-    estimate: FloatArray,
-    stderr: FloatArray,
-    valid: BoolArray,
-    *,
-    size_px: int = NEIGHBORHOOD_PX,
-    limit: float = MAX_RELATIVE_STDERR,
+    estimate: FloatArray, stderr: FloatArray, valid: BoolArray, *, size_px: int = NEIGHBORHOOD_PX
 ) -> BoolArray:
     """Return where the mean standard error around is small against the mean estimate around.
+
+    It is up to `MAX_RELATIVE_STDERR` of it.
 
     Parameters
     ----------
@@ -33,8 +30,6 @@ def detectable(
         (H, W); other pixels do not count and are not detectable.
     size_px
         Side of the square neighborhood, odd.
-    limit
-        Largest mean standard error over mean estimate.
 
     Returns
     -------
@@ -55,4 +50,4 @@ def detectable(
         kept = np.where(good, values, 0.0).astype(np.float64)
         return np.asarray(ndimage.uniform_filter(kept, size_px, mode="constant"))
 
-    return np.asarray(good & (total(stderr) <= limit * total(estimate)))
+    return np.asarray(good & (total(stderr) <= MAX_RELATIVE_STDERR * total(estimate)))

@@ -1,25 +1,30 @@
 """The distribution of one person's melanin and blood, from the colors of the face's pixels.
 
 `reconstruction.chromophores.face_distribution` says what it is and why;
-`reconstruction.chromophores.posterior` weighs each pixel by it.
+`reconstruction.chromophores.posterior` weighs each pixel by it, and by itself where it may be a
+mole, shade, lip or lid (`reconstruction.chromophores.dark_spots`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
-from reconstruction.arrays import Float32Array, Float64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.face_distribution import FaceDistribution, fit, with_common_errors
-from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
+from reconstruction.chromophores.inversion import without_brightness
+from reconstruction.chromophores.pixel_checks import ChromophoreError, usable_colors
+from reconstruction.chromophores.posterior import ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
 
@@ -181,6 +186,54 @@ def fit_with_white_reference(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceEstimate:
+    """What pixels say with and without each other."""
+
+    found: ChromophorePosterior
+    """Each pixel by what it may be."""
+    by_face: ChromophorePosterior
+    """Each as usual skin of the face; the same as `found` without a face."""
+    face: FaceDistribution | None
+    """None where it is not told."""
+    spots: BoolArray
+    """Of the pixels' shape: pixels that may be no usual skin."""
+
+
+def estimate_face(
+    rgb: FloatArray,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    variance: FloatArray,
+    model_error: FloatArray,
+    has_white: bool,
+) -> FaceEstimate:
+    """Estimate melanin and hemoglobin of every pixel of one face.
+
+    Parameters
+    ----------
+    rgb, table, prior, variance, model_error
+        As of `reconstruction.chromophores.posterior.estimate`.
+    has_white
+        Whether a white tile in the face's place says how much light there is: without it pixels
+        together say no more than each by itself.
+    """
+    errors: dict[str, Any] = {"variance": variance, "model_error": model_error}
+    known = partial(chromophore_posterior.estimate, rgb, table, prior=prior, **errors)
+    face = None
+    if has_white:
+        face = fit_with_white_reference(rgb, table, **errors)
+    by_face = known(face=face)
+    if face is None:
+        return FaceEstimate(by_face, by_face, None, np.zeros(rgb.shape[:-1], bool))
+    alone = known()
+    spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
+    if rgb.ndim == 3:
+        spots |= dark_spots.is_locally_dark(rgb, variance=variance)
+    return FaceEstimate(dark_spots.average_hypotheses(by_face, alone, spots), by_face, face, spots)
+
+
 def _sampled(
     rgb: ArrayLike,
     variance: ArrayLike | None,
@@ -191,8 +244,7 @@ def _sampled(
     colors = np.asarray(rgb, dtype=np.float32)
     if colors.ndim == 0 or colors.shape[-1] != 3:
         raise ChromophoreError(f"rgb: expected shape (..., 3), got {colors.shape}")
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(colors).all(axis=-1) & (colors > 0.0).all(axis=-1)
+    good = usable_colors(colors)
     if valid is not None:
         good &= np.asarray(valid, dtype=np.bool_)
     places = np.flatnonzero(good)

@@ -20,13 +20,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
-from reconstruction.arrays import Float64Array, FloatArray
+from reconstruction.arrays import Float32Array, Float64Array, FloatArray
 
 MIN_CONTAMINATION: Final = 0.01
 """Least part of the skin that follows no distribution at all, as of the light
@@ -176,74 +177,89 @@ def fit(
     total = flat.sum(axis=1, dtype=np.float64)
     if not (np.isfinite(total).all() and (total > 0.0).all()):
         raise ValueError("probability: expected finite positive sums of each pixel")
-    share = (flat / total[:, None]).astype(np.float32)
-    places, ends = (log_melanin, blood), (melanin_ends, blood_ends)
-    edges = [
-        np.concatenate([[1.5 * at[0] - 0.5 * at[1]], at + 0.5 * (at[1] - at[0])]) for at in places
-    ]
-
-    def bells(unknowns: Float64Array) -> tuple[ContaminatedNormal, ContaminatedNormal]:
-        unknowns = unknowns * _SEARCH_SCALE
-        first, second = (
-            ContaminatedNormal(
-                float(unknowns[3 * k]),
-                math.exp(unknowns[3 * k + 1]),
-                math.exp(unknowns[3 * k + 2]),
-                *ends[k],
-            )
-            for k in range(2)
-        )
-        return first, second
-
-    def densities(unknowns: Float64Array) -> tuple[Float64Array, Float64Array]:
-        first, second = bells(unknowns)
-        return first.of_cells(edges[0]), second.of_cells(edges[1])
-
-    def misfit(unknowns: Float64Array) -> tuple[float, Float64Array]:
-        """Return -log likelihood of a pixel on the mean, and its gradient."""
-        of_melanin, of_blood = densities(unknowns)
-        both = np.outer(of_melanin, of_blood).astype(np.float32).reshape(-1)
-        each = np.maximum((share @ both).astype(np.float64), 1e-30)
-        pulled = ((1.0 / each).astype(np.float32) @ share).astype(np.float64).reshape(shape)
-        by_density = pulled @ of_blood, of_melanin @ pulled
-        gradient = np.empty(6)
-        for k in range(6):
-            step = np.zeros(6)
-            step[k] = _DIFFERENCE_STEP
-            more, less = densities(unknowns + step), densities(unknowns - step)
-            gradient[k] = (
-                by_density[k // 3] @ (more[k // 3] - less[k // 3]) / (2.0 * _DIFFERENCE_STEP)
-            )
-        return -float(np.log(each).mean()), -gradient / len(share)
-
-    if begin is None:
-        usual = share.mean(axis=0, dtype=np.float64).reshape(shape)
-        means = usual.sum(axis=1) @ log_melanin, usual.sum(axis=0) @ blood
-        start = [(means[k], math.log(_START_SIGMAS[k]), math.log(0.1)) for k in range(2)]
-    else:
-        start = [
-            (bell.mean, math.log(bell.spread), math.log(bell.unexpected))
-            for bell in (begin.melanin, begin.blood)
-        ]
+    search = _Search(
+        (flat / total[:, None]).astype(np.float32), (log_melanin, blood), (melanin_ends, blood_ends)
+    )
+    bells = search.start() if begin is None else (begin.melanin, begin.blood)
+    start = [(bell.mean, math.log(bell.spread), math.log(bell.unexpected)) for bell in bells]
     bounds = [
         bound
         for k in range(2)
         for bound in (
-            (float(places[k][0]), float(places[k][-1])),
+            (float(search.places[k][0]), float(search.places[k][-1])),
             (math.log(MIN_SIGMAS[k]), math.log(MAX_SIGMAS[k])),
             (math.log(MIN_CONTAMINATION), math.log(MAX_CONTAMINATION)),
         )
     ]
     low, high = np.array(bounds).T / _SEARCH_SCALE
     found = minimize(
-        misfit,
+        search.misfit,
         np.clip(np.ravel(start) / _SEARCH_SCALE, low, high),
         jac=True,
         method="L-BFGS-B",
         bounds=np.stack([low, high], axis=1),
         options={"maxiter": _MAX_ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
     )
-    return FaceDistribution(*bells(found.x))
+    return FaceDistribution(*search.bells(found.x))
+
+
+Bells = tuple[ContaminatedNormal, ContaminatedNormal]
+
+
+class _Search:
+    """The likelihood of the colors under distributions of melanin and blood.
+
+    Of six unknowns over `_SEARCH_SCALE`: means, logs of spreads and of parts.
+    """
+
+    def __init__(
+        self,
+        share: Float32Array,
+        places: tuple[Float64Array, Float64Array],
+        ends: tuple[tuple[float, float], tuple[float, float]],
+    ) -> None:
+        self.share, self.places, self.ends = share, places, ends
+        self.shape = places[0].size, places[1].size
+        self.edges = [
+            np.concatenate([[1.5 * at[0] - 0.5 * at[1]], at + 0.5 * (at[1] - at[0])])
+            for at in places
+        ]
+
+    def start(self) -> Bells:
+        """Return where to begin when nothing is known."""
+        usual = self.share.mean(axis=0, dtype=np.float64).reshape(self.shape)
+        melanin = float(usual.sum(axis=1) @ self.places[0])
+        blood = float(usual.sum(axis=0) @ self.places[1])
+        return (
+            ContaminatedNormal(melanin, _START_SIGMAS[0], 0.1, *self.ends[0]),
+            ContaminatedNormal(blood, _START_SIGMAS[1], 0.1, *self.ends[1]),
+        )
+
+    def bells(self, unknowns: Float64Array) -> Bells:
+        unknowns = unknowns * _SEARCH_SCALE
+        first, second = (
+            ContaminatedNormal(float(mean), math.exp(spread), math.exp(part), *ends)
+            for (mean, spread, part), ends in zip(unknowns.reshape(2, 3), self.ends, strict=True)
+        )
+        return first, second
+
+    def densities(self, unknowns: Float64Array) -> tuple[Float64Array, Float64Array]:
+        first, second = self.bells(unknowns)
+        return first.of_cells(self.edges[0]), second.of_cells(self.edges[1])
+
+    def misfit(self, unknowns: Float64Array) -> tuple[float, Float64Array]:
+        """Return -log likelihood of a pixel on the mean, and its gradient."""
+        of_melanin, of_blood = self.densities(unknowns)
+        both = np.outer(of_melanin, of_blood).astype(np.float32).reshape(-1)
+        each = np.maximum((self.share @ both).astype(np.float64), 1e-30)
+        pulled = ((1.0 / each).astype(np.float32) @ self.share).astype(np.float64)
+        pulled = pulled.reshape(self.shape)
+        by_density = pulled @ of_blood, of_melanin @ pulled
+        gradient = np.empty(6)
+        for k, step in enumerate(_DIFFERENCE_STEP * np.eye(6)):
+            more, less = (self.densities(unknowns + off)[k // 3] for off in (step, -step))
+            gradient[k] = by_density[k // 3] @ (more - less) / (2.0 * _DIFFERENCE_STEP)
+        return -float(np.log(each).mean()), -gradient / len(self.share)
 
 
 def with_common_errors(
@@ -275,7 +291,7 @@ def with_common_errors(
                 for minus, plus in moved
             )
         )
-        for pick in (_melanin_of, _blood_of)
+        for pick in (attrgetter("melanin"), attrgetter("blood"))
     ]
     blood = replace(usual.blood, stderr=errors[1])
     if blood.mean - blood.low < END_DISTANCE:
@@ -292,11 +308,3 @@ def _moves_by(usual: ContaminatedNormal, minus: float, plus: float) -> float:
     if held:
         return max(abs(usual.mean - minus), abs(plus - usual.mean))
     return 0.5 * (plus - minus)
-
-
-def _melanin_of(face: FaceDistribution) -> ContaminatedNormal:
-    return face.melanin
-
-
-def _blood_of(face: FaceDistribution) -> ContaminatedNormal:
-    return face.blood

@@ -5,36 +5,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float32, float64, int64, njit, prange, types, void
+from numba import float32, float64, int64, njit, prange, void
 
-_FAST_MATH = {"contract"}
+from reconstruction.compiled import OVER_PIXELS, given
+
 NEGLIGIBLE_DEVIANCE = 36.0
 """-2 log p above the pixel's lowest from which on probability is left out."""
 
 
-def _given(dtype: types.Type, axes: int) -> types.Array:
-    """Return the type of a contiguous argument that is only read, and may be read-only."""
-    return types.Array(dtype, axes, "C", readonly=True)
-
-
 @njit(
     void(
-        _given(float64, 2),  # log rgb (n, 3)
-        _given(float64, 3),  # weights of its errors, brightness projected out (n, 3, 3)
-        _given(float64, 2),  # weights of its mean that tells shading (n, 3), their sum is 1
-        _given(float64, 3),  # log color of the plane (m, b, 3)
-        _given(float64, 1),  # -2 log probability of log shading
+        given(float64, 2),  # log rgb (n, 3)
+        given(float64, 3),  # weights of its errors, brightness projected out (n, 3, 3)
+        given(float64, 2),  # weights of its mean that tells shading (n, 3), their sum is 1
+        given(float64, 3),  # log color of the plane (m, b, 3)
+        given(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
         float64,  # and its step
         int64,  # places in blood that are summed
         float32[:, :, ::1],  # probability (n, m, b / summed), 0 before
     ),
-    parallel=True,
-    fastmath=_FAST_MATH,
-    cache=True,
-    nogil=True,
-    boundscheck=False,
-    error_model="numpy",
+    **OVER_PIXELS,
 )
 def plane_probability(  # type: ignore[no-untyped-def]
     log_rgb, weights, mean, plane, prior, prior_low, prior_step, summed, probability

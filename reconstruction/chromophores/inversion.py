@@ -16,6 +16,11 @@ from numpy.typing import ArrayLike
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
+from reconstruction.chromophores.pixel_checks import (
+    ChromophoreError,
+    broadcast_variance,
+    checked_mask,
+)
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, Start, evaluate, start_for
 
 Shading = Literal["known"] | ArrayLike | None
@@ -25,10 +30,6 @@ DEFAULT_RELATIVE_NOISE = 0.01
 MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not seen."""
 _TASK_PIXELS = 8192
-
-
-class ChromophoreError(ValueError):
-    """Arguments of the chromophore fit that do not fit each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def invert(
         _usable(valid, shape),
         free,
         covariance.astype(np.float32),
-        _cells(table),
+        np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
         start.axes,
@@ -191,18 +192,16 @@ class Identifiability:
     """The same of hemoglobin."""
     ambiguous: BoolArray
     """Another pair of chromophores has the same color (with the shading free)."""
-    limit: float
-    """Relative standard error up to which a chromophore counts as identifiable."""
 
     @property
     def melanin_identifiable(self) -> BoolArray:
-        """Where melanin can be told."""
-        return np.asarray((self.stderr_melanin <= self.limit) & ~self.ambiguous)
+        """Where the relative standard error of melanin is up to `MAX_IDENTIFIABLE_STDERR`."""
+        return np.asarray((self.stderr_melanin <= MAX_IDENTIFIABLE_STDERR) & ~self.ambiguous)
 
     @property
     def hemoglobin_identifiable(self) -> BoolArray:
-        """Where hemoglobin can be told."""
-        return np.asarray((self.stderr_hemoglobin <= self.limit) & ~self.ambiguous)
+        """The same of hemoglobin."""
+        return np.asarray((self.stderr_hemoglobin <= MAX_IDENTIFIABLE_STDERR) & ~self.ambiguous)
 
 
 def identifiability(
@@ -211,8 +210,6 @@ def identifiability(
     shading: Literal["known"] | float | None = None,
     variance: ArrayLike | Callable[[Float64Array], ArrayLike] | None = None,
     model_error: ArrayLike | None = None,
-    shading_max: float | None = None,
-    limit: float = MAX_IDENTIFIABLE_STDERR,
     size: int = 64,
 ) -> Identifiability:
     """Return the Cramer-Rao bounds of both chromophores over the table.
@@ -226,7 +223,7 @@ def identifiability(
     variance
         Noise variance of a pixel's RGB: (3,), or a function from RGB (..., 3) to it. None: 1
         percent of each channel.
-    model_error, shading_max, limit
+    model_error
         As in `invert`.
     size
         Points along each axis, evenly spaced in the cube roots.
@@ -266,14 +263,13 @@ def identifiability(
     det = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)
     ambiguous = np.zeros(a.shape, dtype=np.bool_)
     if shading is None:
-        ambiguous = _second_solution(start_for(table, True), color, gradient, shading_max)
+        ambiguous = _second_solution(start_for(table, True), color, gradient)
     return Identifiability(
         c_m=table.c_m_max * fraction**3,
         c_hd=table.c_hd_max * fraction**3,
         stderr_melanin=3.0 * np.sqrt(bb / det) / a,
         stderr_hemoglobin=3.0 * np.sqrt(aa / det) / b,
         ambiguous=ambiguous,
-        limit=limit,
     )
 
 
@@ -335,17 +331,12 @@ def _weights(
     return np.asarray(weights)
 
 
-def _second_solution(
-    start: Start, color: Float64Array, gradient: Float64Array, shading_max: float | None
-) -> BoolArray:
+def _second_solution(start: Start, color: Float64Array, gradient: Float64Array) -> BoolArray:
     """Return where skin seen with a shading of 1 has its color from other chromophores too."""
     log_color = np.log(color)
     place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
     i, j = np.clip(place, 0, start.twin_log.shape[0] - 1).astype(np.intp).transpose(2, 0, 1)
-    lightest = start.twin_log[i, j].astype(np.float64)
-    darker = np.isfinite(lightest)
-    if shading_max is not None:
-        darker &= log_color.mean(axis=-1) <= lightest + np.log(shading_max)
+    darker = np.isfinite(start.twin_log[i, j])
     facing = np.cross(gradient[..., 0], gradient[..., 1]).sum(axis=-1) * start.side
     return np.asarray((facing <= 0.0) | darker)
 
@@ -369,30 +360,14 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Arr
 
 
 def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Array:
-    if variance is None:
-        return np.zeros((1, 3), dtype=np.float32)
-    values = np.asarray(variance, dtype=np.float32)
-    if values.shape == (3,):
-        return np.ascontiguousarray(values).reshape(1, 3)
-    try:
-        values = np.broadcast_to(values, (*shape, 3))
-    except ValueError as error:
-        raise ChromophoreError(
-            f"variance: expected a shape that broadcasts to {(*shape, 3)}, got {values.shape}"
-        ) from error
-    return np.ascontiguousarray(values).reshape(-1, 3)
+    """Return the variance of each pixel (n, 3), or of all (1, 3)."""
+    values = np.zeros(3) if variance is None else np.asarray(variance)
+    if values.shape != (3,):
+        values = broadcast_variance(values, (*shape, 3))
+    return np.ascontiguousarray(values, np.float32).reshape(-1, 3)
 
 
 def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    if valid is None:
-        return np.ones(1, dtype=np.bool_)
-    usable = np.asarray(valid)
-    if usable.dtype != np.bool_ or usable.shape != shape:
-        raise ChromophoreError(
-            f"valid: expected bool of shape {shape}, got {usable.dtype} of {usable.shape}"
-        )
+    """Return which pixels may be used (n,), or that all may (1,)."""
+    usable = np.ones(1, np.bool_) if valid is None else checked_mask(valid, shape)
     return np.ascontiguousarray(usable).reshape(-1)
-
-
-def _cells(table: ColorTable) -> Float32Array:
-    return np.ascontiguousarray(table.cells, dtype=np.float32)

@@ -21,13 +21,13 @@ from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
     DEFAULT_RELATIVE_NOISE,
-    ChromophoreError,
     invert,
     model_covariance,
     without_brightness,
 )
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophores.lines import MELANIN_AXIS, lines_of
+from reconstruction.chromophores.pixel_checks import ChromophoreError
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 

@@ -5,8 +5,7 @@ likelihood, over the fold where dark skin takes the colors of lighter skin; betw
 lines the cost is interpolated by its values and slopes. Where it is known how blood and melanin
 are distributed over the face, the ridge is that of the product, and each line is looked at from
 the face's blood too. `reconstruction.chromophores.posterior` is the door;
-`reconstruction.chromophores.reference` sums the same over a dense plane and is what this is tested
-against.
+its tests sum the same over a dense plane.
 
 A pixel goes through `_weights`, `_follow`, `_lowest`, `_look_across` and `_sum_up`. These hand on:
 
@@ -24,11 +23,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, types, void
+from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.chromophores.lines import N_LINE_NODES, N_LINES, NODES_PER_LINE
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.compiled import CONTRACT, OVER_PIXELS, given
 
 N_NEWTON_STEPS = 4
 MAX_RIDGE_STEP = 0.12
@@ -74,7 +74,6 @@ _MIN_AXIS_FRACTION = float(MIN_AXIS_FRACTION)
 _STEP_A = (1.0 - _MIN_AXIS_FRACTION) / (N_LINES - 1)
 _STEP_B = (1.0 - _MIN_AXIS_FRACTION) / (N_LINE_NODES - 1)
 _MAX_NODES = (N_LINES - 1) * MIN_NODES + N_FINE
-_FAST_MATH = {"contract"}
 
 
 class _Ridge(NamedTuple):
@@ -113,7 +112,7 @@ class _Beside(NamedTuple):
     """(COARSE,): costs on one wide line."""
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -126,7 +125,7 @@ def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     """Return the cubic with these values and derivatives at the ends, and its derivative."""
     rise = v1 - v0
@@ -137,33 +136,29 @@ def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     return value, slope
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     """Return the log color and its derivative by blood on line k, the node and the way past it."""
     y = (b - _MIN_AXIS_FRACTION) / _STEP_B
     j = min(int(y), N_LINE_NODES - 2)
     x = y - j
-    f0, g0 = _hermite(
-        log_rgb[k, j, 0], log_rgb[k, j + 1, 0], by_b[k, j, 0], by_b[k, j + 1, 0], x, _STEP_B
-    )
-    f1, g1 = _hermite(
-        log_rgb[k, j, 1], log_rgb[k, j + 1, 1], by_b[k, j, 1], by_b[k, j + 1, 1], x, _STEP_B
-    )
-    f2, g2 = _hermite(
-        log_rgb[k, j, 2], log_rgb[k, j + 1, 2], by_b[k, j, 2], by_b[k, j + 1, 2], x, _STEP_B
-    )
+    v, w, d, e = log_rgb[k, j], log_rgb[k, j + 1], by_b[k, j], by_b[k, j + 1]
+    f0, g0 = _hermite(v[0], w[0], d[0], e[0], x, _STEP_B)
+    f1, g1 = _hermite(v[1], w[1], d[1], e[1], x, _STEP_B)
+    f2, g2 = _hermite(v[2], w[2], d[2], e[2], x, _STEP_B)
     return f0, f1, f2, g0, g1, g2, j, x
 
 
-@njit(fastmath=_FAST_MATH)
-def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
+@njit(fastmath=CONTRACT)
+def _prior_cost(light, t):  # type: ignore[no-untyped-def]
     """Return -2 log p of a log shading; beyond the table its ends go on straight."""
+    prior, low, step = light
     y = (t - low) / step
     i = min(max(math.floor(y), 0), prior.shape[0] - 2)
     return prior[i] + (y - i) * (prior[i + 1] - prior[i])
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
 
@@ -178,7 +173,7 @@ def _blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     return cost, -share * away / of_face[1], share / (of_face[1] * of_face[1])
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
     """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
     y = x * NODES_PER_LINE
@@ -187,7 +182,7 @@ def _melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
     return of_face[i0] + (y - i) * (of_face[i0 + 1] - of_face[i0])
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-def]
     """Return the blood on line k near which color and face are the most probable.
 
@@ -213,7 +208,7 @@ def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-
     return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     """Return blood, cost, the face's part of it and shading after the last step of `_descend`.
 
@@ -232,14 +227,14 @@ def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     return after, max(square, 0.0) + more, more, shade, held
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
     a = _MIN_AXIS_FRACTION + (k + x) * _STEP_A
     return end * a * a * a
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
     """Interpolate `at` where the ascending `values`, count + 1 of them, reach `wanted`."""
     if wanted <= values[0]:
@@ -257,7 +252,7 @@ def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
     return at[low] + part * (at[high] - at[low])
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     """Return the median, and the distance from it within which one sigma's probability lies.
 
@@ -276,7 +271,7 @@ def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     return center, 0.5 * (low + high)
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=CONTRACT, error_model="numpy")
 def _weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     """Return the weights of relative errors of a color, brightness projected out, and its own.
 
@@ -307,13 +302,12 @@ def _weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     return w, (s0, s1, s2)
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=CONTRACT, error_model="numpy")
 def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
     """Write the ridge, followed to both sides of where the fit ended."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
     blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
     spread, pull = ridge.spread, ridge.pull
-    prior, prior_low, prior_step = light
     first = min(max(int((begin[0] - _MIN_AXIS_FRACTION) / _STEP_A + 0.5), 0), N_LINES - 1)
     for side in range(2):
         b = float64(begin[1])
@@ -329,18 +323,12 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
                 # the same melanin may have the color with blood that the face has
                 other = _descend(log_rgb, by_b, k, blood_of_face[0], seen, w, blood_of_face)
                 o_after, o_least, o_more, o_t, o_held = _cost_after(w, s, other, blood_of_face)
-                better = least + _prior_cost(prior, prior_low, prior_step, t)
-                better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
+                better = least + _prior_cost(light, t)
+                better -= o_least + _prior_cost(light, o_t)
                 if better > 0.0:
                     second[k] = after if better < TAIL_COST else o_after
-                    found, after, least, more, t, held = (
-                        other,
-                        o_after,
-                        o_least,
-                        o_more,
-                        o_t,
-                        o_held,
-                    )
+                    found, after, least = other, o_after, o_least
+                    more, t, held = o_more, o_t, o_held
                 elif better > -TAIL_COST:
                     second[k] = o_after
             _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
@@ -358,11 +346,10 @@ def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge)
             shade[k] = t
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=CONTRACT, error_model="numpy")
 def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
     """Return the lowest cost along the ridge, and of colors alone; write it between the lines."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
-    prior, prior_low, prior_step = light
     lowest, color_lowest = np.inf, np.inf
     for k in range(N_LINES - 1):
         least = np.inf
@@ -373,7 +360,7 @@ def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-
             more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
             color_lowest = min(color_lowest, max(value - more, 0.0))
             t = shade[k] + x * (shade[k + 1] - shade[k])
-            value += _prior_cost(prior, prior_low, prior_step, t)
+            value += _prior_cost(light, t)
             value += _melanin_cost(melanin_of_face, k, x)
             least = min(least, value)
         between[k] = least
@@ -381,7 +368,7 @@ def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-
     return lowest, color_lowest
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=CONTRACT, error_model="numpy")
 def _look_across(  # type: ignore[no-untyped-def]
     log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
 ):
@@ -392,7 +379,6 @@ def _look_across(  # type: ignore[no-untyped-def]
     across_low, across_width = beside_ridge.low, beside_ridge.width
     l0, l1, l2 = seen
     s0, s1, s2 = s
-    prior, prior_low, prior_step = light
     b_low, b_high = 1.0, _MIN_AXIS_FRACTION
     for k in range(N_LINES):
         beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
@@ -414,7 +400,7 @@ def _look_across(  # type: ignore[no-untyped-def]
                 e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                 t = s0 * e0 + s1 * e1 + s2 * e2
                 value = _form(w, e0, e1, e2, e0, e1, e2)
-                value += _prior_cost(prior, prior_low, prior_step, t)
+                value += _prior_cost(light, t)
                 more, _, _ = _blood_cost(blood_of_face, _MIN_AXIS_FRACTION + (i + 0.5) * width)
                 value += more
                 coarse[i] = value
@@ -428,7 +414,7 @@ def _look_across(  # type: ignore[no-untyped-def]
         across_low[k], across_width[k] = low, width
         if beside < lowest + 10.0:
             b_low, b_high = min(b_low, low), max(b_high, high)
-        here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
+        here = cost[k] + _prior_cost(light, shade[k])
         deepest = 0.0
         for i in range(N_ACROSS):
             f0, f1, f2 = _color(log_rgb, by_b, k, low + (i + 0.5) * width)[:3]
@@ -436,7 +422,7 @@ def _look_across(  # type: ignore[no-untyped-def]
             t = s0 * e0 + s1 * e1 + s2 * e2
             more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
             more += _form(w, e0, e1, e2, e0, e1, e2) - here
-            more += _prior_cost(prior, prior_low, prior_step, t)
+            more += _prior_cost(light, t)
             across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE_COST))
             deepest = min(deepest, max(more, -NEGLIGIBLE_COST))
         if deepest < -RIDGE_JUMP_COST:
@@ -448,9 +434,9 @@ def _look_across(  # type: ignore[no-untyped-def]
     return b_low, b_high
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=CONTRACT, error_model="numpy")
 def _sum_up(  # type: ignore[no-untyped-def]
-    ridge, beside_ridge, between, lowest, light, melanin_of_face, end, b_low, b_high, sums
+    ridge, beside_ridge, between, lowest, light, melanin_of_face, end, blood_ends, sums
 ):
     """Sum over melanin along the ridge, and over blood across it.
 
@@ -461,7 +447,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
     across, wide = beside_ridge.across, beside_ridge.wide
     across_low, across_width = beside_ridge.low, beside_ridge.width
     edges_a, total_a, bins = sums
-    prior, prior_low, prior_step = light
+    b_low, b_high = blood_ends
     live = 0
     for k in range(N_LINES - 1):
         live += between[k] < lowest + NEGLIGIBLE_COST
@@ -484,7 +470,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
             value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
             t = shade[k] + x * (shade[k + 1] - shade[k])
             value = max(value, min(0.0, cost[k], cost[k + 1]))
-            value += _prior_cost(prior, prior_low, prior_step, t) - lowest
+            value += _prior_cost(light, t) - lowest
             value += _melanin_cost(melanin_of_face, k, x)
             mass = 0.0
             if value < NEGLIGIBLE_COST:
@@ -516,36 +502,26 @@ def _sum_up(  # type: ignore[no-untyped-def]
     return count, mean_shade, per_b
 
 
-def _given(dtype: types.Type, axes: int) -> types.Array:
-    """Return the type of a contiguous argument that is only read, and may be read-only."""
-    return types.Array(dtype, axes, "C", readonly=True)
-
-
 @njit(
     void(
-        _given(float32, 2),  # rgb (n, 3)
-        _given(float32, 2),  # variance (n, 3)
-        _given(boolean, 1),  # usable (n,)
-        _given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        _given(float64, 2),  # upper triangles of the model error's covariances (n, 6) or (1, 6)
-        _given(float64, 3),  # log color of the lines (LINES, NODES, 3)
-        _given(float64, 3),  # its derivative by melanin
-        _given(float64, 3),  # its derivative by blood
-        _given(float64, 1),  # ends of the axes as volume fractions (2,)
-        _given(float64, 1),  # -2 log probability of log shading
+        given(float32, 2),  # rgb (n, 3)
+        given(float32, 2),  # variance (n, 3)
+        given(boolean, 1),  # usable (n,)
+        given(float32, 2),  # where to begin: fractions of the axes (n, 2)
+        given(float64, 2),  # upper triangles of the model error's covariances (n, 6) or (1, 6)
+        given(float64, 3),  # log color of the lines (LINES, NODES, 3)
+        given(float64, 3),  # its derivative by melanin
+        given(float64, 3),  # its derivative by blood
+        given(float64, 1),  # ends of the axes as volume fractions (2,)
+        given(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
         float64,  # and its step
-        _given(float64, 1),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
-        _given(float64, 1),  # of blood: see _blood_cost
+        given(float64, 1),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
+        given(float64, 1),  # of blood: see _blood_cost
         float32[:, ::1],  # maps (6, n): see MAPS
         int64,  # pixels a task
     ),
-    parallel=True,
-    fastmath=_FAST_MATH,
-    cache=True,
-    nogil=True,
-    boundscheck=False,
-    error_model="numpy",
+    **OVER_PIXELS,
 )
 def weigh_pixels(  # type: ignore[no-untyped-def]
     rgb,
@@ -570,17 +546,8 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     each_model = model.shape[0] > 1
     light = prior, prior_low, prior_step
     for task in prange((pixels + block - 1) // block):
-        ridge = _Ridge(
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-        )
+        r = np.empty((9, N_LINES))
+        ridge = _Ridge(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8])
         beside = _Beside(
             np.empty((N_LINES, N_ACROSS)),
             np.empty(N_LINES),
@@ -605,17 +572,10 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
             b_low, b_high = _look_across(
                 log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside
             )
+            sums = edges_a, total_a, bins
+            blood_ends = b_low, b_high
             count, mean_shade, per_b = _sum_up(
-                ridge,
-                beside,
-                between,
-                lowest,
-                light,
-                melanin_of_face,
-                ends[0],
-                b_low,
-                b_high,
-                (edges_a, total_a, bins),
+                ridge, beside, between, lowest, light, melanin_of_face, ends[0], blood_ends, sums
             )
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
             for m in range(N_BINS):

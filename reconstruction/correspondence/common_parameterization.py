@@ -17,16 +17,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
+from scipy.ndimage import map_coordinates
 
 from model.texture_statistics.masks import fill_smoothly
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_field
 from reconstruction.correspondence.landmark_field import LandmarkField, LandmarkFieldError
+from reconstruction.correspondence.splatting import closed, outermost, splat
 
 Point = tuple[float, float, float]
 
@@ -36,8 +37,6 @@ MIN_SHARED_LANDMARKS: Final = 6
 """Named landmarks that two faces need in common: three for the affine part, as many again."""
 NOSE_TIP_FRACTION: Final = 1e-3
 """Foremost texels that stand for the tip of the nose where no landmark names it."""
-SHADOW_DEPTH_MM: Final = 10.0
-"""Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
 CHART_SIZE_RANGE_PX: Final = (16, 4096)
 _TEXELS_PER_BATCH: Final = 40_000
 NOSE_LANDMARK: Final = "nose tip"
@@ -105,10 +104,8 @@ class CommonFrame:
     def __post_init__(self) -> None:
         """Check shapes and ranges."""
         if self.landmarks_mm.shape != (len(self.names), 2):
-            raise ParameterizationError(
-                f"landmarks_mm: got shape {self.landmarks_mm.shape}, "
-                f"expected ({len(self.names)}, 2)"
-            )
+            shape, expected = self.landmarks_mm.shape, (len(self.names), 2)
+            raise ParameterizationError(f"landmarks_mm: got shape {shape}, expected {expected}")
         if not np.isfinite(self.landmarks_mm).all() or not np.isfinite(self.center_mm).all():
             raise ParameterizationError("landmarks_mm: got a place that is not finite")
         if not (math.isfinite(self.side_mm) and self.side_mm > 0):
@@ -162,23 +159,20 @@ class CommonFrame:
         ParameterizationError
             Naming what is missing or of another kind.
         """
+        values: Any = told
         try:
-            if float(told["radius_mm"]) != CYLINDER_RADIUS_MM:  # type: ignore[arg-type]
-                raise ParameterizationError(
-                    f"radius_mm: got {told['radius_mm']}, expected {CYLINDER_RADIUS_MM}"
-                )
-            u, v = (float(x) for x in told["center_mm"])  # type: ignore[attr-defined]
-            return CommonFrame(
-                tuple(str(name) for name in told["names"]),  # type: ignore[attr-defined]
-                np.asarray(told["landmarks_mm"], np.float64).reshape(-1, 2),
-                (u, v),
-                float(told["side_mm"]),  # type: ignore[arg-type]
-                int(told["size"]),  # type: ignore[call-overload]
-            )
-        except ParameterizationError:
-            raise
+            radius_mm = float(values["radius_mm"])
+            u, v = map(float, values["center_mm"])
+            names = tuple(map(str, values["names"]))
+            places = np.asarray(values["landmarks_mm"], np.float64).reshape(-1, 2)
+            side_mm, size = float(values["side_mm"]), int(values["size"])
         except (KeyError, TypeError, ValueError) as error:
             raise ParameterizationError(f"common parameterization: {error}") from error
+        if radius_mm != CYLINDER_RADIUS_MM:
+            raise ParameterizationError(
+                f"radius_mm: got {radius_mm}, expected {CYLINDER_RADIUS_MM}"
+            )
+        return CommonFrame(names, places, (u, v), side_mm, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,18 +260,15 @@ class Chart:
             Pixels that texels say something about: at most half a texel's distance from one.
         """
         image = np.asarray(texture, np.float64)
-        layers = image if image.ndim == 3 else image[..., None]
         use = self.on_surface & self.outermost
         if valid is not None:
             use = use & np.asarray(valid, np.bool_)
-        total, weight = _splat(self.place_px[use], layers[use], self.size)
+        total, weight = splat(self.place_px[use], _layers(image)[use], self.size)
         mean = total / np.maximum(weight, 1e-12)[..., None]
         known = weight > 0.0
-        near = _closed(known)
-        if not known.any():
-            return np.zeros_like(mean if image.ndim == 3 else mean[..., 0], np.float32), known
-        filled = fill_smoothly(mean, known).astype(np.float32)
-        return filled if image.ndim == 3 else filled[..., 0], near
+        filled = fill_smoothly(mean, known) if known.any() else np.zeros_like(mean)
+        near = closed(known) if known.any() else known
+        return filled.astype(np.float32).reshape(known.shape + image.shape[2:]), near
 
     def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
         """Read a common map at the texels, linearly.
@@ -295,24 +286,24 @@ class Chart:
             Texels of the surface inside the map.
         """
         image = np.asarray(common, np.float64)
-        layers = image if image.ndim == 3 else image[..., None]
         at = [self.place_px[..., 1], self.place_px[..., 0]]
-        out = np.stack(
-            [
-                map_coordinates(layers[..., c], at, order=1, mode="nearest")
-                for c in range(layers.shape[2])
-            ],
-            axis=-1,
-        ).astype(np.float32)
+        out = [
+            map_coordinates(layer, at, order=1, mode="nearest")
+            for layer in np.moveaxis(_layers(image), 2, 0)
+        ]
+        values = np.stack(out, axis=-1).astype(np.float32)
         last = self.size - 0.5
         inside = self.on_surface & np.all((self.place_px >= -0.5) & (self.place_px <= last), axis=2)
-        return out if image.ndim == 3 else out[..., 0], inside
+        return values.reshape(self.on_surface.shape + image.shape[2:]), inside
 
 
-def find_cylinder(
-    position_mm: ArrayLike, valid: ArrayLike, landmarks: Mapping[str, Point] | None = None
-) -> Cylinder:
-    """Find what to unroll a face from: by the landmark "nose tip", else by its foremost texels.
+def _layers(image: Float64Array) -> Float64Array:
+    """Return an image (H, W) or (H, W, C) as (H, W, C)."""
+    return image if image.ndim == 3 else image[..., None]
+
+
+def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
+    """Find what to unroll a face from by its foremost texels, where no landmark names its nose.
 
     Parameters
     ----------
@@ -320,17 +311,12 @@ def find_cylinder(
         (H, W, 3), rig frame.
     valid
         (H, W), texels of the surface.
-    landmarks
-        Name to x, y, z, mm, rig frame.
 
     Raises
     ------
     ParameterizationError
         When no texel is valid.
     """
-    if landmarks and NOSE_LANDMARK in landmarks:
-        x, y, z = landmarks[NOSE_LANDMARK]
-        return Cylinder((float(x), float(y), float(z)))
     points = np.asarray(position_mm, np.float64)[np.asarray(valid, np.bool_)]
     if not len(points):
         raise ParameterizationError("position: no texel is valid")
@@ -371,20 +357,18 @@ def common_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, .
             f"landmarks: all faces have {len(names)} in common ({', '.join(names) or 'none'}), "
             f"expected at least {MIN_SHARED_LANDMARKS}, better 20"
         )
-    places = np.stack(
-        [
-            Cylinder(face[NOSE_LANDMARK]).unroll(
-                np.array([face[name] for name in names], np.float64)
-            )
-            for face in faces
-        ]
-    )
+    places = np.stack([_unrolled(face, names) for face in faces])
     middle = places.mean(axis=1, keepdims=True)
     spread = np.sqrt(((places - middle) ** 2).sum(axis=2).mean(axis=1))[:, None, None]
     if not np.all(spread > 0):
         raise ParameterizationError("landmarks: all of a face lie at one point")
     mean = ((places - middle) / spread).mean(axis=0) * float(spread.mean())
     return names, mean - mean[names.index(NOSE_LANDMARK)]
+
+
+def _unrolled(landmarks: Mapping[str, Point], names: Sequence[str]) -> Float64Array:
+    """Return some landmarks of a face unrolled by its nose, (K, 2)."""
+    return Cylinder(landmarks[NOSE_LANDMARK]).unroll([landmarks[name] for name in names])
 
 
 def correspond(
@@ -419,13 +403,13 @@ def correspond(
             f"{NOSE_LANDMARK!r} among them"
         )
     cylinder = Cylinder(landmarks[NOSE_LANDMARK])
-    own = cylinder.unroll(np.array([landmarks[name] for name in names], np.float64))
+    own = _unrolled(landmarks, names)
     common = np.array([frame.landmark(name) for name in names])
     try:
         field = landmark_field.fit(own, common, stderr_px=stderr_mm)
     except LandmarkFieldError as error:
         raise ParameterizationError(str(error).replace("stderr_px", "stderr_mm")) from error
-    if _folds(field, own):
+    if field.folds():
         worst = names[int(np.argmax(field.leave_one_out_px))]
         raise ParameterizationError(
             f"landmarks: no map without folds goes through them; {worst!r} lies "
@@ -468,7 +452,8 @@ def chart(
     reach[shown] = np.hypot(
         position[shown, 0] - tip[0], position[shown, 2] - tip[2] + CYLINDER_RADIUS_MM
     )
-    return Chart(frame.size, place, shown, shown & _outermost(place, reach, shown, frame), error)
+    visible = shown & outermost(place, reach, shown, frame.side_mm, frame.size)
+    return Chart(frame.size, place, shown, visible, error)
 
 
 def frame_around(
@@ -497,58 +482,3 @@ def frame_around(
     middle = 0.5 * (low + high)
     side = float(np.max(high - low))
     return CommonFrame(names, landmarks_mm, (float(middle[0]), float(middle[1])), side, size)
-
-
-def _folds(field: LandmarkField, own: Float64Array) -> bool:
-    """Return whether the map turns anything over, within the landmarks and a fifth around."""
-    low, high = own.min(axis=0), own.max(axis=0)
-    rim = 0.2 * (high - low)
-    along = [np.linspace(a - r, b + r, 40) for a, b, r in zip(low, high, rim, strict=True)]
-    u, v = np.meshgrid(*along)
-    points = np.stack([u, v], axis=-1)
-    moved = points + field.at(points.reshape(-1, 2))[0].reshape(points.shape)
-    du, dv = np.diff(moved, axis=1)[:-1], np.diff(moved, axis=0)[:, :-1]
-    return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
-
-
-def _outermost(
-    place: Float64Array, reach: Float64Array, shown: BoolArray, frame: CommonFrame
-) -> BoolArray:
-    """Return the texels that lie about as far out as any near their place, on cells of 2 mm."""
-    cells = max(1, math.ceil(frame.side_mm / 2.0))
-    at = np.floor((place + 0.5) * (cells / frame.size)).astype(np.int64)
-    inside = shown & np.all((at >= 0) & (at < cells), axis=2)
-    index = at[..., 1] * cells + at[..., 0]
-    highest = np.zeros(cells * cells)
-    np.maximum.at(highest, index[inside], reach[inside])
-    highest = maximum_filter(highest.reshape(cells, cells), size=3, mode="nearest").ravel()
-    out = shown & ~inside
-    out[inside] = reach[inside] >= highest[index[inside]] - SHADOW_DEPTH_MM
-    return np.asarray(out, np.bool_)
-
-
-def _splat(at: Float64Array, values: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
-    """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
-    total = np.zeros((size * size, values.shape[1]))
-    weight = np.zeros(size * size)
-    low = np.floor(at).astype(np.int64)
-    part = at - low
-    for dx in (0, 1):
-        for dy in (0, 1):
-            share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-            x, y = low[:, 0] + dx, low[:, 1] + dy
-            use = (x >= 0) & (x < size) & (y >= 0) & (y < size) & (share > 1e-6)
-            index = y[use] * size + x[use]
-            weight += np.bincount(index, share[use], minlength=size * size)
-            for c in range(values.shape[1]):
-                total[:, c] += np.bincount(
-                    index, share[use] * values[use, c], minlength=size * size
-                )
-    return total.reshape(size, size, -1), weight.reshape(size, size)
-
-
-def _closed(known: BoolArray) -> BoolArray:
-    """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
-    padded = np.pad(known, 3, mode="edge")
-    closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)
-    return np.asarray(closed[3:-3, 3:-3] | known, np.bool_)

@@ -116,32 +116,31 @@ def _beard_outline(at: dict[str, Float64Array]) -> Float64Array:
     )
 
 
+def _ellipse(middle: Float64Array, half: tuple[float, float], grid: Float64Array) -> BoolArray:
+    return np.asarray((((grid - middle) / np.array(half)) ** 2).sum(axis=-1) <= 1.0, np.bool_)
+
+
 def _eyes(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
     """Return the eyes with the brows above them."""
     out = np.zeros(grid.shape[:2], np.bool_)
     for side in ("left", "right"):
         inner, outer = at[f"eye inner {side}"], at[f"eye outer {side}"]
         middle = 0.5 * (inner + outer) + np.array([0.0, 7.0])
-        half = np.array([0.5 * abs(outer[0] - inner[0]) + 8.0, 20.0])
-        out |= (((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0
+        out |= _ellipse(middle, (0.5 * abs(outer[0] - inner[0]) + 8.0, 20.0), grid)
     return out
 
 
 def _nostrils(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
     left, right = at["nose wing left"], at["nose wing right"]
     middle = 0.5 * (left + right) - np.array([0.0, 4.0])
-    half = np.array([0.5 * abs(right[0] - left[0]), 7.0])
-    return np.asarray((((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0, np.bool_)
+    return _ellipse(middle, (0.5 * abs(right[0] - left[0]), 7.0), grid)
 
 
 def _lips(at: dict[str, Float64Array], grid: Float64Array) -> BoolArray:
-    corners = at["mouth corner left"], at["mouth corner right"]
-    middle = 0.5 * (at["upper lip"] + at["lower lip"])
-    half = (
-        0.5 * abs(corners[1][0] - corners[0][0]) + 2.0,
-        0.5 * abs(at["upper lip"][1] - at["lower lip"][1]) + 4.0,
-    )
-    return np.asarray((((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0, np.bool_)
+    left, right = at["mouth corner left"], at["mouth corner right"]
+    upper, lower = at["upper lip"], at["lower lip"]
+    half = 0.5 * abs(right[0] - left[0]) + 2.0, 0.5 * abs(upper[1] - lower[1]) + 4.0
+    return _ellipse(0.5 * (upper + lower), half, grid)
 
 
 def _inside(corners: Float64Array, grid: Float64Array) -> BoolArray:

@@ -13,16 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.correspondence import landmark_field, landmark_table
+from reconstruction.correspondence import landmark_field
 from reconstruction.registration import (
     RegistrationError,
     dense_flow,
@@ -115,22 +114,16 @@ class Alignment:
             polynomials, which keep small contrast, beside masked ones linearly.
         """
         image, good = self._checked(values, valid)
-        filled = np.where(good[..., None] if image.ndim == 3 else good, image, 0.0)
-        filled = filled.astype(np.float32)
+        filled = np.where(_beside(good, image), image, 0.0).astype(np.float32)
         unknown = (~good).astype(np.float32)
         near = dense_flow.bilinear(unknown, self.source_px)
         wide = dense_flow.bilinear(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), self.source_px)
-        linear = dense_flow.bilinear(filled, self.source_px)
-        cubic = dense_flow.bilinear(filled, self.source_px, interpolation=cv2.INTER_CUBIC)
-        smooth = wide <= 0.0
         seen = self.valid & (near <= 0.0)
-        if image.ndim == 3:
-            linear = linear.reshape(*seen.shape, image.shape[2])
-            cubic = cubic.reshape(*seen.shape, image.shape[2])
-            smooth, shown = smooth[..., None], seen[..., None]
-        else:
-            shown = seen
-        return np.where(shown, np.where(smooth, cubic, linear), 0.0).astype(np.float32), seen
+        shape = seen.shape + image.shape[2:]
+        linear = dense_flow.bilinear(filled, self.source_px).reshape(shape)
+        cubic = dense_flow.bilinear(filled, self.source_px, interpolation=cv2.INTER_CUBIC)
+        best = np.where(_beside(wide <= 0.0, image), cubic.reshape(shape), linear)
+        return np.where(_beside(seen, image), best, 0.0).astype(np.float32), seen
 
     def warp_stderr(
         self, values: ArrayLike, stderr: ArrayLike, valid: ArrayLike | None = None
@@ -155,59 +148,28 @@ class Alignment:
         variance, seen = self.warp(np.square(own), good)
         slope = _slope_variance(image, good)
         steep, _ = self.warp(slope, None)
-        place = np.square(self.error_px) / 2.0
-        place = place[..., None] if image.ndim == 3 else place
+        place = _beside(np.square(self.error_px) / 2.0, image)
         # cubic interpolation may undershoot
         total = np.maximum(variance, 0.0) + np.maximum(steep, 0.0) * place
-        shown = seen[..., None] if image.ndim == 3 else seen
-        return np.where(shown, np.sqrt(total), 0.0).astype(np.float32)
+        return np.where(_beside(seen, image), np.sqrt(total), 0.0).astype(np.float32)
 
-    def place_stderr(self, values: ArrayLike, valid: ArrayLike | None = None) -> Float32Array:
-        """Return how far a map on the neutral picture may be off because its places are.
+    def warp_map(self, skin_map: SkinMap) -> SkinMap:
+        """Lay a map with its own standard error and mask over the neutral picture.
 
-        Parameters
-        ----------
-        values : array_like, shape (H, W) or (H, W, C)
-            What was warped, or computed of it: the change of a state's blood, for one.
-        valid : array_like of bool, shape (H, W), optional
-
-        Returns
-        -------
-        ndarray of float32
-            Shape of `values`: its slope (smoothed over 2 px) times the error of the place; 0 where
-            not valid. It adds to other errors in squares.
-        """
-        image = np.asarray(values, np.float32)
-        if image.ndim not in (2, 3) or image.shape[:2] != self.valid.shape:
-            raise AlignmentError(f"values: got shape {image.shape}, expected {self.valid.shape}")
-        good = self.valid if valid is None else self.valid & np.asarray(valid, bool)
-        finite = np.isfinite(image)
-        good = good & (finite.all(axis=-1) if image.ndim == 3 else finite)
-        place = self.error_px if image.ndim == 2 else self.error_px[..., None]
-        steep = np.sqrt(_slope_variance(np.where(finite, image, 0.0).astype(np.float32), good))
-        return np.asarray(steep * place / math.sqrt(2.0), np.float32)
-
-    def warp_map(self, skin_map: SkinMap, *, place: bool = True) -> SkinMap:
-        """Lay a map with its standard error and mask over the neutral picture.
+        What the error of the place adds is no part of it:
+        `reconstruction.facial_color.registration_error` has it with how the channels go together.
+        What interpolation averages of the noise is taken off.
 
         Parameters
         ----------
         skin_map
             Of the moving picture.
-        place
-            Whether the error of the place is added to the map's own. Colors for
-            `reconstruction.facial_color.shared_melanin` go without:
-            `reconstruction.facial_color.registration_error` tells it with how the channels go
-            together. What interpolation averages of the noise is taken off then.
         """
         values, seen = self.warp(skin_map.values, skin_map.valid)
         stderr = None
-        if skin_map.stderr is not None and place:
-            stderr = self.warp_stderr(skin_map.values, skin_map.stderr, skin_map.valid)
-        elif skin_map.stderr is not None:
+        if skin_map.stderr is not None:
             variance, _ = self.warp(np.square(skin_map.stderr), skin_map.valid)
-            left = dense_flow.noise_left(self.source_px)
-            left = left[..., None] if values.ndim == 3 else left
+            left = _beside(dense_flow.noise_left(self.source_px), values)
             stderr = np.sqrt(np.maximum(variance, 0.0) * left).astype(np.float32)
         return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
 
@@ -222,8 +184,7 @@ class Alignment:
         good = np.ones(self.moving_shape, bool) if valid is None else np.asarray(valid, bool)
         if good.shape != self.moving_shape:
             raise AlignmentError(f"valid: got shape {good.shape}, expected {self.moving_shape}")
-        finite = np.isfinite(image)
-        return image, good & (finite.all(axis=-1) if image.ndim == 3 else finite)
+        return image, good & _everywhere(np.isfinite(image))
 
 
 def align(
@@ -332,23 +293,6 @@ def align(
     )
 
 
-def read_landmarks(path: str | Path) -> dict[str, tuple[float, float]]:
-    """Read landmarks of a picture from a table ``name,x,y``.
-
-    Parameters
-    ----------
-    path
-        CSV with that header; x to the right and y down from the centre of the upper left pixel of
-        the maps, px.
-
-    Raises
-    ------
-    reconstruction.correspondence.landmark_table.LandmarkError
-        For anything else; it names line and column.
-    """
-    return landmark_table.read(path)
-
-
 def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, BoolArray]:
     """Return the local contrast of a picture and where it means something."""
     image = np.asarray(picture, np.float64)
@@ -360,11 +304,10 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
     good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
     if good.shape != image.shape[:2]:
         raise AlignmentError(f"valid_{name}: got shape {good.shape}, expected {image.shape[:2]}")
-    usable = np.isfinite(image) & (image > 0.0)
-    good = good & (usable.all(axis=-1) if image.ndim == 3 else usable)
+    good = good & _everywhere(np.isfinite(image) & (image > 0.0))
     if not good.any():
         raise AlignmentError(f"{name}: has no valid pixel with light")
-    shown = np.where(good[..., None] if image.ndim == 3 else good, image, 1.0)
+    shown = np.where(_beside(good, image), image, 1.0)
     value = np.exp(np.log(shown).mean(axis=-1)) if image.ndim == 3 else shown
     # where there is no skin goes on what is beside it: an edge of the mask is no structure
     weight = good.astype(np.float64)
@@ -373,6 +316,16 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
     middle = float(np.median(value[good]))
     around = np.where(share > 1e-3, around, middle)
     return normalize_local_contrast(np.where(good, value, around)), good
+
+
+def _beside(array: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
+    """Return an array of pixels (H, W) as it broadcasts beside an image (H, W) or (H, W, C)."""
+    return array[..., None] if image.ndim == 3 else array
+
+
+def _everywhere(good: BoolArray) -> BoolArray:
+    """Return where all channels of (H, W) or (H, W, C) are good, (H, W)."""
+    return np.asarray(good.all(axis=-1)) if good.ndim == 3 else good
 
 
 def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, Float64Array]:
@@ -428,8 +381,7 @@ def _slope_variance(image: Float32Array, good: BoolArray) -> Float32Array:
     """Return the squared slope of a map per px, smoothed over 2 px."""
     weight = good.astype(np.float32)
     share = cv2.GaussianBlur(weight, (0, 0), 2.0)
-    keep = weight[..., None] if image.ndim == 3 else weight
-    spread = share[..., None] if image.ndim == 3 else share
+    keep, spread = _beside(weight, image), _beside(share, image)
     known = np.where(keep > 0, image, 0.0).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(known, (0, 0), 2.0)).reshape(image.shape)
     smooth = smooth / np.maximum(spread, 1e-6)

@@ -95,6 +95,16 @@ class LandmarkField:
         ).astype(np.float64)
         return fine[..., :2], np.maximum(fine[..., 2], 0.0)
 
+    def folds(self) -> bool:
+        """Return whether it turns anything over, within the landmarks and a fifth around."""
+        low, high = self.points_px.min(axis=0), self.points_px.max(axis=0)
+        rim = 0.2 * (high - low)
+        along = [np.linspace(a - r, b + r, 40) for a, b, r in zip(low, high, rim, strict=True)]
+        points = np.stack(np.meshgrid(*along), axis=-1)
+        moved = points + self.at(points.reshape(-1, 2))[0].reshape(points.shape)
+        du, dv = np.diff(moved, axis=1)[:-1], np.diff(moved, axis=0)[:, :-1]
+        return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
+
     def at(self, points_px: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return displacement (N, 2) and standard error along each axis (N,) at some points, px.
 

@@ -42,30 +42,23 @@ def read(path: str | Path) -> dict[str, tuple[float, float]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
+        where = f"{path}, line {number}"
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:
             if cells != list(LANDMARK_COLUMNS):
-                raise LandmarkError(
-                    f"{path}, line {number}: got columns {cells}, expected name, x, y"
-                )
+                raise LandmarkError(f"{where}: got columns {cells}, expected name, x, y")
             header = True
             continue
         if len(cells) != len(LANDMARK_COLUMNS):
-            raise LandmarkError(
-                f"{path}, line {number}: got {len(cells)} cells, expected 3: name, x, y"
-            )
+            raise LandmarkError(f"{where}: got {len(cells)} cells, expected 3: name, x, y")
         name = cells[0]
         if not name:
-            raise LandmarkError(f"{path}, line {number}, column name: got an empty name")
+            raise LandmarkError(f"{where}, column name: got an empty name")
         if name in found:
             raise LandmarkError(
-                f"{path}, line {number}, column name: {name!r} is there twice, "
-                f"first in line {lines[name]}"
+                f"{where}, column name: {name!r} is there twice, first in line {lines[name]}"
             )
-        x, y = (
-            _number(cell, f"{path}, line {number}, column {column}")
-            for column, cell in zip(LANDMARK_COLUMNS[1:], cells[1:], strict=True)
-        )
+        x, y = (_number(cells[k], f"{where}, column {LANDMARK_COLUMNS[k]}") for k in (1, 2))
         found[name], lines[name] = (x, y), number
     if not header:
         raise LandmarkError(f"{path}: is empty, expected the columns name, x, y")

@@ -276,7 +276,6 @@ def transition(
     values: ArrayLike,
     *,
     cycle_s: float,
-    change_s: float | None = None,
     stderr: ArrayLike | None = None,
     false_alarm: float = TRANSITION_FALSE_ALARM_RATE,
 ) -> Transition:
@@ -285,12 +284,10 @@ def transition(
     Parameters
     ----------
     phase_s : array_like, shape (N,)
-        Phase of each shot, s; the expression is asked for at 0 and rest at ``change_s``.
+        Phase of each shot, s; the expression is asked for at 0 and rest after half of the cycle.
     values : array_like, shape (N,)
     cycle_s : float
         Length of the cycle, s.
-    change_s : float, optional
-        When rest is asked for, s; None: after half of the cycle.
     stderr : array_like, shape (N,), optional
         Standard errors; no shot's noise is taken for less than its own.
     false_alarm : float
@@ -317,7 +314,7 @@ def transition(
         raise CurveError(f"false_alarm: got {false_alarm}, expected 0 to 1")
     phase = np.asarray(phase_s, np.float64) % cycle_s
     value = np.asarray(values, np.float64)
-    middle = 0.5 * cycle_s if change_s is None else change_s
+    middle = 0.5 * cycle_s
     settled = [
         _between(phase, value, 0.5 * middle, middle),
         _between(phase, value, 0.5 * (middle + cycle_s), cycle_s),

@@ -11,7 +11,6 @@ for quick blood; so it is one more level of each curve, with its standard error 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -173,16 +172,10 @@ def fit_cycle(
         between = data.moves_between(phase % cycle_s, middle, longest)
         delays = np.linspace(*between, _POSE_DELAY_NODES)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
-    plain, *bent = (
-        _fit(data, _bent(straight, amount), delays, constants, changes)
-        for amount in ((0.0, -bend, bend) if bend else (0.0,))
-    )
-    return _with_bends(plain, bent)
+    return _fit_bent(data, straight, delays, constants, changes, bend)
 
 
-def fit_course(
-    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None, bend: float = 0.0
-) -> RelaxationFit:
+def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> RelaxationFit:
     """Fit blood that relaxes to a new level after an event at time 0.
 
     Parameters
@@ -191,8 +184,6 @@ def fit_course(
         s after the event; samples before it are not used.
     values : array_like, shape (N,) or (P, N)
         One curve, or several that share the time constant; NaN is left out.
-    stderr : array_like, optional
-        Standard errors of the values, their shape.
     bend : float
         Standard error of how the values are bent over the change, in [0, 1): a part s of it
         shows as s +- bend s (1 - s). The best constant is that of no bend; what both bends move it
@@ -212,9 +203,7 @@ def fit_course(
     time = np.asarray(time_s, np.float64)
     after = (time >= 0) & np.isfinite(time)
     time = time[after]
-    shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
-    errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
-    data = Samples.of(time, shown, errors)
+    data = Samples.of(time, np.atleast_2d(np.asarray(values, np.float64))[:, after], None)
 
     def course(delay: Float64Array, constant: Float64Array) -> Float64Array:
         """Part of the way to the new level."""
@@ -223,11 +212,7 @@ def fit_course(
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
     constants = np.geomspace(spacing / 50, 50 * span, _GRID_NODES)
-    straight, *bent = (
-        _fit(data, _bent(course, amount), np.zeros(1), constants, np.zeros(0))
-        for amount in ((0.0, -bend, bend) if bend else (0.0,))
-    )
-    return _with_bends(straight, bent)
+    return _fit_bent(data, course, np.zeros(1), constants, np.zeros(0), bend)
 
 
 def _check_bend(bend: float) -> None:
@@ -235,25 +220,30 @@ def _check_bend(bend: float) -> None:
         raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
 
 
-def _bent(shape: Shape, amount: float) -> Shape:
-    """Return a shape as it shows where values are bent over their change."""
-    if amount == 0.0:
-        return shape
-
-    def bent(delay: Float64Array, constant: Float64Array) -> Float64Array:
-        part = shape(delay, constant)
-        return np.asarray(part + amount * part * (1.0 - part))
-
-    return bent
-
-
-def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> RelaxationFit:
+def _fit_bent(
+    data: Samples,
+    curve: Shape,
+    delays: Float64Array,
+    constants: Float64Array,
+    at: Float64Array,
+    bend: float,
+) -> RelaxationFit:
     """Return a fit whose time constant is as uncertain as what may have bent the values."""
+
+    def fit(amount: float) -> RelaxationFit:
+        def shape(delay: Float64Array, constant: Float64Array) -> Float64Array:
+            """Return the shape as it shows where values are bent over their change."""
+            part = curve(delay, constant)
+            return np.asarray(part + amount * part * (1.0 - part)) if amount else part
+
+        return _fit(data, shape, delays, constants, at)
+
+    straight, *bent = (fit(amount) for amount in ((0.0, -bend, bend) if bend else (0.0,)))
     if not bent or straight.known == "unknown":
         return straight
-    constants = [fit.time_constant_s for fit in bent]
+    moved_to = [one.time_constant_s for one in bent]
     middle = straight.time_constant_s
-    moved = (min(constants), max(constants))
+    moved = (min(moved_to), max(moved_to))
 
     def widened(interval: tuple[float, float], sigmas: float) -> tuple[float, float]:
         """Return an interval of so many standard errors with what bends add to it."""
@@ -265,7 +255,7 @@ def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> Relax
         )
         return float(low), float(high)
 
-    half = 0.5 * (max(constants) - min(constants))
+    half = 0.5 * (moved[1] - moved[0])
     return replace(
         straight,
         interval_s=widened(straight.interval_s, COVERAGE_FACTOR_95),

@@ -47,10 +47,8 @@ class RegionRepeatability:
         Valid in all captures.
     means : ndarray of float64, shape (N,)
         Mean of the map in each capture.
-    stderr : ndarray of float64, shape (N,)
-        By noise.
-    within, within_stderr : float
-        Standard deviation of repeats about their state, and its standard error.
+    within : float
+        Standard deviation of repeats about their state.
     between : float
         Standard deviation of the states' levels, noise and repeats taken away; 0 when they do not
         differ by more.
@@ -59,8 +57,6 @@ class RegionRepeatability:
         standard error for levels drawn from a normal distribution.
     chi_square : float
         Of repeats about their state, in standard errors of noise.
-    degrees : int
-        Captures less states.
     p_value : float
         Chance of so much scatter by noise alone.
     scatters : bool
@@ -72,14 +68,11 @@ class RegionRepeatability:
     name: str
     pixels: int
     means: Float64Array
-    stderr: Float64Array
     within: float
-    within_stderr: float
     between: float
     correlation: float
     correlation_stderr: float
     chi_square: float
-    degrees: int
     p_value: float
     scatters: bool
     change_to_scatter: float
@@ -125,26 +118,17 @@ class Drift:
         Of the region.
     slope_per_minute, slope_stderr : float
         In units of the map a minute, and its standard error.
-    relative_per_minute : float
-        Slope over the mean of all captures.
     p_value : float
         Chance of such a slope without drift.
     drifts : bool
         The p-value is below the false-alarm rate, shared among the regions.
-    degrees : int
-        Captures less states less one.
-    scatter : float
-        Standard deviation of the captures about the line.
     """
 
     name: str
     slope_per_minute: float
     slope_stderr: float
-    relative_per_minute: float
     p_value: float
     drifts: bool
-    degrees: int
-    scatter: float
 
 
 def compare(
@@ -200,19 +184,12 @@ def compare(
     >>> found.correlation > 0.99, found.scatters
     (True, False)
     """
-    values, error, common, names = _checked(maps, states, stderr, valid)
-    groups = _groups(names)
-    if len(names) == len(groups):
+    captured = _Captures.of(maps, states, stderr, valid)
+    if len(captured.states) == len(captured.groups):
         raise RepeatabilityError("states: got each once, expected at least one that is repeated")
-    _check_rates(false_alarm, correlated_px)
-    chosen, left_out = _regions(regions, common)
-    # Sidak: all of them together alarm at the stated rate
-    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
-    found = []
-    for name, mask in chosen.items():
-        means, noise = _means(values, error, mask, correlated_px)
-        found.append(_compared(name, int(mask.sum()), means, noise, groups, reference, limit))
-    return Repeatability(names, tuple(found), false_alarm, left_out)
+    chosen, left_out, limit = captured.regions(regions, correlated_px, false_alarm)
+    found = tuple(_compared(region, captured.groups, reference, limit) for region in chosen)
+    return Repeatability(captured.states, found, false_alarm, left_out)
 
 
 def drift(
@@ -256,65 +233,123 @@ def drift(
     >>> f"{found[-1].slope_per_minute:.5f}", found[-1].drifts
     ('0.00010', True)
     """
-    values, error, common, names = _checked(maps, states, stderr, valid)
+    captured = _Captures.of(maps, states, stderr, valid)
+    names, groups = captured.states, captured.groups
     times = np.asarray(times_s, np.float64)
     if times.shape != (len(names),) or not np.isfinite(times).all():
         raise RepeatabilityError(f"times_s: got shape {times.shape}, expected ({len(names)},)")
-    _check_rates(false_alarm, correlated_px)
-    groups = _groups(names)
     degrees = len(names) - len(groups) - 1
-    minutes = times / 60.0
-    apart = minutes.copy()
-    for members in groups.values():
-        apart[members] -= minutes[members].mean()
-    if degrees < 1 or not (apart**2).sum() > 0:
+    apart = captured.within_states(times / 60.0)
+    square = float((apart**2).sum())
+    if degrees < 1 or not square > 0:
         raise RepeatabilityError(
             f"states: {len(names)} captures of {len(groups)} states leave no repeats over time; "
             "expected at least two more captures than states"
         )
-    chosen, _ = _regions(regions, common)
-    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
+    chosen, _, limit = captured.regions(regions, correlated_px, false_alarm)
     found = []
-    for name, mask in chosen.items():
-        means, noise = _means(values, error, mask, correlated_px)
-        rest = means.copy()
-        for members in groups.values():
-            rest[members] -= means[members].mean()
-        slope = float((apart * rest).sum() / (apart**2).sum())
+    for region in chosen:
+        rest = captured.within_states(region.means)
+        slope = float((apart * rest).sum() / square)
         scatter = math.sqrt(float(((rest - slope * apart) ** 2).sum()) / degrees)
-        by_noise = math.sqrt(float((apart**2 * noise**2).sum())) / float((apart**2).sum())
-        by_scatter = scatter / math.sqrt(float((apart**2).sum()))
-        if by_scatter >= by_noise:
-            stderr_slope = by_scatter
-            p_value = float(2 * stats.t.sf(abs(slope) / max(stderr_slope, 1e-300), degrees))
-        else:
-            stderr_slope = by_noise
-            p_value = float(2 * stats.norm.sf(abs(slope) / stderr_slope))
-        level = float(means.mean())
-        found.append(
-            Drift(
-                name,
-                slope,
-                stderr_slope,
-                slope / level if level else math.nan,
-                p_value,
-                p_value < limit,
-                degrees,
-                scatter,
-            )
-        )
+        by_noise = math.sqrt(float((apart**2 * region.noise**2).sum())) / square
+        by_scatter = scatter / math.sqrt(square)
+        stderr_slope = max(by_scatter, by_noise)
+        sigmas = abs(slope) / max(stderr_slope, 1e-300)
+        one_side = stats.t.sf(sigmas, degrees) if by_scatter >= by_noise else stats.norm.sf(sigmas)
+        p_value = float(2 * one_side)
+        found.append(Drift(region.name, slope, stderr_slope, p_value, p_value < limit))
     return tuple(found)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Region:
+    """Means of the captures in one region, and their standard errors by noise, (N,)."""
+
+    name: str
+    pixels: int
+    means: Float64Array
+    noise: Float64Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Captures:
+    """Checked maps of captures, (N, H, W), and what pixels all of them know, (H, W)."""
+
+    values: Float64Array
+    stderr: Float64Array
+    known: BoolArray
+    states: tuple[str, ...]
+    groups: Mapping[str, NDArray[np.intp]]
+    """Captures of each state."""
+
+    @staticmethod
+    def of(
+        maps: ArrayLike, states: Sequence[str], stderr: ArrayLike, valid: ArrayLike | None
+    ) -> _Captures:
+        values, error = np.asarray(maps, np.float64), np.asarray(stderr, np.float64)
+        if values.ndim != 3:
+            raise RepeatabilityError(f"maps: got shape {values.shape}, expected (N, H, W)")
+        if error.shape != values.shape:
+            raise RepeatabilityError(f"stderr: got shape {error.shape}, expected {values.shape}")
+        if len(states) != len(values):
+            raise RepeatabilityError(f"states: got {len(states)}, expected {len(values)}")
+        good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
+        if good.shape != values.shape:
+            raise RepeatabilityError(f"valid: got shape {good.shape}, expected {values.shape}")
+        known = np.asarray((good & np.isfinite(values) & np.isfinite(error)).all(axis=0))
+        if (error[:, known] < 0).any():
+            raise RepeatabilityError("stderr: got a negative one, expected 0 or above")
+        groups = {
+            state: np.flatnonzero([other == state for other in states])
+            for state in dict.fromkeys(states)
+        }
+        return _Captures(values, error, known, tuple(states), groups)
+
+    def within_states(self, values: Float64Array) -> Float64Array:
+        """Return values of the captures (N,) less their state's mean."""
+        rest = values.copy()
+        for members in self.groups.values():
+            rest[members] -= values[members].mean()
+        return rest
+
+    def regions(
+        self, regions: Mapping[str, ArrayLike] | None, correlated_px: float, false_alarm: float
+    ) -> tuple[list[_Region], tuple[tuple[str, str], ...], float]:
+        """Return the regions with pixels, those without, and the p-value of an alarm of one."""
+        if not 0.0 < false_alarm < 1.0:
+            raise RepeatabilityError(f"false_alarm: got {false_alarm}, expected between 0 and 1")
+        if not correlated_px >= 1.0:
+            raise RepeatabilityError(f"correlated_px: got {correlated_px}, expected at least 1")
+        given = _grid(self.known) if regions is None else regions
+        wanted = {name: np.asarray(mask, bool) for name, mask in given.items()}
+        chosen, left_out = [], []
+        for name, mask in {**wanted, WHOLE_REGION: np.ones_like(self.known)}.items():
+            if mask.shape != self.known.shape:
+                raise RepeatabilityError(
+                    f"regions: {name!r} has shape {mask.shape}, expected {self.known.shape}"
+                )
+            seen = mask & self.known
+            count = int(seen.sum())
+            if count < MIN_REGION_PIXELS:
+                left_out.append((name, f"{count} pixels are valid in all captures"))
+                continue
+            means = self.values[:, seen].mean(axis=1)
+            squares = (self.stderr[:, seen] ** 2).sum(axis=1)
+            noise = np.sqrt(squares * min(correlated_px, count)) / count
+            # rounding of float32 maps is noise too
+            noise = np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
+            chosen.append(_Region(name, count, means, noise))
+        if not chosen:
+            raise RepeatabilityError("valid: no region has pixels that are valid in all captures")
+        # Sidak: all of them together alarm at the stated rate
+        return chosen, tuple(left_out), 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
+
+
 def _compared(
-    name: str,
-    pixels: int,
-    means: Float64Array,
-    noise: Float64Array,
-    groups: Mapping[str, NDArray[np.intp]],
-    reference: str,
-    limit: float,
+    region: _Region, groups: Mapping[str, NDArray[np.intp]], reference: str, limit: float
 ) -> RegionRepeatability:
+    means, noise = region.means, region.noise
     count, kinds = len(means), len(groups)
     levels = {state: float(means[members].mean()) for state, members in groups.items()}
     sizes = np.array([len(members) for members in groups.values()], np.float64)
@@ -342,20 +377,17 @@ def _compared(
     start = levels.get(reference, float(np.mean(list(levels.values()))))
     largest = max(abs(level - start) for level in levels.values())
     return RegionRepeatability(
-        name=name,
-        pixels=pixels,
-        means=means,
-        stderr=noise,
-        within=within,
-        within_stderr=within / math.sqrt(2.0 * degrees),
-        between=between,
-        correlation=correlation,
-        correlation_stderr=error,
-        chi_square=chi_square,
-        degrees=degrees,
-        p_value=p_value,
-        scatters=p_value < limit,
-        change_to_scatter=largest / within if within > 0 else math.inf,
+        region.name,
+        region.pixels,
+        means,
+        within,
+        between,
+        correlation,
+        error,
+        chi_square,
+        p_value,
+        p_value < limit,
+        largest / within if within > 0 else math.inf,
     )
 
 
@@ -370,73 +402,6 @@ def _correlation_stderr(correlation: float, size: float, kinds: int, count: int)
     """Return the large-sample standard error of an intraclass correlation (Donner 1986, 3.1)."""
     spread = (1.0 - correlation) * (1.0 + (size - 1.0) * correlation)
     return math.sqrt(2.0 * (count - 1) / ((kinds - 1) * (count - kinds))) * abs(spread) / size
-
-
-def _means(
-    values: Float64Array, error: Float64Array, mask: BoolArray, correlated_px: float
-) -> tuple[Float64Array, Float64Array]:
-    count = int(mask.sum())
-    means = values[:, mask].mean(axis=1)
-    noise = np.sqrt((error[:, mask] ** 2).sum(axis=1) * min(correlated_px, count)) / count
-    # rounding of float32 maps is noise too
-    return means, np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
-
-
-def _groups(states: tuple[str, ...]) -> dict[str, NDArray[np.intp]]:
-    return {
-        state: np.flatnonzero([other == state for other in states])
-        for state in dict.fromkeys(states)
-    }
-
-
-def _check_rates(false_alarm: float, correlated_px: float) -> None:
-    if not 0.0 < false_alarm < 1.0:
-        raise RepeatabilityError(f"false_alarm: got {false_alarm}, expected between 0 and 1")
-    if not correlated_px >= 1.0:
-        raise RepeatabilityError(f"correlated_px: got {correlated_px}, expected at least 1")
-
-
-def _checked(
-    maps: ArrayLike, states: Sequence[str], stderr: ArrayLike, valid: ArrayLike | None
-) -> tuple[Float64Array, Float64Array, BoolArray, tuple[str, ...]]:
-    values, error = np.asarray(maps, np.float64), np.asarray(stderr, np.float64)
-    if values.ndim != 3:
-        raise RepeatabilityError(f"maps: got shape {values.shape}, expected (N, H, W)")
-    if error.shape != values.shape:
-        raise RepeatabilityError(f"stderr: got shape {error.shape}, expected {values.shape}")
-    names = tuple(states)
-    if len(names) != len(values):
-        raise RepeatabilityError(f"states: got {len(names)}, expected {len(values)}")
-    good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
-    if good.shape != values.shape:
-        raise RepeatabilityError(f"valid: got shape {good.shape}, expected {values.shape}")
-    known = (good & np.isfinite(values) & np.isfinite(error)).all(axis=0)
-    if (error[:, known] < 0).any():
-        raise RepeatabilityError("stderr: got a negative one, expected 0 or above")
-    return values, error, np.asarray(known), names
-
-
-def _regions(
-    regions: Mapping[str, ArrayLike] | None, known: BoolArray
-) -> tuple[dict[str, BoolArray], tuple[tuple[str, str], ...]]:
-    wanted = (
-        _grid(known) if regions is None else {k: np.asarray(v, bool) for k, v in regions.items()}
-    )
-    chosen, left_out = {}, []
-    for name, mask in {**wanted, WHOLE_REGION: np.ones_like(known)}.items():
-        if mask.shape != known.shape:
-            raise RepeatabilityError(
-                f"regions: {name!r} has shape {mask.shape}, expected {known.shape}"
-            )
-        seen = mask & known
-        pixels = int(seen.sum())
-        if pixels < MIN_REGION_PIXELS:
-            left_out.append((name, f"{pixels} pixels are valid in all captures"))
-        else:
-            chosen[name] = seen
-    if not chosen:
-        raise RepeatabilityError("valid: no region has pixels that are valid in all captures")
-    return chosen, tuple(left_out)
 
 
 def _grid(known: BoolArray) -> dict[str, BoolArray]:

@@ -22,23 +22,21 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.color_table import ColorTable
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import (
     ChromophoreError,
-    dark_spots,
     invert,
     model_covariance,
     without_brightness,
 )
-from reconstruction.chromophores import face as face_chromophores
-from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
+from reconstruction.chromophores.pixel_checks import broadcast_variance, checked_mask, usable_colors
 from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
@@ -177,125 +175,140 @@ def estimate_shared_melanin(
         )
     if not 0.0 <= own_share <= 1.0:
         raise ChromophoreError(f"own_share: expected 0 to 1, got {own_share}")
-    colors = colors.reshape(states, -1, 3)
-    usable = _usable(colors, valid, (states, *shape))
-    relative = _relative_variance(colors, variance, (states, *shape, 3), usable)
-    usable &= np.isfinite(relative).all(axis=-1)
-    log_rgb = np.log(np.where(usable[..., None], colors, 1.0), dtype=np.float32)
-    relative = np.where(usable[..., None], relative, 1.0).astype(np.float32)
-
-    each_error, usual = _model_errors(model_error, shape, usable)
+    seen = _States.of(colors, variance, valid)
+    each_error, usual = _model_errors(model_error, shape, seen.usable)
     common = each_error * (1.0 - own_share)
-    owns = _own_errors(
-        own_error, own_share * usual + MIN_RELATIVE_NOISE**2, (states, *shape), usable
-    )
-    cells = np.ascontiguousarray(table.cells, np.float64)
-    mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, owns)
+    least = own_share * usual + MIN_RELATIVE_NOISE**2
+    owns = _own_errors(own_error, least, (states, *shape), seen.usable)
+    mean, mean_variance = _mean_color(seen, table, owns)
     mean_rgb = np.exp(mean)
-    mean_error = _with_mean_of(owns, relative, usable, common)
-    found = _weighed(
-        mean_rgb, table, prior, mean_variance * mean_rgb**2, mean_error, shape if one_face else None
-    )
-    ends = np.array([table.c_m_max, table.c_hd_max])
-    begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
-    # dm = 3 end a^2 da
-    stderr = found.stderr_melanin / (
-        3.0 * ends[0] * np.maximum(begin[:, 0], MIN_AXIS_FRACTION) ** 2
-    )
-    good: BoolArray = np.asarray(usable & np.isfinite(found.melanin))
-    fixed = (
-        np.ascontiguousarray(begin, np.float32),
-        np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32),
-    )
+    error = _with_mean_of(owns, seen, common)
+    found = estimate_face(
+        mean_rgb.reshape(*shape, 3),
+        table,
+        prior=prior,
+        variance=(mean_variance * mean_rgb**2).reshape(*shape, 3),
+        model_error=error if error.ndim == 2 else error.reshape(*shape, 3, 3),
+        has_white=one_face,
+    ).found
 
-    weighed_by = np.ascontiguousarray(without_brightness(common))
-
-    def fit(log_change: Float32Array, stiffness: Float32Array) -> tuple[Float32Array, Float32Array]:
-        pixels = mean.shape[0]
-        of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
-        of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
-        kernels.blood_of_states(
-            log_rgb,
-            relative,
-            good,
-            mean,
-            log_change,
-            stiffness,
-            *fixed,
-            weighed_by,
-            owns,
-            cells,
-            float(ends[0]),
-            float(ends[1]),
-            reference % states,
-            of_pixels,
-            of_states,
-            _TASK_PIXELS,
-        )
-        return of_pixels, of_states
-
-    free = np.zeros(good.shape, np.float32)
-    pixel_maps, state_maps = fit(free, free)
+    fit = _BloodFit(seen, mean, found, table, common, owns, reference % states)
+    free = np.zeros(seen.usable.shape, np.float32)
+    of_pixels, of_states = fit(free, free)
     if shading_window_px is not None and states > 1:
+        good = fit.good & (of_states["residual"] < MISFIT_SIGMAS)
         log_change, stiffness = light_change.smooth(
-            state_maps[6],
-            state_maps[7],
-            good & (state_maps[5] < MISFIT_SIGMAS),
+            of_states["log_shading"],
+            of_states["log_shading_variance"],
+            good,
             shape,
             shading_window_px,
         )
-        pixel_maps, state_maps = fit(log_change, np.where(good, stiffness, 0.0).astype(np.float32))
-    named = {
-        name: state_maps[k].reshape(states, *shape) for k, name in enumerate(kernels.STATE_MAPS)
-    }
+        stiffness = np.where(fit.good, stiffness, 0.0).astype(np.float32)
+        of_pixels, of_states = fit(log_change, stiffness)
+    named = {name: values.reshape(states, *shape) for name, values in of_states.items()}
     shading = np.exp(named.pop("log_shading"))
     del named["log_shading_variance"]
-    each: BoolArray = np.asarray(usable & found.valid)
     return SharedMelanin(
-        melanin=found.melanin.reshape(shape),
-        stderr_melanin=found.stderr_melanin.reshape(shape),
-        noise_stderr_melanin=pixel_maps[0].reshape(shape),
+        melanin=found.melanin,
+        stderr_melanin=found.stderr_melanin,
+        noise_stderr_melanin=of_pixels[0].reshape(shape),
         **named,
         shading=shading,
-        valid=found.valid.reshape(shape),
-        valid_states=each.reshape(states, *shape),
+        valid=found.valid,
+        valid_states=seen.usable.reshape(states, *shape) & found.valid,
         reference=reference % states,
     )
 
 
-def _weighed(
-    rgb: Float32Array,
-    table: ColorTable,
-    prior: ShadingPrior,
-    variance: Float32Array,
-    model_error: Float64Array,
-    face_shape: tuple[int, ...] | None,
-) -> ChromophorePosterior:
-    """Weigh all solutions of colors (n, 3); those of one face, of such a shape, by it."""
-    known = partial(
-        chromophore_posterior.estimate,
-        rgb,
-        table,
-        prior=prior,
-        variance=variance,
-        model_error=model_error,
-    )
-    face = None
-    if face_shape is not None:
-        face = face_chromophores.fit_with_white_reference(
-            rgb, table, variance=variance, model_error=model_error
+@dataclass(frozen=True, slots=True, eq=False)
+class _States:
+    """Log colors of S states of n pixels."""
+
+    log_rgb: Float32Array
+    """(S, n, 3): 0 where not usable."""
+    relative: Float32Array
+    """(S, n, 3): relative variance by noise; 1 where not usable."""
+    usable: BoolArray
+    """(S, n)"""
+
+    @staticmethod
+    def of(colors: Float32Array, variance: ArrayLike | None, valid: ArrayLike | None) -> _States:
+        usable = usable_colors(colors)
+        if valid is not None:
+            usable &= checked_mask(valid, usable.shape)
+        relative: FloatArray = np.full(colors.shape, DEFAULT_RELATIVE_NOISE**2, np.float32)
+        if variance is not None:
+            values = broadcast_variance(np.asarray(variance, np.float32), colors.shape)
+            with np.errstate(invalid="ignore"):
+                if (values[usable] < 0.0).any():
+                    raise ChromophoreError("variance: got a negative one")
+            relative = values / np.square(np.where(usable[..., None], colors, 1.0))
+        usable &= np.isfinite(relative).all(axis=-1)
+        keep = usable[..., None]
+        log_rgb = np.log(np.where(keep, colors, 1.0), dtype=np.float32)
+        relative = np.where(keep, relative, 1.0).astype(np.float32)
+        n = len(colors)
+        return _States(log_rgb.reshape(n, -1, 3), relative.reshape(n, -1, 3), usable.reshape(n, -1))
+
+
+class _BloodFit:
+    """Fits the blood of every state under the melanin of the mean colors."""
+
+    def __init__(
+        self,
+        seen: _States,
+        mean: Float32Array,
+        found: ChromophorePosterior,
+        table: ColorTable,
+        common: Float64Array,
+        owns: Float64Array,
+        reference: int,
+    ) -> None:
+        melanin, stderr = found.melanin.reshape(-1), found.stderr_melanin.reshape(-1)
+        self._seen, self._mean, self._reference = seen, mean, reference
+        self.good: BoolArray = np.asarray(seen.usable & np.isfinite(melanin))
+        ends = np.array([table.c_m_max, table.c_hd_max])
+        begin = _fractions(np.stack([melanin, found.hemoglobin.reshape(-1)], axis=-1), ends)
+        # dm = 3 end a^2 da
+        stderr = stderr / (3.0 * ends[0] * np.maximum(begin[:, 0], MIN_AXIS_FRACTION) ** 2)
+        self._fixed = (
+            np.ascontiguousarray(begin, np.float32),
+            np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32),
+            np.ascontiguousarray(without_brightness(common)),
+            owns,
+            np.ascontiguousarray(table.cells, np.float64),
+            float(ends[0]),
+            float(ends[1]),
         )
-    by_face = known(face=face)
-    if face is None or face_shape is None:
-        return by_face
-    alone = known()
-    spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
-    if len(face_shape) == 2:
-        dark = dark_spots.is_locally_dark(
-            rgb.reshape(*face_shape, 3), variance=variance.reshape(*face_shape, 3)
+
+    def __call__(
+        self, log_change: Float32Array, stiffness: Float32Array
+    ) -> tuple[Float32Array, dict[str, Float32Array]]:
+        """Return maps of pixels (1, n), and those of states (S, n) by name.
+
+        Parameters
+        ----------
+        log_change, stiffness
+            (S, n): log light of each state, up to a factor, and one over its variance; 0: free.
+        """
+        states, pixels = self.good.shape
+        of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
+        of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
+        kernels.blood_of_states(
+            self._seen.log_rgb,
+            self._seen.relative,
+            self.good,
+            self._mean,
+            log_change,
+            stiffness,
+            *self._fixed,
+            self._reference,
+            of_pixels,
+            of_states,
+            _TASK_PIXELS,
         )
-        spots |= dark.reshape(-1)
-    return dark_spots.average_hypotheses(by_face, alone, spots)
+        return of_pixels, dict(zip(kernels.STATE_MAPS, of_states, strict=True))
 
 
 def _model_errors(
@@ -340,17 +353,15 @@ def _own_errors(
     return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
 
 
-def _with_mean_of(
-    owns: Float64Array, relative: Float32Array, usable: BoolArray, common: Float64Array
-) -> Float64Array:
+def _with_mean_of(owns: Float64Array, seen: _States, common: Float64Array) -> Float64Array:
     """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
     if owns.shape[1] == 1:
         own = np.zeros((3, 3))
         own[_UPPER_TRIANGLE] = owns[0, 0]
-        most = max(int(usable.sum(axis=0).max(initial=0)), 1)
+        most = max(int(seen.usable.sum(axis=0).max(initial=0)), 1)
         return np.asarray((common if len(common) > 1 else common[0]) + own / most)
     # each state's part in the mean, as `shared_melanin_kernels.mean_color` takes it
-    share = usable / (relative.sum(axis=-1) + owns[..., [0, 3, 5]].sum(axis=-1))
+    share = seen.usable / (seen.relative.sum(axis=-1) + owns[..., [0, 3, 5]].sum(axis=-1))
     share /= np.maximum(share.sum(axis=0), 1e-300)
     mean = (np.square(share)[..., None] * owns).sum(axis=0)
     whole = np.empty((len(mean), 3, 3))
@@ -360,31 +371,26 @@ def _with_mean_of(
 
 
 def _mean_color(
-    log_rgb: Float32Array,
-    relative: Float32Array,
-    usable: BoolArray,
-    table: ColorTable,
-    cells: Float64Array,
-    owns: Float64Array,
+    seen: _States, table: ColorTable, owns: Float64Array
 ) -> tuple[Float32Array, Float32Array]:
     """Return the states' mean log color, as of skin with their mean blood, and its variance."""
-    count = np.maximum(usable.sum(axis=0), 1)[:, None]
-    keep = usable[..., None]
-    plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count
-    noise = np.where(keep, relative, 0.0).sum(axis=0) / count**2
-    seen: BoolArray = np.asarray(usable.any(axis=0))
-    rgb = np.where(seen[:, None], np.exp(plain), np.nan).astype(np.float32)
+    count = np.maximum(seen.usable.sum(axis=0), 1)[:, None]
+    keep = seen.usable[..., None]
+    plain = np.where(keep, seen.log_rgb, 0.0).sum(axis=0) / count
+    noise = np.where(keep, seen.relative, 0.0).sum(axis=0) / count**2
+    known = np.asarray(seen.usable.any(axis=0))[:, None]
+    rgb = np.where(known, np.exp(plain), np.nan).astype(np.float32)
     first = invert(rgb, table, variance=noise * rgb**2)
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
-    mean, variance = np.empty_like(plain, np.float32), np.empty_like(plain, np.float32)
+    mean, variance = np.empty((2, *plain.shape), np.float32)
     kernels.mean_color(
-        log_rgb,
-        relative,
-        np.ascontiguousarray(usable),
+        seen.log_rgb,
+        seen.relative,
+        seen.usable,
         begin.astype(np.float32),
         owns,
-        cells,
+        np.ascontiguousarray(table.cells, np.float64),
         mean,
         variance,
         _TASK_PIXELS,
@@ -396,35 +402,3 @@ def _fractions(values: Float32Array, ends: Float64Array) -> Float64Array:
     """Return volume fractions as fractions of the table's axes; NaN as a tenth of the ends."""
     known = np.where(np.isfinite(values), values, 0.001 * ends)
     return np.asarray(np.clip(np.cbrt(known / ends), MIN_AXIS_FRACTION, 1.0), np.float64)
-
-
-def _usable(colors: Float32Array, valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    good = np.isfinite(colors).all(axis=-1)
-    with np.errstate(invalid="ignore"):
-        good &= (colors > 0.0).all(axis=-1)
-    if valid is None:
-        return np.asarray(good)
-    given = np.asarray(valid)
-    if given.dtype != np.bool_ or given.shape != shape:
-        raise ChromophoreError(
-            f"valid: expected bool of shape {shape}, got {given.dtype} of {given.shape}"
-        )
-    return np.asarray(good & given.reshape(good.shape))
-
-
-def _relative_variance(
-    colors: Float32Array, variance: ArrayLike | None, shape: tuple[int, ...], usable: BoolArray
-) -> Float32Array:
-    if variance is None:
-        return np.full(colors.shape, DEFAULT_RELATIVE_NOISE**2, np.float32)
-    values = np.asarray(variance, np.float32)
-    try:
-        values = np.broadcast_to(values, shape).reshape(colors.shape)
-    except ValueError as error:
-        raise ChromophoreError(
-            f"variance: expected a shape that broadcasts to {shape}, got {values.shape}"
-        ) from error
-    with np.errstate(invalid="ignore"):
-        if (values[usable] < 0.0).any():
-            raise ChromophoreError("variance: got a negative one")
-    return (values / np.square(np.where(usable[..., None], colors, 1.0))).astype(np.float32)

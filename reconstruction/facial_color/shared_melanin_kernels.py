@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, types, void
+from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.compiled import CONTRACT, OVER_PIXELS, given
 
 MAX_SHARED_STEPS = 12
 MAX_BLOOD_STEP = 0.15
@@ -29,11 +30,10 @@ STATE_MAPS = (
     "log_shading_variance",
 )
 
-_FAST_MATH = {"contract"}
 _MIN_AXIS_FRACTION = float(MIN_AXIS_FRACTION)
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
     """Write log color and its derivatives by the axes' fractions: out (3 of value, a, b; 3)."""
     last = cells.shape[0]
@@ -53,7 +53,7 @@ def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
         out[2, c] = v_y * last / v
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     """Write the inverse of each + model + brightness / stiffness, (3, 3), to `w`.
 
@@ -81,7 +81,7 @@ def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     return t0 / total, t1 / total, t2 / total
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _times(w, g):  # type: ignore[no-untyped-def]
     """Return W g."""
     return (
@@ -91,7 +91,7 @@ def _times(w, g):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     """Return p' (each + common brightness) q; `each` is symmetric, (3, 3)."""
     return (
@@ -105,7 +105,7 @@ def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
     """Write a state's own covariance to `each`, (3, 3): noise and the triangle of its own error."""
     each[0, 0] = variance[0] + own[0]
@@ -116,12 +116,12 @@ def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
     each[1, 2] = each[2, 1] = own[4]
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _dot(p, q):  # type: ignore[no-untyped-def]
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@njit(fastmath=_FAST_MATH)
+@njit(fastmath=CONTRACT)
 def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
     """Return the blood, as a fraction of its axis, that fits a log color under a melanin.
 
@@ -155,29 +155,19 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
     return b
 
 
-def _given(dtype: types.Type, axes: int) -> types.Array:
-    """Return the type of a contiguous argument that is only read, and may be read-only."""
-    return types.Array(dtype, axes, "C", readonly=True)
-
-
 @njit(
     void(
-        _given(float32, 3),  # log rgb (s, n, 3)
-        _given(float32, 3),  # relative variance (s, n, 3)
-        _given(boolean, 2),  # usable (s, n)
-        _given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        _given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
-        _given(float64, 5),  # cells of the color table
+        given(float32, 3),  # log rgb (s, n, 3)
+        given(float32, 3),  # relative variance (s, n, 3)
+        given(boolean, 2),  # usable (s, n)
+        given(float32, 2),  # where to begin: fractions of the axes (n, 2)
+        given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
+        given(float64, 5),  # cells of the color table
         float32[:, ::1],  # mean log color as of skin with the mean blood (n, 3)
         float32[:, ::1],  # its relative variance, noise alone (n, 3)
         int64,  # pixels a task
     ),
-    parallel=True,
-    fastmath=_FAST_MATH,
-    cache=True,
-    nogil=True,
-    boundscheck=False,
-    error_model="numpy",
+    **OVER_PIXELS,
 )
 def mean_color(  # type: ignore[no-untyped-def]
     log_rgb, variance, usable, begin, owns, cells, mean, mean_variance, block
@@ -228,17 +218,17 @@ def mean_color(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        _given(float32, 3),  # log rgb (s, n, 3)
-        _given(float32, 3),  # relative variance (s, n, 3)
-        _given(boolean, 2),  # usable (s, n)
-        _given(float32, 2),  # mean log color (n, 3), as of `mean_color`
-        _given(float32, 2),  # log shading of each state, up to a factor (s, n)
-        _given(float32, 2),  # one over its variance (s, n); 0 everywhere: free
-        _given(float32, 2),  # melanin and where blood begins: fractions of the axes (n, 2)
-        _given(float32, 1),  # standard error of melanin, as a fraction of its axis (n,)
-        _given(float64, 3),  # covariance of the model error common to the states (n or 1, 3, 3)
-        _given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
-        _given(float64, 5),  # cells of the color table
+        given(float32, 3),  # log rgb (s, n, 3)
+        given(float32, 3),  # relative variance (s, n, 3)
+        given(boolean, 2),  # usable (s, n)
+        given(float32, 2),  # mean log color (n, 3), as of `mean_color`
+        given(float32, 2),  # log shading of each state, up to a factor (s, n)
+        given(float32, 2),  # one over its variance (s, n); 0 everywhere: free
+        given(float32, 2),  # melanin and where blood begins: fractions of the axes (n, 2)
+        given(float32, 1),  # standard error of melanin, as a fraction of its axis (n,)
+        given(float64, 3),  # covariance of the model error common to the states (n or 1, 3, 3)
+        given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
+        given(float64, 5),  # cells of the color table
         float64,  # end of the axis of melanin as a volume fraction
         float64,  # end of the axis of blood as a volume fraction
         int64,  # state that changes are taken from
@@ -246,12 +236,7 @@ def mean_color(  # type: ignore[no-untyped-def]
         float32[:, :, ::1],  # maps of the states (8, s, n): see STATE_MAPS
         int64,  # pixels a task
     ),
-    parallel=True,
-    fastmath=_FAST_MATH,
-    cache=True,
-    nogil=True,
-    boundscheck=False,
-    error_model="numpy",
+    **OVER_PIXELS,
 )
 def blood_of_states(  # type: ignore[no-untyped-def]
     log_rgb,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -45,14 +45,32 @@ class Stage:
     refused: str = ""
 
 
-class Cache(Protocol):
-    """Keeps products between runs, by the hash of everything they depend on."""
+def stage_maker(base: Mapping[str, Any]) -> Callable[..., Stage]:
+    """Return what makes the stages of one graph, whose parameters begin with those of ``base``.
 
-    def load(self, key: str) -> Mapping[str, Any] | None:
-        """Return the products kept under ``key``, all of them or some, or None."""
+    It takes a stage's name, its needs and what it makes as names parted by spaces, and what runs
+    it; then why it is refused, and more parameters by name. What makes a single product returns
+    that, what makes several a mapping.
 
-    def save(self, key: str, products: Mapping[str, Any]) -> None:
-        """Keep ``products`` under ``key``."""
+    Examples
+    --------
+    >>> stage = stage_maker({"revision": 1})("double", "x", "y", lambda x: 2 * x, gain=2)
+    >>> stage.run(x=3), stage.parameters
+    ({'y': 6}, {'revision': 1, 'gain': 2})
+    """
+
+    def stage(
+        name: str, needs: str, makes: str, run: Callable[..., Any], refused: str = "", **more: Any
+    ) -> Stage:
+        products = tuple(makes.split())
+
+        def made(**needed: Any) -> Mapping[str, Any]:
+            found: Any = run(**needed)
+            return found if len(products) > 1 else {products[0]: found}
+
+        return Stage(name, tuple(needs.split()), products, made, {**base, **more}, refused)
+
+    return stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +88,7 @@ class Outcome:
     assumed: tuple[str, ...] = ()
     """What was taken for granted for want of a calibration."""
     work: tuple[Mapping[str, str], ...] = ()
-    """What became of each stage and why, see `reconstruction.pipeline.record.record`."""
+    """What became of each stage and why, see `record`."""
 
 
 def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
@@ -129,19 +147,28 @@ def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
     return ordered
 
 
-def input_hash(stage: Stage, keys_of_inputs: Sequence[str]) -> str:
-    """Return the hash of all that a stage's products depend on."""
-    text = json.dumps(
-        [stage.name, stage.makes, list(keys_of_inputs), dict(stage.parameters)], sort_keys=True
-    )
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+def input_hashes(ordered: Iterable[Stage]) -> dict[str, str]:
+    """Return the hash of all that a stage's products depend on, by the name of the stage.
+
+    Parameters
+    ----------
+    ordered
+        As `order` returns them.
+    """
+    made_by = {product: stage.name for stage in ordered for product in stage.makes}
+    keys: dict[str, str] = {}
+    for stage in ordered:
+        needed = [keys[made_by[product]] for product in stage.needs]
+        text = json.dumps([stage.name, stage.makes, needed, dict(stage.parameters)], sort_keys=True)
+        keys[stage.name] = hashlib.sha256(text.encode("utf-8")).hexdigest()
+    return keys
 
 
 def run(
     stages: Sequence[Stage],
     want: Sequence[str],
     *,
-    cache: Cache | None = None,
+    cache: MutableMapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Outcome:
     """Compute the wanted products and nothing else.
@@ -156,7 +183,8 @@ def run(
     want
         Names of products, in any order.
     cache
-        Where products are kept between runs; None keeps nothing.
+        Products kept from earlier runs, by the input hash of their stage: all of a stage or some.
+        What is made is added.
     progress
         Called with a line of text before each stage that runs.
 
@@ -166,12 +194,10 @@ def run(
     """
     needed = order(stages, want)
     made_by = {product: stage for stage in needed for product in stage.makes}
-    keys: dict[str, str] = {}
-    for stage in needed:
-        keys[stage.name] = input_hash(stage, [keys[made_by[p].name] for p in stage.needs])
+    keys = input_hashes(needed)
+    cache = {} if cache is None else cache
     for stage in needed:  # before anything is computed in vain
-        kept = cache.load(keys[stage.name]) if cache is not None else None
-        if stage.refused and kept is None:
+        if stage.refused and keys[stage.name] not in cache:
             raise StageError(stage.refused)
     products: dict[str, Any] = {}
     ran: list[str] = []
@@ -181,8 +207,8 @@ def run(
         if product in products:
             return
         stage = made_by[product]
-        kept = cache.load(keys[stage.name]) if cache is not None else None
-        if kept is not None and product in kept:
+        kept = cache.get(keys[stage.name], {})
+        if product in kept:
             products.update({name: kept[name] for name in kept if name not in products})
             if stage.name not in reused:
                 reused.append(stage.name)
@@ -200,26 +226,76 @@ def run(
         ran.append(stage.name)
         if stage.name in reused:  # its maps were at hand, but not what only other stages need
             reused.remove(stage.name)
-        if cache is not None:
-            cache.save(keys[stage.name], made)
+        cache[keys[stage.name]] = made
 
     for product in want:
         provide(product)
-    left_out = [
-        (stage.name, "nothing wanted depends on it") for stage in stages if stage not in needed
-    ]
-    left_out += [
-        (stage.name, "what depends on it was reused")
-        for stage in needed
-        if stage.name not in ran and stage.name not in reused
-    ]
-    return Outcome(
-        products={product: products[product] for product in want},
-        ran=tuple(ran),
-        reused=tuple(reused),
-        left_out=tuple(left_out),
-        keys=keys,
-    )
+    left_out = [(s.name, "nothing wanted depends on it") for s in stages if s not in needed]
+    idle = [s.name for s in needed if s.name not in ran and s.name not in reused]
+    left_out += [(name, "what depends on it was reused") for name in idle]
+    wanted = {product: products[product] for product in want}
+    return Outcome(wanted, tuple(ran), tuple(reused), tuple(left_out), keys)
+
+
+def record(
+    graph: Sequence[Stage], outcome: Outcome, before: Mapping[str, str]
+) -> tuple[dict[str, str], ...]:
+    """Return what a run did, stage by stage in the order of the graph.
+
+    Parameters
+    ----------
+    graph
+        All stages.
+    outcome
+        What a run of it did.
+    before
+        Input hash of each stage of the run before, by name; empty: there was none.
+
+    Returns
+    -------
+    tuple of dict
+        ``stage``; ``done``: "run", "reused" or "skipped"; ``why``; ``inputs``: the hash of all that
+        the stage's products depend on, empty where nothing needed it.
+
+    Examples
+    --------
+    >>> a = Stage("a", (), ("x",), dict)
+    >>> outcome = Outcome({}, ("a",), (), (), {"a": "12"})
+    >>> record([a], outcome, {"a": "34"})[0]["why"]
+    'its inputs have changed'
+    """
+    skipped = dict(outcome.left_out)
+    return tuple(_entry(stage.name, outcome, before, skipped) for stage in graph)
+
+
+def _entry(
+    name: str, outcome: Outcome, before: Mapping[str, str], skipped: Mapping[str, str]
+) -> dict[str, str]:
+    key = outcome.keys.get(name, "")
+    if name in outcome.reused:
+        done, why = "reused", "its inputs are the same"
+    elif name in outcome.ran:
+        done = "run"
+        if name not in before:
+            why = "it was not made before"
+        elif before[name] != key:
+            why = "its inputs have changed"
+        else:
+            why = "what it made is not kept, or not all of it"
+    else:
+        done, why = "skipped", skipped.get(name, "nothing wanted depends on it")
+    return {"stage": name, "done": done, "why": why, "inputs": key}
+
+
+def attributes_of(record: Any, names: str) -> dict[str, Any]:
+    """Return attributes of a record by their names, which are parted by spaces.
+
+    Examples
+    --------
+    >>> attributes_of(3 + 4j, "real imag")
+    {'real': 3.0, 'imag': 4.0}
+    """
+    return {name: getattr(record, name) for name in names.split()}
 
 
 def document_bytes(document: Mapping[str, Any]) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals, light_check
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
+from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
@@ -62,34 +64,15 @@ class Lights:
     alive: BoolArray
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session with a light list can go through; see `stages.run`."""
-    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    stage = inputs.stage_maker(STAGE_REVISION)
+    known = "stack lights normals gray_albedo"
     return [
-        stages.Stage("stack", (), ("stack",), lambda: {"stack": _stack(evidence.session)}, base),
-        stages.Stage(
-            "lights",
-            ("stack",),
-            ("lights",),
-            lambda stack: {"lights": _lights(evidence, stack)},
-            base,
-        ),
-        stages.Stage(
-            "normals",
-            ("stack", "lights"),
-            ("normals", "residual", "gray_albedo"),
-            lambda stack, lights: _normals(evidence, stack, lights),
-            base,
-        ),
-        stages.Stage(
-            "albedo",
-            ("stack", "lights", "normals", "gray_albedo"),
-            ("albedo",),
-            lambda stack, lights, normals, gray_albedo: _albedo(
-                evidence.session, stack, lights, normals, gray_albedo
-            ),
-            base,
-        ),
+        stage("stack", "", "stack", partial(_stack, inputs.session)),
+        stage("lights", "stack", "lights", partial(_lights, inputs)),
+        stage("normals", "stack lights", "normals residual gray_albedo", partial(_normals, inputs)),
+        stage("albedo", known, "albedo", partial(_albedo, inputs.session)),
     ]
 
 
@@ -106,7 +89,7 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
 def _stack(session: Session) -> Stack:
     records = tuple(session.frames("olat"))
     if len(records) < 3:
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: has {len(records)} frames under a light each, expected 3"
         )
     exposures = [
@@ -121,20 +104,18 @@ def _stack(session: Session) -> Stack:
     if strength is not None:
         level = np.asarray(strength, np.float64)
         gain /= level / level.mean()
-    gray: Any = None
-    usable: Any = None
     folder: Any = None
     for number, record in enumerate(records):
         values, good = _linear(session.read(record))
-        if gray is None:
+        if number == 0:
             shape = (len(records), *good.shape)
-            if 4 * int(np.prod(shape)) > MEMORY_BYTES:
+            gray: Any = np.empty(shape, np.float32)
+            usable: Any = np.empty(shape, bool)
+            if gray.nbytes > MEMORY_BYTES:
                 folder = tempfile.TemporaryDirectory(prefix="skinrig-")
                 at = Path(folder.name)
                 gray = np.memmap(at / "gray", np.float32, "w+", shape=shape)
                 usable = np.memmap(at / "usable", np.bool_, "w+", shape=shape)
-            else:
-                gray, usable = np.empty(shape, np.float32), np.empty(shape, bool)
         factor = gain[number, : values.shape[2]].astype(np.float32)
         gray[number] = (values * factor).mean(axis=-1)
         usable[number] = good
@@ -145,17 +126,17 @@ def _stack(session: Session) -> Stack:
         data = np.frombuffer(session.attachment("mask.png"), np.uint8)
         mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape != inside.shape:
-            raise EvidenceError(f"{session.path}: its mask does not fit its pictures")
+            raise InputsError(f"{session.path}: its mask does not fit its pictures")
         inside = np.asarray(mask > 127)
     return Stack(gray, usable, inside, records, gain, folder)
 
 
-def _lights(evidence: Evidence, stack: Stack) -> Lights:
+def _lights(inputs: Inputs, stack: Stack) -> Lights:
     """Take the list's lights if the shading agrees, else the order that it agrees with."""
-    session = evidence.session
+    session = inputs.session
     listed = session.manifest.extra["light_list"]
     if not isinstance(listed, dict):
-        raise EvidenceError(f"{session.path}: its light list is no table")
+        raise InputsError(f"{session.path}: its light list is no table")
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )
@@ -168,33 +149,33 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
             stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
         )
     except PhotometricStereoError as error:
-        evidence.assumed.append(f"the lights belong to their pictures ({error})")
+        inputs.assumed.append(f"the lights belong to their pictures ({error})")
         return Lights(vectors, near, scale, alive)
     best = f"{100 * min(found.misfit.values()):.1f} %"
     as_listed = f"{100 * found.misfit['as listed']:.1f} %"
     if found.order == "unknown":
-        evidence.assumed.append(
+        inputs.assumed.append(
             "the light list is right, though no order of it explains the shading"
             f" (misfit {as_listed}): the object shines, or these are not its lights"
         )
     elif found.order != "as listed":
         vectors = vectors[found.permutation]
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"the light list is {found.order}: the shading's misfit is {as_listed} as listed and"
             f" {best} so; it was used so"
         )
     alive = ~found.dead
     for number in np.flatnonzero(found.dead):
-        evidence.assumed.append(f"light {number + 1} of the list gave no light and is left out")
+        inputs.assumed.append(f"light {number + 1} of the list gave no light and is left out")
     off = np.flatnonzero(alive & (np.abs(found.strength - 1) > MAX_STRENGTH_DEVIATION))
     if off.size and found.order != "unknown":
         worst = off[np.argmax(np.abs(found.strength[off] - 1))]
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"lights are of one strength, though {off.size} differ by more than "
             f"{MAX_STRENGTH_DEVIATION:.0%}, most"
             f" light {worst + 1} with {found.strength[worst]:.2f} of the middle one"
         )
-    evidence.noted["light_check"] = {
+    inputs.noted["light_check"] = {
         "order": found.order,
         "misfit": {name: round(value, 5) for name, value in found.misfit.items()},
         "dead": [int(k) for k in np.flatnonzero(found.dead)],
@@ -237,13 +218,13 @@ def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
     return float(np.median(curl[inner])) if inner.any() else float("inf")
 
 
-def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, Any]:
+def _normals(inputs: Inputs, stack: Stack, lights: Lights) -> Mapping[str, Any]:
     """Estimate normals both ways and keep those that are more of a surface's."""
     found = {robust: _estimate(stack, lights, robust=robust) for robust in (True, False)}
     both = found[True].valid & found[False].valid
     curl = {robust: _roughness_of_field(maps, both) for robust, maps in found.items()}
     robust = curl[True] <= curl[False]
-    evidence.noted["normals"] = {
+    inputs.noted["normals"] = {
         "estimator": "robust" if robust else "least squares weighted by intensity",
         "median_curl": {"robust": curl[True], "weighted": curl[False]},
     }
@@ -252,25 +233,19 @@ def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, A
     n = np.where(valid[..., None], best.normals, 0.0)
     # isotropic across the normal: each component has its share of the angle's error
     each = best.stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
-    relative = np.where(valid, best.residual / np.where(valid, best.albedo, 1.0), 0.0)
+    relative = best.residual / np.where(valid, best.albedo, 1.0)
+    frame = "picture frame: x right, y up, z towards the camera"
+    misfit = "root mean square misfit over albedo"
     return {
-        "normals": SkinMap(
-            n,
-            MAP_UNITS["normals"],
-            np.where(valid[..., None], each, 0.0),
-            valid,
-            "picture frame: x right, y up, z towards the camera",
-        ),
-        "residual": SkinMap(
-            relative, MAP_UNITS["residual"], None, valid, "root mean square misfit over albedo"
-        ),
+        "normals": masked_map(n, each, valid, MAP_UNITS["normals"], frame),
+        "residual": masked_map(relative, None, valid, MAP_UNITS["residual"], misfit),
         "gray_albedo": best,
     }
 
 
 def _albedo(
     session: Session, stack: Stack, lights: Lights, normals: SkinMap, gray_albedo: NormalMaps
-) -> Mapping[str, SkinMap]:
+) -> SkinMap:
     """Fit each channel's albedo to the samples that agree with the gray fit."""
     n, gray = normals.values, gray_albedo
     above = np.zeros((), np.float64)
@@ -296,18 +271,10 @@ def _albedo(
         below += weight * shading
     valid = gray.valid & (below > 0)
     albedo = above / np.where(valid, below, 1.0)[..., None]
-    albedo = np.where(valid[..., None], albedo, 0.0)
     channels = albedo.shape[2]
     error = np.minimum(gray.stderr_albedo, gray.albedo) * np.sqrt(channels)
-    errors = np.broadcast_to(np.where(valid, error, 0.0)[..., None], albedo.shape)
+    errors = np.broadcast_to(error[..., None], albedo.shape)
     if channels == 1:
         albedo, errors = albedo[..., 0], errors[..., 0]
-    return {
-        "albedo": SkinMap(
-            albedo.astype(np.float32),
-            "1",
-            np.ascontiguousarray(errors, np.float32),
-            valid,
-            "over what the lights give a white surface, up to one factor",
-        )
-    }
+    what = "over what the lights give a white surface, up to one factor"
+    return masked_map(albedo, errors, valid, "1", what)

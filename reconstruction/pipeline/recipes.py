@@ -7,15 +7,12 @@ from dataclasses import dataclass, replace
 from datetime import date
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline import record as stage_record
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
-from reconstruction.pipeline.hold_out import HoldOut
+from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +21,7 @@ class Recipe:
 
     maps: tuple[str, ...]
     """Names of the maps."""
-    graph: Callable[[Evidence], list[stages.Stage]]
+    graph: Callable[[Inputs], list[stages.Stage]]
     files: tuple[str, ...] = ()
     """Names of what is no map and goes along: meshes, tables."""
     always: tuple[str, ...] = ()
@@ -92,7 +89,7 @@ def recipe_of(session: Session) -> Recipe:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When no step of its plan shows a subject.
     """
     if "light_list" in session.manifest.extra:
@@ -101,7 +98,7 @@ def recipe_of(session: Session) -> Recipe:
     for kind, recipe in RECIPE_OF_STEP.items():
         if kind in kinds:
             return recipe()
-    raise EvidenceError(
+    raise InputsError(
         f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
         f"{' or '.join(RECIPE_OF_STEP)}; `skinrig calibrate` takes sessions of targets"
     )
@@ -115,11 +112,8 @@ def reconstruct(
     calibration: str | Path | None = None,
     state: str = "neutral",
     on_date: date | None = None,
-    scan: str | Path | None = None,
-    basis: str | Path | None = None,
     landmarks: str | Path | None = None,
-    hold_out: HoldOut | str | None = None,
-    rank: int | None = None,
+    dome: DomeOptions | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.Outcome:
@@ -140,19 +134,11 @@ def reconstruct(
         Which state of the subject.
     on_date
         The date the calibrations must be valid on; None: that of the session.
-    scan
-        A mesh of the face, PLY in mm, instead of the one that a dome session holds.
-    basis
-        Folder of MERL ``.binary`` tables that surface lobes are fitted with, instead of the
-        generated dielectrics.
     landmarks
         Table "name,x,y" of places on a probe's translucency map, pixels from its top left; None:
         forehead, cheek and chin of the simulated heads' texture.
-    hold_out
-        Lights and views of a dome session whose frames no fit sees, as
-        "lights=L007,L023,views=C03" or as parsed; what `skinrig render --against` compares with.
-    rank
-        Lobes that a dome's points share, 1 to 59; None: 4.
+    dome
+        What only sessions of the dome take; None: nothing of it.
     truth
         Name of the TRUTH/ folder beside ``out``, for the report.
     progress
@@ -165,37 +151,33 @@ def reconstruct(
 
     Raises
     ------
-    EvidenceError, stages.StageError, SessionError, CalibrationError
+    InputsError, stages.StageError, SessionError, CalibrationError
         When frames are missing, a wanted map is unknown, or a file is damaged, of another rig
         or out of date.
     """
     opened = Session.open(session)
     recipe = recipe_of(opened)
     store.require_free(out)
-    dome_options = {"hold-out": hold_out, "rank": rank, "scan": scan, "basis": basis}
-    _require_fitting_options(opened, recipe, dome_options)
-    _require_files({"scan": scan, "landmarks": landmarks})
-    recipe = _recipe_of_rank(recipe, rank)
+    options = dome or DomeOptions()
+    _require_fitting_options(opened, recipe, options)
+    for name, file in {"scan": options.scan, "landmarks": landmarks}.items():
+        if file is not None and not Path(file).is_file():
+            raise InputsError(f"{name}: {file} is no file")
+    if options.rank is not None and recipe.maps_of_rank is not None:
+        recipe = replace(recipe, maps=recipe.maps_of_rank(options.rank))
     _require_known(want, recipe.maps)
-    evidence = Evidence.of(
-        opened,
-        calibration,
-        state=state,
-        on_date=on_date,
-        scan=scan,
-        basis=basis,
-        landmarks=landmarks,
+    inputs = Inputs.of(
+        opened, calibration, state=state, on_date=on_date, landmarks=landmarks, dome=options
     )
-    evidence.progress = progress
-    evidence.rank = rank
-    if hold_out is not None:
-        evidence.hold_out = HoldOut.parse(hold_out) if isinstance(hold_out, str) else hold_out
-    graph = recipe.graph(evidence)
+    inputs.progress = progress
+    graph = recipe.graph(inputs)
     products = _planned_products(graph, recipe, opened, want)
     previous = _Previous.of(Path(out))
-    outcome = stages.run(graph, products, cache=_Kept(graph, previous), progress=progress)
-    work = stage_record.record(graph, outcome, previous.made_keys(graph))
-    outcome = replace(outcome, assumed=tuple(evidence.assumed), work=work)
+    held = previous.held(graph)
+    kept = {previous.keys[name]: contents for name, contents in held.items()}
+    outcome = stages.run(graph, products, cache=kept, progress=progress)
+    work = stages.record(graph, outcome, {name: previous.keys[name] for name in held})
+    outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
     # what the subject agreed to goes wherever the maps go
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
     current = previous.exists and previous.parameters.get("consent", []) == consent
@@ -208,43 +190,29 @@ def reconstruct(
         "truth": truth,
         "consent": consent,
     }
-    store.write(out, _appearance(evidence, graph, outcome, products, previous, parameters))
+    store.write(out, _appearance(inputs, graph, outcome, products, previous, parameters))
     return outcome
 
 
-def _require_fitting_options(
-    session: Session, recipe: Recipe, dome_options: Mapping[str, object]
-) -> None:
-    given = [name for name, value in dome_options.items() if value is not None]
+def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions) -> None:
+    options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
+    given = [name for name, value in options.items() if value is not None]
     if given and recipe.maps_of_rank is None:
-        raise EvidenceError(
+        raise InputsError(
             f"{', '.join(given)}: {session.path} is no session of the dome; leave out what only it "
             "takes"
         )
-
-
-def _require_files(files: Mapping[str, str | Path | None]) -> None:
-    for name, file in files.items():
-        if file is not None and not Path(file).is_file():
-            raise EvidenceError(f"{name}: {file} is no file")
-
-
-def _recipe_of_rank(recipe: Recipe, rank: int | None) -> Recipe:
-    """Return the recipe whose maps are those of a chosen number of lobes."""
-    if rank is not None and rank < 1:
-        raise EvidenceError(f"rank: got {rank}, expected 1 or more")
-    if rank is None or recipe.maps_of_rank is None:
-        return recipe
-    return replace(recipe, maps=recipe.maps_of_rank(rank))
+    if dome.rank is not None and dome.rank < 1:
+        raise InputsError(f"rank: got {dome.rank}, expected 1 or more")
 
 
 def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
     known = ", ".join(maps)
     if not want:
-        raise EvidenceError(f"want: got nothing, expected names out of {known}")
+        raise InputsError(f"want: got nothing, expected names out of {known}")
     unknown = [name for name in want if name not in maps]
     if unknown:
-        raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
+        raise InputsError(f"want: got {unknown[0]!r}, expected names out of {known}")
 
 
 def _planned_products(
@@ -266,7 +234,7 @@ def _planned_products(
 
 
 def _appearance(
-    evidence: Evidence,
+    inputs: Inputs,
     graph: Sequence[stages.Stage],
     outcome: stages.Outcome,
     products: Sequence[str],
@@ -274,34 +242,32 @@ def _appearance(
     parameters: Mapping[str, object],
 ) -> SkinAppearance:
     """Return what was made, with what an older folder holds that is still current."""
-    keys = _all_keys(graph)
+    keys = stages.input_hashes(stages.order(graph, [p for s in graph for p in s.makes]))
     kept = {name: outcome.products[name] for name in products}
-    for stage in graph:
-        if previous.keys.get(stage.name) == keys[stage.name]:
-            for name in stage.makes:
-                if name in previous.contents:
-                    kept.setdefault(name, previous.contents[name])
-    noted = dict(evidence.noted)
-    if previous.exists and previous.inputs == evidence.hashes:
+    for stage, held in previous.held(graph).items():
+        if previous.keys[stage] == keys[stage]:
+            kept |= {name: value for name, value in held.items() if name not in kept}
+    noted = dict(inputs.noted)
+    if previous.exists and previous.inputs == inputs.hashes:
         names = previous.parameters.get("noted", [])
-        for name in names if isinstance(names, list) else []:
-            noted.setdefault(str(name), previous.parameters.get(str(name)))
+        texts = [str(name) for name in names] if isinstance(names, list) else []
+        noted |= {n: previous.parameters.get(n) for n in texts if n not in noted}
     return SkinAppearance(
         maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
-        source=evidence.session.source,
+        source=inputs.session.source,
         parameters={
             **parameters,
             "stages": {stage.name: keys[stage.name] for stage in graph},
             "work": [dict(entry) for entry in outcome.work],
-            "assumed": evidence.assumed,
+            "assumed": inputs.assumed,
             "noted": sorted(noted),
             **noted,
         },
-        inputs=evidence.hashes,
+        inputs=inputs.hashes,
         versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
         left_out=outcome.left_out,
         files={name: value for name, value in kept.items() if isinstance(value, bytes)},
-        seed=evidence.session.seed,
+        seed=inputs.session.seed,
     )
 
 
@@ -324,7 +290,7 @@ class _Previous:
         try:
             found = store.read(out)
         except store.StoreError as error:
-            raise EvidenceError(
+            raise InputsError(
                 f"{error}; nothing was written: remove {out}, or name another, to make all anew"
             ) from error
         recorded = found.parameters.get("stages", {})
@@ -337,33 +303,10 @@ class _Previous:
             {str(name): str(key) for name, key in keys},
         )
 
-    def made_keys(self, graph: Sequence[stages.Stage]) -> dict[str, str]:
-        """Return the input hashes of the stages that the folder holds something of."""
-        made = {stage.name for stage in graph if any(name in self.contents for name in stage.makes)}
-        return {name: key for name, key in self.keys.items() if name in made}
-
-
-class _Kept:
-    """Finished maps in an older APPEARANCE/ folder, by the hash of their stage."""
-
-    def __init__(self, graph: Sequence[stages.Stage], previous: _Previous) -> None:
-        self._by_key: dict[str, Mapping[str, SkinMap | bytes]] = {}
-        for stage in graph:
-            contents = previous.contents
-            kept = {name: contents[name] for name in stage.makes if name in contents}
-            if stage.name in previous.keys and kept:
-                self._by_key[previous.keys[stage.name]] = kept
-
-    def load(self, key: str) -> Mapping[str, Any] | None:
-        return self._by_key.get(key)
-
-    def save(self, key: str, products: Mapping[str, Any]) -> None:
-        """Nothing: the finished folder is what is kept."""
-
-
-def _all_keys(graph: Sequence[stages.Stage]) -> dict[str, str]:
-    made_by = {product: stage.name for stage in graph for product in stage.makes}
-    keys: dict[str, str] = {}
-    for stage in stages.order(graph, [p for s in graph for p in s.makes]):
-        keys[stage.name] = stages.input_hash(stage, [keys[made_by[p]] for p in stage.needs])
-    return keys
+    def held(self, graph: Sequence[stages.Stage]) -> dict[str, Mapping[str, SkinMap | bytes]]:
+        """Return what the folder holds of each stage that it has the input hash of."""
+        of_stages = {
+            stage.name: {n: self.contents[n] for n in stage.makes if n in self.contents}
+            for stage in graph
+        }
+        return {name: held for name, held in of_stages.items() if held and name in self.keys}

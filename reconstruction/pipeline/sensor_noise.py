@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture import raw
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +23,11 @@ class SensorNoise:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             Where the frame has none.
         """
         if frame.noise_profile is None:
-            raise EvidenceError(
+            raise InputsError(
                 f"{frame.path}: does not say how noisy the sensor is; calibrate the sensor"
             )
         scale, offset = frame.noise_profile

@@ -13,16 +13,33 @@ doi:10.1364/JOSAA.14.000246.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+
+from reconstruction.arrays import Float64Array
 
 N_PARAMETERS = 4
 TABLE_MODEL = 1
 """The model is a table; anything else is a closed form."""
 _FAST_MATH = {"contract", "reassoc", "nsz"}
 _FOUR_PI = 4.0 * math.pi
+
+
+class Curves(NamedTuple):
+    """A forward model at fixed radii, as the kernels take it."""
+
+    kind: int
+    """`TABLE_MODEL` or a closed form."""
+    radius_mm: Float64Array
+    """(F,)"""
+    constants: Float64Array
+    """(4,) of the closed form."""
+    axes: Float64Array
+    """(3, 2) of the table: first node and spacing of each axis."""
+    grid: Float64Array
+    """(S, U, G, F) of the table."""
 
 
 @njit(inline="always")
@@ -150,12 +167,12 @@ def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-de
 
 
 @njit(error_model="numpy")
-def evaluate_one(kind, theta, radius, constants, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
+def evaluate_one(curves, theta, w, m, jac):  # type: ignore[no-untyped-def]
     """Fill one profile and its derivatives by all parameters."""
-    if kind == TABLE_MODEL:
-        _tabled(theta, radius, axes, grid, w, m, jac)
+    if curves.kind == TABLE_MODEL:
+        _tabled(theta, curves.radius_mm, curves.axes, curves.grid, w, m, jac)
     else:
-        _closed(theta, radius, constants, m, jac)
+        _closed(theta, curves.radius_mm, curves.constants, m, jac)
     jac[2, :] = m
 
 
@@ -204,10 +221,8 @@ def valleys(score: Any, valley: Any, place: Any, depth: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def evaluate(
-    kind: Any, theta: Any, radius: Any, constants: Any, axes: Any, grid: Any, out: Any, slopes: Any
-) -> None:
+def evaluate(curves: Any, theta: Any, out: Any, slopes: Any) -> None:
     """Fill profiles (N, F) of parameters (N, 4) and their derivatives (N, 4, F)."""
     w = np.zeros((6, 4))
     for n in range(theta.shape[0]):
-        evaluate_one(kind, theta[n], radius, constants, axes, grid, w, out[n], slopes[n])
+        evaluate_one(curves, theta[n], w, out[n], slopes[n])

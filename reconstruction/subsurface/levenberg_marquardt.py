@@ -11,11 +11,12 @@ Marquardt 1963, doi:10.1137/0111030.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
+from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.subsurface.kernels import decay, evaluate_one
 
 MAX_LOG_STEP = 1.5
@@ -24,6 +25,45 @@ LOG_STEP_TOL = 1e-5
 """A step of the logarithms after which the next would change nothing that matters."""
 _FAST_MATH = {"contract", "reassoc", "nsz"}
 _MIN_REFLECTANCE = 1e-290
+
+
+class Problem(NamedTuple):
+    """What is fitted and how."""
+
+    y: Float64Array
+    """(N, F): reflectance, or its logarithm where `logarithmic`."""
+    variance: Float64Array
+    """(N, F): of `y`; infinite where a fibre is left out."""
+    logarithmic: bool
+    """Compare logarithms; then the model's error is not added."""
+    prior: Float64Array
+    """(4, 2): mean and standard deviation; 0: fixed; infinite: free."""
+    model_error: Float64Array
+    """(3,), relative: everywhere; at the source, falling by exp(-r (sigma_a + sigma_s')); and times
+    sigma_a/sigma_s'."""
+    bounds: Float64Array
+    """(4, 2): least and greatest value of each parameter."""
+    rounds: int
+    """Times the model's error is taken anew."""
+    most: int
+    """Steps of a round at most."""
+
+
+class Found(NamedTuple):
+    """Where the results go."""
+
+    theta: Float64Array
+    """(N, 4): start; becomes the result."""
+    covariance: Float64Array
+    """(N, 4, 4), infinite where singular."""
+    chi2: Float64Array
+    """(N,), with the priors' part."""
+    predicted: Float64Array
+    """(N, F): the profile."""
+    total: Float64Array
+    """(N, F): its variance with the model's error."""
+    steps: Int64Array
+    """(N,): evaluations, negative: not converged."""
 
 
 @njit(error_model="numpy")
@@ -99,30 +139,11 @@ def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignor
 
 
 @njit(error_model="numpy")
-def _fit_share(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    kind,
-    radius,
-    constants,
-    axes,
-    grid,
-    y,
-    variance,
-    model_error,
-    logarithmic,
-    prior,
-    bounds,
-    theta,
-    rounds,
-    most,
-    covariance,
-    chi2,
-    predicted,
-    total,
-    steps,
-):
+def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-def]
     """Fit the profiles from `begin` to `end`; see `fit`."""
+    radius, y, logarithmic = curves.radius_mm, problem.y, problem.logarithmic
+    model_error, prior, bounds = problem.model_error, problem.prior, problem.bounds
+    theta, total = found.theta, found.total
     fibres = radius.size
     m, trial_m = np.empty(fibres), np.empty(fibres)
     jac, trial_jac = np.empty((4, fibres)), np.empty((4, fibres))
@@ -137,19 +158,19 @@ def _fit_share(  # type: ignore[no-untyped-def]
             count += 1
     for n in range(begin, end):
         now = theta[n]
-        evaluate_one(kind, now, radius, constants, axes, grid, w, m, jac)
+        evaluate_one(curves, now, w, m, jac)
         done = 1
         settled = False
         best = 0.0
         changing = not logarithmic and (
             model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
         )
-        for round_ in range(rounds):
+        for round_ in range(problem.rounds):
             close = max(LOG_STEP_TOL, 1e-2 * 0.01**round_) if changing else LOG_STEP_TOL
             extinction = math.exp(now[0]) + math.exp(now[1])
             base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
             for f in range(fibres):
-                v = variance[n, f]
+                v = problem.variance[n, f]
                 if not logarithmic and v < np.inf:
                     e = base
                     if model_error[1] > 0.0:
@@ -165,7 +186,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                 p = active[r]
                 best += ((now[p] - prior[p, 0]) / prior[p, 1]) ** 2
             fresh = True
-            for _ in range(most):
+            for _ in range(problem.most):
                 if fresh:
                     _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
                     free = 0
@@ -204,7 +225,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                 if longest < 1e-9:
                     settled = True
                     break
-                evaluate_one(kind, trial, radius, constants, axes, grid, w, trial_m, trial_jac)
+                evaluate_one(curves, trial, w, trial_m, trial_jac)
                 done += 1
                 there = _misfit(y[n], trial_m, weight, logarithmic)
                 for r in range(count):
@@ -232,103 +253,37 @@ def _fit_share(  # type: ignore[no-untyped-def]
                         break
             if not changing or (first and close <= LOG_STEP_TOL):
                 break
-        steps[n] = done if settled else -done
-        chi2[n] = best
-        predicted[n] = m
+        found.steps[n] = done if settled else -done
+        found.chi2[n] = best
+        found.predicted[n] = m
         if fresh:
             _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
             for r in range(count):
                 h[active[r], active[r]] += 1.0 / prior[active[r], 1] ** 2
-        covariance[n] = 0.0
+        found.covariance[n] = 0.0
         for r in range(count):
             unit[:] = 0.0
             unit[active[r]] = 1.0
             x[:] = 0.0
             if _solve(h, unit, active, count, 0.0, low, x):
-                covariance[n, active[r]] = x
+                found.covariance[n, active[r]] = x
             else:
-                covariance[n, active[r], :] = np.inf
+                found.covariance[n, active[r], :] = np.inf
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fit(
-    kind: Any,
-    radius: Any,
-    constants: Any,
-    axes: Any,
-    grid: Any,
-    y: Any,
-    variance: Any,
-    model_error: Any,
-    logarithmic: Any,
-    prior: Any,
-    bounds: Any,
-    theta: Any,
-    rounds: Any,
-    most: Any,
-    parts: Any,
-    covariance: Any,
-    chi2: Any,
-    predicted: Any,
-    total: Any,
-    steps: Any,
-) -> None:
-    """Fit every profile, from `theta` on.
+def fit(curves: Any, problem: Any, found: Any, parts: Any) -> None:
+    """Fit every profile, from `found.theta` on.
 
     Parameters
     ----------
-    kind : int
-        TABLE or a closed form.
-    radius : (F,)
-        mm.
-    constants : (4,)
-        Of the closed form.
-    axes : (3, 2); grid : (S, U, G, F)
-        Of the table.
-    y : (N, F)
-        Reflectance, or its logarithm where `logarithmic`.
-    variance : (N, F)
-        Of `y`; infinite where a fibre is left out.
-    model_error : (3,)
-        Relative: everywhere; at the source, falling by exp(-r (sigma_a + sigma_s')); and times
-        sigma_a/sigma_s'.
-    logarithmic : bool
-        Compare logarithms; then the model's error is not added.
-    prior : (4, 2)
-        Mean and standard deviation; 0: fixed; infinite: free.
-    bounds : (4, 2)
-        Least and greatest value of each parameter.
-    theta : (N, 4)
-        Start; becomes the result.
-    rounds, most, parts : int
-        Times the model's error is taken anew, steps of a round at most, shares of the profiles.
-    covariance : (N, 4, 4), chi2 : (N,), predicted, total : (N, F), steps : (N,)
-        Results: covariance of theta (infinite where singular); chi2 with the priors' part; the
-        profile; its variance with the model's error; evaluations, negative: not converged.
+    curves : Curves
+    problem : Problem
+    found : Found
+    parts : int
+        Shares of the profiles.
     """
-    profiles = y.shape[0]
+    profiles = problem.y.shape[0]
     for part in prange(parts):
         begin, end = part * profiles // parts, (part + 1) * profiles // parts
-        _fit_share(
-            begin,
-            end,
-            kind,
-            radius,
-            constants,
-            axes,
-            grid,
-            y,
-            variance,
-            model_error,
-            logarithmic,
-            prior,
-            bounds,
-            theta,
-            rounds,
-            most,
-            covariance,
-            chi2,
-            predicted,
-            total,
-            steps,
-        )
+        _fit_share(begin, end, curves, problem, found)

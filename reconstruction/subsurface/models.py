@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -82,11 +82,8 @@ class ProfileModel:
 
     Attributes
     ----------
-    radius_mm : ndarray, shape (F,)
-    kind : int
-        As `levenberg_marquardt.fit` takes it.
-    constants, axes, grid : ndarray
-        Likewise.
+    curves : Curves
+        As the kernels take it.
     bounds : ndarray, shape (4, 2)
         Of log sigma_a, log sigma_s', log of the common factor, g.
     error : ndarray, shape (3,)
@@ -97,30 +94,22 @@ class ProfileModel:
         Greatest sigma_a/sigma_s' that the model is good for.
     """
 
-    radius_mm: Float64Array
-    kind: int
-    constants: Float64Array
-    axes: Float64Array
-    grid: Float64Array
+    curves: kernels.Curves
     bounds: Float64Array
     error: Float64Array
     bias: tuple[float, float]
     max_ratio: float
 
+    @property
+    def radius_mm(self) -> Float64Array:
+        """Distances of the fibers from the source, (F,)."""
+        return self.curves.radius_mm
+
     def profiles(self, theta: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return profiles (N, F), 1/mm^2, of parameters (N, 4), and derivatives (N, 4, F)."""
         out = np.empty((theta.shape[0], self.radius_mm.size))
         slopes = np.zeros((theta.shape[0], kernels.N_PARAMETERS, self.radius_mm.size))
-        kernels.evaluate(
-            self.kind,
-            np.ascontiguousarray(theta),
-            self.radius_mm,
-            self.constants,
-            self.axes,
-            self.grid,
-            out,
-            slopes,
-        )
+        kernels.evaluate(self.curves, np.ascontiguousarray(theta), out, slopes)
         return out, slopes
 
     def contains(self, theta: Float64Array) -> BoolArray:
@@ -201,12 +190,8 @@ class ProfileModel:
                     np.divide(left**2, firm, out=left, where=firm > 0.0)
                     score -= left
             score += nowhere
-            kernels.valleys(
-                score.reshape(-1, log_s.size, log_k.size),
-                valley[:, part],
-                place[:, part],
-                depth[:, part],
-            )
+            score = score.reshape(-1, log_s.size, log_k.size)
+            kernels.valleys(score, valley[:, part], place[:, part], depth[:, part])
         ends = []
         for which, at in zip(valley, place, strict=True):
             start = np.zeros((which.size, kernels.N_PARAMETERS))
@@ -240,11 +225,7 @@ def profile_model(method: Method, radius_mm: Float64Array, optics: Optics) -> Pr
         return _tabled(radius_mm.tobytes(), optics)
     constants, error, bias = _CLOSED_FORM_MODELS[method](optics.eta)
     return ProfileModel(
-        radius_mm=radius_mm,
-        kind=0,
-        constants=constants,
-        axes=np.ones((3, 2)),
-        grid=np.zeros((1, 1, 1, 1)),
+        curves=kernels.Curves(0, radius_mm, constants, np.ones((3, 2)), np.zeros((1, 1, 1, 1))),
         bounds=_bounds(SIGMA_S_RANGE, (0.0, 1.0)),
         error=error,
         bias=bias,
@@ -278,17 +259,11 @@ def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
     decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
     a, s = a[..., None], s[..., None]
 
+    of_tissue: dict[str, Any] = {"eta": optics.eta, "collection": optics.collection}
+
     def log_table(r: Float64Array, g: float, cores_mm: tuple[float, float]) -> Float64Array:
-        profile = photon_table.reflectance(
-            r,
-            a,
-            s,
-            eta=optics.eta,
-            g=g,
-            collection=optics.collection,
-            core_mm=cores_mm[0],
-            source_core_mm=cores_mm[1],
-        )
+        cores: dict[str, Any] = {"core_mm": cores_mm[0], "source_core_mm": cores_mm[1]}
+        profile = photon_table.reflectance(r, a, s, g=g, **of_tissue, **cores)
         return np.asarray(np.log(np.maximum(profile, 1e-290)))
 
     points, cores_mm = (0.0, 0.0), (optics.core_mm, optics.source_core_mm)
@@ -298,12 +273,9 @@ def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
         r = np.where(radius_mm > 0.0, radius_mm, radius_mm.max(initial=1.0))
         beyond = _diffused(log_table(r, g, points), r, a, s, end, optics.eta)
         grid[:, :, n] = log_table(radius_mm, g, cores_mm) + beyond + decay
+    axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
     return ProfileModel(
-        radius_mm=radius_mm,
-        kind=kernels.TABLE_MODEL,
-        constants=np.zeros(4),
-        axes=np.stack([np.array([logs[0], roots[0], low]), steps], axis=1),
-        grid=grid,
+        curves=kernels.Curves(kernels.TABLE_MODEL, radius_mm, np.zeros(4), axes, grid),
         bounds=_bounds(TABLE_SIGMA_S_RANGE, (low, high)),
         error=TABLE_ERROR,
         bias=(0.0, 0.0),

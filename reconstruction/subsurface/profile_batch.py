@@ -174,45 +174,35 @@ def fit_from(
     variance
         To weight by in place of the batch's, (N, F).
     """
-    theta = start.copy()
     given = batch.y if y is None else y
     n, shape = len(given), given.shape
-    covariance, chi2, steps = np.empty((n, 4, 4)), np.empty(n), np.empty(n, np.int64)
-    predicted, total = np.empty(shape), np.empty(shape)
-    levenberg_marquardt.fit(
-        model.kind,
-        model.radius_mm,
-        model.constants,
-        model.axes,
-        model.grid,
+    found = levenberg_marquardt.Found(
+        start.copy(),
+        np.empty((n, 4, 4)),
+        np.empty(n),
+        np.empty(shape),
+        np.empty(shape),
+        np.empty(n, np.int64),
+    )
+    problem = levenberg_marquardt.Problem(
         given,
         batch.variance if variance is None else variance,
-        model.error,
         batch.logarithmic or y is not None,
         batch.prior,
+        model.error,
         model.bounds,
-        theta,
         MAX_WEIGHT_ROUNDS,
         MAX_ROUND_STEPS,
-        min(get_num_threads(), max(1, n // 64)),
-        covariance,
-        chi2,
-        predicted,
-        total,
-        steps,
     )
+    parts = min(get_num_threads(), max(1, n // 64))
+    levenberg_marquardt.fit(model.curves, problem, found, parts)
     return Fits(
-        theta=theta,
-        covariance=covariance,
-        chi2=chi2,
-        predicted=predicted,
-        total=total,
-        steps=steps,
+        **found._asdict(),
         used=batch.used,
         observed=batch.observed,
         outlier=np.zeros(shape, np.bool_),
         model_error=np.zeros(n),
-        in_domain=model.contains(theta),
-        at_bound=model.at_bound(theta),
-        bias=model.systematic(theta),
+        in_domain=model.contains(found.theta),
+        at_bound=model.at_bound(found.theta),
+        bias=model.systematic(found.theta),
     )

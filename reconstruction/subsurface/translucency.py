@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 from threadpoolctl import ThreadpoolController
 
-from model.translucency_population import TranslucencyPopulation, weyrich_2005
+from model.translucency_population import weyrich_2005
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 TEXTURE_MM: Final = (200.0, 330.0)
@@ -91,20 +91,12 @@ class TranslucencyPrior:
             raise TranslucencyError(f"length_mm: got {self.length_mm}, expected above 0, finite")
 
 
-def population_prior(
-    population: TranslucencyPopulation | None = None, *, length_mm: float = CORRELATION_LENGTH_MM
-) -> TranslucencyPrior:
-    """Return the prior of a person from a population.
+def population_prior() -> TranslucencyPrior:
+    """Return the prior of a person from table 2 of Weyrich et al. 2005.
 
     The level varies by the part of the variance that places have in common, the places by the
-    rest and by what their means differ. Variances are averaged over places.
-
-    Parameters
-    ----------
-    population : TranslucencyPopulation, optional
-        Table 2 of Weyrich et al. 2005 by default; its deviations hold the noise of measurement,
-        so that the prior is rather too wide.
-    length_mm : float
+    rest and by what their means differ. Variances are averaged over places. The table's deviations
+    hold the noise of measurement, so that the prior is rather too wide.
 
     Examples
     --------
@@ -114,20 +106,17 @@ def population_prior(
     >>> np.hypot(prior.person_deviation, prior.place_deviation).round(2).tolist()
     [0.29, 0.26, 0.21]
     """
-    people = weyrich_2005() if population is None else population
+    people = weyrich_2005()
     deviation, places = people.log_deviation, len(people.sites)
-    variance = (deviation**2).mean(axis=0)
+    squares = (deviation**2).sum(axis=0)
     # mean covariance of two different places
-    pairs = (deviation.sum(axis=0) ** 2 - (deviation**2).sum(axis=0)) / max(
-        places * (places - 1), 1
-    )
-    shared = max(people.site_correlation, 1e-6) * (pairs if places > 1 else variance)
-    between = people.log_mean.var(axis=0, ddof=1) if places > 1 else 0.0
+    pairs = (deviation.sum(axis=0) ** 2 - squares) / (places * (places - 1))
+    shared = max(people.site_correlation, 1e-6) * pairs
+    rest = (deviation**2).mean(axis=0) - shared
     return TranslucencyPrior(
         log_mean=-people.log_mean.mean(axis=0),
         person_deviation=np.sqrt(shared),
-        place_deviation=np.sqrt(variance - shared + between),
-        length_mm=length_mm,
+        place_deviation=np.sqrt(rest + people.log_mean.var(axis=0, ddof=1)),
         source=people.source,
     )
 
@@ -362,12 +351,8 @@ def _merged(
         dof = same.size - 1
         spread = max(1.0, chi2 / dof) if dof else 1.0
         if dof and stats.chi2.sf(chi2, dof) < CONFLICT_P_VALUE:
-            conflicts.append(
-                (
-                    labels[same[0]],
-                    f"{same.size} repeats differ by {math.sqrt(spread):.1f} times their errors",
-                )
-            )
+            times = f"{math.sqrt(spread):.1f} times their errors"
+            conflicts.append((labels[same[0]], f"{same.size} repeats differ by {times}"))
         at.append(at_mm[same].mean(axis=0))
         mean.append(center)
         variance.append(spread / weight.sum())
@@ -419,14 +404,11 @@ class _Posterior:
         level = self.log_mean + self.shared * self.pull.sum()
         left = total - self.shared**2 * self.inverse.sum()
         mean = _product(level, self.local * along * self.pull, across)
+        by_place = -2.0 * self.shared * self.local * along * self.inverse.sum(axis=0)
+        by_pair = -(self.local**2) * along[:, first] * along[:, second] * twice
         variance = _product(
             left,
-            np.column_stack(
-                [
-                    -2.0 * self.shared * self.local * along * self.inverse.sum(axis=0),
-                    -(self.local**2) * along[:, first] * along[:, second] * twice,
-                ]
-            ),
+            np.column_stack([by_place, by_pair]),
             np.column_stack([across, across[:, first] * across[:, second]]),
         )
         np.maximum(variance, MIN_RELATIVE_VARIANCE * total, out=variance)

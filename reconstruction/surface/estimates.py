@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,12 +15,9 @@ from reconstruction import brdf_basis, diffuse_albedo, photometric_stereo
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
-from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.photometric_stereo import half_vectors as half_vector_normals
 from reconstruction.surface import model_normals
 
-CHUNK_SAMPLES: Final = 3_000_000
-"""Samples of a chunk; about 60 bytes each."""
 MIN_LIGHTS: Final = 10
 MIN_VIEWS: Final = 2
 """A point lit or seen by fewer has no estimate."""
@@ -65,10 +61,15 @@ class PointValues:
     stderr: Float64Array
     valid: BoolArray
 
+    @staticmethod
+    def masked(values: FloatArray, stderr: FloatArray, valid: BoolArray) -> PointValues:
+        """Return estimates of which only those that are valid count, others are 0."""
+        keep = valid[:, None]
+        return PointValues(np.where(keep, values, 0.0), np.where(keep, stderr, 0.0), valid)
 
-def chunk_points(store: LumitexelStore) -> int:
-    """Return how many points of a store make a chunk."""
-    return max(1, CHUNK_SAMPLES // max(store.light_count * store.view_count, 1))
+    def __getitem__(self, rows: slice | NDArray[np.integer]) -> PointValues:
+        """Return the estimates of some of the points."""
+        return PointValues(self.values[rows], self.stderr[rows], self.valid[rows])
 
 
 def transmitted(cos_light: FloatArray, cos_view: FloatArray) -> Float64Array:
@@ -86,36 +87,6 @@ def seen_enough(samples: Lumitexels) -> BoolArray:
         return np.count_nonzero(hit, axis=1)
 
     return np.asarray((kinds(samples.light) >= MIN_LIGHTS) & (kinds(samples.view) >= MIN_VIEWS))
-
-
-def collect(
-    store: LumitexelStore,
-    estimate: Callable[[slice, Lumitexels], PointValues],
-    *,
-    progress: Callable[[float], None] | None = None,
-) -> PointValues:
-    """Estimate chunk by chunk and put the results together.
-
-    Parameters
-    ----------
-    store
-        Samples of P points.
-    estimate
-        Called with the points of a chunk and their samples.
-    progress
-        Called with the share of the points that is done, 0 to 1.
-    """
-    parts = []
-    count = len(store.surface)
-    for part, samples in store.chunks(chunk_points(store)):
-        parts.append(estimate(part, samples))
-        if progress is not None:
-            progress(part.stop / max(count, 1))
-    return PointValues(
-        np.concatenate([p.values for p in parts]),
-        np.concatenate([p.stderr for p in parts]),
-        np.concatenate([p.valid for p in parts]),
-    )
 
 
 def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
@@ -192,9 +163,7 @@ def normals_from_shading(
 
 def _of_normals(normals: FloatArray, stderr_rad: FloatArray, good: BoolArray) -> PointValues:
     spread = np.repeat(np.asarray(stderr_rad, np.float64)[:, None], 3, axis=1)
-    return PointValues(
-        np.where(good[:, None], normals, 0.0), np.where(good[:, None], spread, 0.0), good
-    )
+    return PointValues.masked(normals, spread, good)
 
 
 def at_normals(samples: Lumitexels, normals: PointValues) -> Lumitexels:
@@ -261,8 +230,7 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
         normal_stderr_rad=stderr_rad,
     )
     good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)
-    keep = good[:, None]
-    return PointValues(np.where(keep, found.r_d, 0.0), np.where(keep, found.stderr, 0.0), good)
+    return PointValues.masked(found.r_d, found.stderr, good)
 
 
 def surface_samples(
@@ -292,14 +260,10 @@ def lobe_weights(
     """
     found = brdf_basis.fit_weights(surface_samples(samples, normals, r_d), basis)
     good = found.valid & normals.valid & r_d.valid
-    keep = good[:, None]
     scale = np.where(np.isfinite(found.stderr), LOBE_SCALE_ERROR_RATIO * found.stderr, 1.0)
     residual = np.where(good, found.residual, 0.0)
-    return PointValues(
-        np.concatenate([np.where(keep, found.weights, 0.0), residual[:, None]], axis=1),
-        np.where(keep, scale[:, None] * np.append(found.weights, residual[:, None], axis=1), 0.0),
-        good,
-    )
+    each = np.append(found.weights, residual[:, None], axis=1)
+    return PointValues.masked(each, scale[:, None] * each, good)
 
 
 def normals_from_remainder(
@@ -337,15 +301,9 @@ def normals_from_remainder(
         f=samples.f - lobes[..., None],
         variance=samples.variance + np.square(LOBE_RELATIVE_ERROR * lobes)[..., None],
     )
-    good = normals.valid & r_d.valid
-    found = normals_from_shading(
-        bare,
-        np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)),
-        rounds=1,
-        highlight_rad=PEAK_HALF_ANGLE_RAD,
-    )
-    good = good & found.valid
-    return _of_normals(found.values, found.stderr[:, 0], good)
+    start = np.where(known[:, None], normals.values, (0.0, 0.0, 1.0))
+    found = normals_from_shading(bare, start, rounds=1, highlight_rad=PEAK_HALF_ANGLE_RAD)
+    return _of_normals(found.values, found.stderr[:, 0], known & found.valid)
 
 
 def normals_from_all_light(
@@ -404,17 +362,8 @@ def sample_counts(part: slice, samples: Lumitexels) -> PointValues:
     return PointValues(counts, np.zeros_like(counts), seen_enough(samples))
 
 
-def part_of(values: PointValues, rows: slice | NDArray[np.integer]) -> PointValues:
-    """Return the estimates of some of the points."""
-    return PointValues(values.values[rows], values.stderr[rows], values.valid[rows])
-
-
 def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
     """Return the samples of some of the points."""
-    return dataclasses.replace(
-        samples,
-        **{
-            name: getattr(samples, name)[rows]
-            for name in ("f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid")
-        },
-    )
+    names = ("f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid")
+    some = {name: getattr(samples, name)[rows] for name in names}
+    return dataclasses.replace(samples, **some)

@@ -88,7 +88,16 @@ def estimate(
     steps : int
         Of Gauss and Newton.
     """
-    fit = _Fit(samples, valid, r_d, weights, basis, lobe_error, least_cos_light, least_cos_view)
+    fit = _Fit(
+        samples,
+        np.where(valid, r_d, 0.0),
+        np.where(valid[:, None], weights, 0.0),
+        basis,
+        lobe_error,
+        (least_cos_light, least_cos_view),
+        gray=samples.f.mean(axis=-1).astype(np.float64),
+        noise=np.where(samples.valid, samples.variance.mean(axis=-1), 1.0) / 3.0,
+    )
     n = np.where(valid[:, None], normals, (0.0, 0.0, 1.0)).astype(np.float64)
     start = n
     state = fit.at(n)
@@ -146,30 +155,23 @@ class _State:
     cost: Float64Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     """The samples of points, and the model of them as a function of the normals."""
 
-    def __init__(
-        self,
-        samples: Lumitexels,
-        valid: BoolArray,
-        r_d: Float64Array,
-        weights: Float64Array,
-        basis: BrdfBasis,
-        lobe_error: float,
-        least_cos_light: float,
-        least_cos_view: float,
-    ) -> None:
-        self.samples, self.basis, self.lobe_error = samples, basis, lobe_error
-        self.least = least_cos_light, least_cos_view
-        self.r_d = np.where(valid, r_d, 0.0)
-        self.weights = np.where(valid[:, None], weights, 0.0)
-        self.gray = samples.f.mean(axis=-1).astype(np.float64)
-        self.noise = np.where(samples.valid, samples.variance.mean(axis=-1), 1.0) / 3.0
+    samples: Lumitexels
+    r_d: Float64Array
+    weights: Float64Array
+    basis: BrdfBasis
+    lobe_error: float
+    least_cos: tuple[float, float]
+    """Of light and view."""
+    gray: Float64Array
+    noise: Float64Array
 
     def at(self, normals: Float64Array) -> _State:
         value, lobes, cos_light, cos_view = self._predicted(normals)
-        use = self.samples.valid & (cos_light > self.least[0]) & (cos_view > self.least[1])
+        use = self.samples.valid & (cos_light > self.least_cos[0]) & (cos_view > self.least_cos[1])
         variance = (
             self.noise
             + np.square(self.lobe_error * lobes)

@@ -72,12 +72,10 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
     uv = np.ascontiguousarray(corner_uv, np.float64)
     if uv.ndim != 3 or uv.shape[1:] != (3, 2) or not np.isfinite(uv).all():
         raise ValueError(f"corner_uv: got shape {uv.shape}, expected (F, 3, 2) finite numbers")
-    if not FILL_SIZE_RANGE_PX[0] <= size <= FILL_SIZE_RANGE_PX[1]:
-        raise ValueError(
-            f"size: got {size}, expected {FILL_SIZE_RANGE_PX[0]} to {FILL_SIZE_RANGE_PX[1]} texels"
-        )
-    face, weight = _rasterize(uv, size)
-    return TexelMap(face, weight)
+    least, most = FILL_SIZE_RANGE_PX
+    if not least <= size <= most:
+        raise ValueError(f"size: got {size}, expected {least} to {most} texels")
+    return TexelMap(*_rasterize(uv, size))
 
 
 def texels_from_points(
@@ -116,44 +114,6 @@ def texels_from_points(
     trust = _checked_weight(trust, np.asarray(np.isfinite(at).all(axis=1)))
     safe = np.where(trust[:, None] > 0, at, np.float32(0.0))
     return _interpolate(texels.face, texels.weight, corners, safe, trust)
-
-
-def points_from_texels(
-    texture: ArrayLike, corner_uv: ArrayLike, faces: ArrayLike, points: int
-) -> Float32Array:
-    """Sample a dense texture at points, bilinearly; a point at a seam takes the mean of its sides.
-
-    Parameters
-    ----------
-    texture : array_like, shape (N, N) or (N, N, C)
-    corner_uv : array_like, shape (F, 3, 2)
-    faces : array_like of int, shape (F, 3)
-    points : int
-        Number of points.
-
-    Returns
-    -------
-    ndarray of float32, shape (points,) or (points, C)
-        0 for points of no triangle.
-    """
-    image = np.asarray(texture, np.float32)
-    layers = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
-    size = len(layers)
-    uv = np.asarray(corner_uv, np.float64).reshape(-1, 2)
-    x = np.clip(uv[:, 0] * size - 0.5, 0, size - 1)
-    y = np.clip((1.0 - uv[:, 1]) * size - 0.5, 0, size - 1)
-    j, i = np.minimum(x.astype(int), size - 2), np.minimum(y.astype(int), size - 2)
-    a, b = (x - j)[:, None], (y - i)[:, None]
-    seen = (1 - b) * ((1 - a) * layers[i, j] + a * layers[i, j + 1]) + b * (
-        (1 - a) * layers[i + 1, j] + a * layers[i + 1, j + 1]
-    )
-    corner = np.asarray(faces).reshape(-1)
-    count = np.maximum(np.bincount(corner, minlength=points), 1)
-    out = np.stack(
-        [np.bincount(corner, seen[:, c], minlength=points) / count for c in range(seen.shape[1])],
-        axis=-1,
-    ).astype(np.float32)
-    return out if image.ndim == 3 else out[:, 0]
 
 
 def push_pull(
@@ -260,11 +220,8 @@ def _interpolate(face, weight, corners, values, trust):  # type: ignore[no-untyp
             f = face[i, j]
             if f < 0:
                 continue
-            share = (
-                np.float32(1.0) - weight[i, j, 0] - weight[i, j, 1],
-                weight[i, j, 0],
-                weight[i, j, 1],
-            )
+            second, third = weight[i, j, 0], weight[i, j, 1]
+            share = np.float32(1.0) - second - third, second, third
             total = np.float32(0.0)
             for k in range(3):
                 w = max(share[k], np.float32(0.0)) * trust[corners[f, k]]

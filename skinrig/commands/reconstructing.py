@@ -135,6 +135,7 @@ def reconstruct(
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
     from reconstruction.pipeline import recipes as pipeline
+    from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import truth_beside
 
     console = Console(json)
@@ -151,13 +152,10 @@ def reconstruct(
             out=folder,
             calibration=calibration,
             state=state,
-            scan=scan,
-            basis=basis,
             landmarks=landmarks,
             progress=console.progress,
             truth=truth.name if truth else "",
-            hold_out=hold_out,
-            rank=rank,
+            dome=DomeOptions(scan, basis, hold_out, rank),
         )
         for text in done.assumed:
             console.say(f"assumed: {text}")

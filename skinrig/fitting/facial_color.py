@@ -60,7 +60,7 @@ def fit_facial_color(
 
     Raises
     ------
-    FacialColorFitError, EvidenceError, LandmarkError, DynamicAppearanceError
+    FacialColorFitError, InputsError, LandmarkError, DynamicAppearanceError
         Naming what is missing or does not fit.
     """
     if radius_px is not None and not 0.0 < radius_px < math.inf:

@@ -22,9 +22,9 @@ from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.graph import StageError
 from reconstruction.pipeline.hold_out import HoldOutError
+from reconstruction.pipeline.inputs import DomeOptions, InputsError
 from skinrig.simulating.dome import small_dome
 
 AXES_MM = np.array([58.0, 85.0, 66.0])
@@ -370,7 +370,7 @@ def test_no_frame_of_what_is_held_out_is_read(found, monkeypatch):
         want=("normals",),
         out=folder / "held-out",
         calibration=folder / "calibration",
-        hold_out=f"lights={','.join(lights)},views={view}",
+        dome=DomeOptions(hold_out=f"lights={','.join(lights)},views={view}"),
     )
     assert read
     assert not {light for light, _ in read} & set(lights)
@@ -409,7 +409,10 @@ def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_ou
     folder, _ = found
     with pytest.raises(HoldOutError, match=named):
         pipeline.reconstruct(
-            folder / "session-ellipsoid", want=("normals",), out=folder / "never", hold_out=hold_out
+            folder / "session-ellipsoid",
+            want=("normals",),
+            out=folder / "never",
+            dome=DomeOptions(hold_out=hold_out),
         )
     assert not (folder / "never").exists()
 
@@ -422,7 +425,7 @@ def test_as_many_lobes_are_made_as_are_asked_for(found):
         want=("basis_weight_1",),
         out=folder / "two-lobes",
         calibration=folder / "calibration",
-        rank=2,
+        dome=DomeOptions(rank=2),
     )
     maps = store.read(folder / "two-lobes")
     assert {name for name in maps.maps if name.startswith("basis_weight")} == {
@@ -444,9 +447,12 @@ def test_as_many_lobes_are_made_as_are_asked_for(found):
 )
 def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
     folder, _ = found
-    with pytest.raises(EvidenceError, match=named):
+    with pytest.raises(InputsError, match=named):
         pipeline.reconstruct(
-            folder / "session-ellipsoid", want=(want,), out=folder / "never", rank=rank
+            folder / "session-ellipsoid",
+            want=(want,),
+            out=folder / "never",
+            dome=DomeOptions(rank=rank),
         )
 
 

@@ -6,6 +6,7 @@ were dilated; the estimators know of neither.
 
 import numpy as np
 import pytest
+from twins.alignments import place_stderr
 
 from model.facial_color import HemoglobinRig
 from reconstruction.chromophores import posterior as chromophore_posterior
@@ -140,7 +141,7 @@ def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(
     alone = np.abs(each[1].hemoglobin - each[0].hemoglobin - truth[part])[good]
     assert np.median(error) < 0.6 * np.median(alone)
     # what the places are off by is not in it
-    place = aligned.place_stderr(np.where(valid[1], smiling.hemoglobin_at_rest, np.nan))[part]
+    place = place_stderr(aligned, np.where(valid[1], smiling.hemoglobin_at_rest, np.nan))[part]
     stated = np.hypot(joint.stderr_change[1], place)[good]
     assert np.mean(error < 2 * stated) > 0.9
     assert np.mean(error < 0.5 * stated) < 0.9

@@ -12,8 +12,8 @@ from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram.statistics import measure
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.gradient.images import GradientImages
+from reconstruction.pipeline.inputs import InputsError
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.report import build
 from skinrig.simulating.simulation import simulate_session
@@ -133,7 +133,7 @@ def test_states_without_a_neutral_one_are_refused(captured, tmp_path):
         def frames(self, kind=None, **index):
             return kept if kind == "gradient" else []
 
-    with pytest.raises(EvidenceError, match="neutral"):
+    with pytest.raises(InputsError, match="neutral"):
         GradientImages(Without())
 
 

@@ -17,6 +17,7 @@ from capture.rig import load_rig
 from model import store
 from model.skin_reflectance import assemble
 from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.inputs import DomeOptions
 from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
@@ -80,7 +81,7 @@ def fitted(tmp_path_factory):
         want=WANT,
         out=out / "appearance",
         calibration=out / "calibration",
-        hold_out=f"lights={','.join(lights)},views={view}",
+        dome=DomeOptions(hold_out=f"lights={','.join(lights)},views={view}"),
     )
     return out, lights, view
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.simulating.orders import SimulationError
@@ -173,7 +173,7 @@ def test_sequences_that_cannot_be_are_refused_before_a_folder_is_made(tmp_path):
         SequenceOrder(state="smile", reaction_s=-0.1),
         SequenceOrder(state="exercise", reaction_s=0.2),
     ):
-        with pytest.raises((SimulationError, EvidenceError, ValueError)):
+        with pytest.raises((SimulationError, InputsError, ValueError)):
             simulate(tmp_path, order)
     with pytest.raises(SimulationError, match="knows nothing"):
         simulate_session("dome", tmp_path / "d", sequence=SequenceOrder(state="smile"))

@@ -6,8 +6,8 @@ import pytest
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.graph import StageError
+from reconstruction.pipeline.inputs import InputsError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.cli import main
 from skinrig.evaluating import subsurface as evaluation
@@ -56,7 +56,7 @@ def test_sigma_tr_comes_back_through_the_whole_session_and_the_dipole_misses_it(
 
 
 def test_without_calibrated_fibres_the_way_on_is_told(bench, capsys):
-    with pytest.raises((EvidenceError, StageError), match="calibrate fibre"):
+    with pytest.raises((InputsError, StageError), match="calibrate fibre"):
         pipeline.reconstruct(bench / "session", want=("subsurface",), out=bench / "bare")
     assert not (bench / "bare").exists()
     command = ["reconstruct", str(bench / "session"), "--want", "subsurface"]

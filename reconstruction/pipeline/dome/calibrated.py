@@ -13,7 +13,8 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
-from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.graph import attributes_of
+from reconstruction.pipeline.inputs import Inputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,12 +84,12 @@ def seen_from(dome: Dome, rotation: Float64Array, shift_mm: Float64Array) -> Dom
     )
 
 
-def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
+def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
     """Return the dome of a session's images; what no calibration says is taken as drawn.
 
     Parameters
     ----------
-    evidence
+    inputs
         Session and calibrations; it notes what is assumed, and which lights are dead.
     images
         Those of the session that are to be used.
@@ -98,16 +99,16 @@ def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
     CalibrationError
         When a calibration is damaged, of another rig or device, or out of date.
     """
-    rig = evidence.session.rig
+    rig = inputs.session.rig
     views = [rig.view(name) for name in images.views]
     serials = [view.serial for view in views]
-    found = evidence.load("geometry", serials, "the cameras stand as the rig's file draws them")
+    found = inputs.load("geometry", serials, "the cameras stand as the rig's file draws them")
     if found is None:
         cameras = tuple(CameraPose.nominal(view) for view in views)
     else:
         poses = geometry.poses_from(found, rig.subset(views=images.views))
         cameras = tuple(poses[view.name] for view in views)
-    lit = evidence.load(
+    lit = inputs.load(
         "lights",
         images.lights,
         "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
@@ -119,13 +120,13 @@ def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
     if lit is not None:
         lights = LightTable.from_calibration(lit, lights_rig)
         nominal = {k: lit.notes[k] for k in ("positions", "intensities") if k in lit.notes}
-        evidence.assumed += [f"the lights' {what} are {why}" for what, why in nominal.items()]
+        inputs.assumed += [f"the lights' {what} are {why}" for what, why in nominal.items()]
     dead = [name for name, good in zip(lights.names, lights.valid, strict=True) if not good]
     if dead:
-        evidence.noted["lights_left_out"] = dead
+        inputs.noted["lights_left_out"] = dead
     response = tuple(_response(lights, camera) for camera in cameras)
     absolute = lit is not None and "intensities" not in nominal
-    return Dome(images, cameras, lights, lights, response, absolute, evidence.tell)
+    return Dome(images, cameras, lights, lights, response, absolute, inputs.tell)
 
 
 def split_exposures(dome: Dome) -> Dome:
@@ -138,19 +139,11 @@ def split_exposures(dome: Dome) -> Dome:
 
 def reorder_lights(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
     """Return a table with the rows of another in a given order, also more than once."""
-    kept = {
-        field: getattr(lights, field)[order]
-        for field in (
-            "position_mm",
-            "intensity",
-            "exponent",
-            "axis",
-            "valid",
-            "position_stderr_mm",
-            "intensity_stderr",
-            "exponent_stderr",
-        )
-    }
+    per_light = (
+        "position_mm intensity exponent axis valid position_stderr_mm intensity_stderr "
+        "exponent_stderr"
+    )
+    kept = {field: values[order] for field, values in attributes_of(lights, per_light).items()}
     return dataclasses.replace(lights, names=tuple(names), **kept)
 
 

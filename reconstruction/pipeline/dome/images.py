@@ -11,8 +11,8 @@ import numpy as np
 from capture import hdr, raw
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 __all__ = ["DomeImage", "DomeImages", "SensorNoise"]
@@ -76,7 +76,7 @@ class DomeImages:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session holds no such frames.
     """
 
@@ -99,7 +99,7 @@ class DomeImages:
                 continue
             self._shots.setdefault(key, []).append(record)
         if not self._shots:
-            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
+            raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
         views = {view for view, _ in self._shots}
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)
@@ -137,7 +137,7 @@ class DomeImages:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             Where the session lacks that image.
         """
         shots = self._of(view, light, exposure)
@@ -156,7 +156,7 @@ class DomeImages:
         if exposure >= 0:
             shots = [record for record in shots if record.index.get("exposure", 0) == exposure]
         if not shots:
-            raise EvidenceError(f"{self._session.path}: lacks camera {view}, light {light}")
+            raise InputsError(f"{self._session.path}: lacks camera {view}, light {light}")
         return shots
 
     def _dark(self, view: str) -> tuple[Float32Array, Float32Array] | None:
@@ -180,9 +180,9 @@ class DomeImages:
         times = []
         for frame, level in zip(frames, levels, strict=True):
             if frame.cfa.shape != first.cfa.shape or frame.pattern != first.pattern:
-                raise EvidenceError(f"{frame.path}: differs in size or pattern from {first.path}")
+                raise InputsError(f"{frame.path}: differs in size or pattern from {first.path}")
             if frame.exposure_s is None:
-                raise EvidenceError(f"{frame.path}: does not say its exposure time")
+                raise InputsError(f"{frame.path}: does not say its exposure time")
             times.append(frame.exposure_s * level)
         values = np.zeros(first.cfa.shape, np.float32)
         variance = np.zeros_like(values)

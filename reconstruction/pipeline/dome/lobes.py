@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from reconstruction.arrays import Float64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline.dome.calibrated import Dome
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
@@ -35,6 +34,9 @@ MAX_RELATIVE_STRENGTH: Final = 6.0
 
 RECORDED_RANKS: Final = (1, 2, BASIS_RANK, 2 * BASIS_RANK, 24)
 """Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
+
+CHUNK_SAMPLES: Final = 3_000_000
+"""Samples of a chunk; about 60 bytes each."""
 
 BASIS_POINTS: Final = 5_000
 """Points, drawn at random, that the mixtures are found on."""
@@ -63,51 +65,61 @@ class Samples:
     folder: Any
     lights: int
     """Lights of the dome: where exposures stay apart, several captures are of one."""
+    tell: Callable[[str, float], None]
+    """Says how far a stage is."""
+
+    def chunks(self) -> Iterator[tuple[slice, Lumitexels]]:
+        """Yield parts of the points with their samples, as many as memory should hold."""
+        samples_per_point = max(self.store.light_count * self.store.view_count, 1)
+        return self.store.chunks(max(1, CHUNK_SAMPLES // samples_per_point))
 
     def collect(
-        self,
-        estimate: Callable[[slice, Lumitexels], PointValues],
-        progress: Callable[[float], None] | None = None,
+        self, stage: str, estimate: Callable[[slice, Lumitexels], PointValues]
     ) -> PointValues:
-        """Estimate at all points; see `estimates.collect`."""
+        """Estimate chunk by chunk and put the results together.
 
-        def by_light(part: slice, samples: Lumitexels) -> PointValues:
-            return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
-
-        return estimates.collect(self.store, by_light, progress=progress)
+        Parameters
+        ----------
+        stage
+            What is estimated, for those who wait.
+        estimate
+            Called with the points of a chunk and their samples.
+        """
+        parts = []
+        for part, samples in self.chunks():
+            by_light = dataclasses.replace(samples, light=samples.light % self.lights)
+            parts.append(estimate(part, by_light))
+            self.tell(stage, part.stop / max(len(self.store.surface), 1))
+        return PointValues(
+            np.concatenate([p.values for p in parts]),
+            np.concatenate([p.stderr for p in parts]),
+            np.concatenate([p.valid for p in parts]),
+        )
 
 
 def fit_lobes(
-    evidence: Evidence, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
+    inputs: Inputs, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
 ) -> Mapping[str, Any]:
     """Fit basis BRDFs to all points, reduce them, and return basis, weights and file."""
-    folder = evidence.basis
+    folder = inputs.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
-    store = lumitexels.store
-    rank = evidence.rank or BASIS_RANK
+    rank = inputs.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
-        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
+        raise InputsError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
     fitted = []
-    for part, samples in store.chunks(estimates.chunk_points(store)):
-        rows = drawn[(drawn >= part.start) & (drawn < part.stop)] - part.start
-        if not len(rows):
+    for part, samples in lumitexels.chunks():
+        points = drawn[(drawn >= part.start) & (drawn < part.stop)]
+        if not len(points):
             continue
-        fitted.append(
-            brdf_basis.fit_weights(
-                estimates.surface_samples(
-                    estimates.rows_of(samples, rows),
-                    estimates.part_of(point_normals, part.start + rows),
-                    estimates.part_of(point_r_d, part.start + rows),
-                ),
-                materials,
-            ).weights
-        )
+        some = estimates.rows_of(samples, points - part.start)
+        shine = estimates.surface_samples(some, point_normals[points], point_r_d[points])
+        fitted.append(brdf_basis.fit_weights(shine, materials).weights)
     shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * BASIS_RANK))
     most = min(shares.shape)
     if rank > most:
-        raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
+        raise InputsError(f"rank: got {rank}, expected at most {most}; the data hold no more")
     mixes = {
         k: brdf_basis.reduce(shares, k, basis=materials)[1:]
         for k in sorted({*RECORDED_RANKS, rank})
@@ -115,13 +127,10 @@ def fit_lobes(
     }
     basis = materials.mixed(mixes[rank][0])
     found = lumitexels.collect(
+        "lobes",
         lambda part, samples: estimates.lobe_weights(
-            samples,
-            estimates.part_of(point_normals, part),
-            estimates.part_of(point_r_d, part),
-            basis,
+            samples, point_normals[part], point_r_d[part], basis
         ),
-        progress=partial(evidence.tell, "lobes"),
     )
     return {
         "basis": basis,
@@ -140,7 +149,7 @@ def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Fl
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
     if np.count_nonzero(kept) < least:
-        raise EvidenceError(
+        raise InputsError(
             f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
             f"reflects, expected at least {least}; more lights or views would show it"
         )
@@ -179,14 +188,10 @@ def refine_normals(
 ) -> Mapping[str, SkinMap | bytes]:
     """Refine normals and lobe weights in turn, and return them as maps with the basis's file."""
     started = lumitexels.collect(
+        "normals by what lobes leave",
         lambda part, samples: estimates.normals_from_remainder(
-            samples,
-            estimates.part_of(point_normals, part),
-            estimates.part_of(point_r_d, part),
-            weights[part],
-            basis,
+            samples, point_normals[part], point_r_d[part], weights[part], basis
         ),
-        progress=partial(dome.tell, "normals by what lobes leave"),
     )
     known = point_normals.valid & point_r_d.valid
     inside = PointValues(
@@ -196,23 +201,18 @@ def refine_normals(
     )
     found, rank = inside, weights.shape[1]
     for turn in range(N_REFINEMENTS):
-        normals, shares = found, weights
+        of_turn = f"{turn + 1} of {N_REFINEMENTS}"
         found = lumitexels.collect(
-            lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples,
-                estimates.part_of(inside, part),
-                estimates.part_of(point_r_d, part),
-                w[part],
-                basis,
-                now=n.values[part],
+            f"normals by all light, {of_turn}",
+            lambda part, samples, n=found.values, w=weights: estimates.normals_from_all_light(  # type: ignore[misc]
+                samples, inside[part], point_r_d[part], w[part], basis, now=n[part]
             ),
-            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {N_REFINEMENTS}"),
         )
         fitted = lumitexels.collect(
+            f"lobes, {of_turn}",
             lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
-                samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis
+                samples, n[part], point_r_d[part], basis
             ),
-            progress=partial(dome.tell, f"lobes, {turn + 1} of {N_REFINEMENTS}"),
         )
         weights = fitted.values[:, :rank]
     maps = {

@@ -13,7 +13,7 @@ from capture.calibration.geometry import CameraPose
 from capture.session import Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.registration import head_motion
 from reconstruction.scan.mesh import RefinedScan
 
@@ -106,21 +106,18 @@ def follow_head(
     order = np.argsort(times)
     frames = [[_gray(session, whole[k][view]) for view in images.views] for k in order]
     step = max(1, len(surface.points_mm) // TRACKED_POINTS)
-    reference = len(order) // 2
+    points = surface.points_mm[::step].astype(np.float64)
     found = head_motion.estimate(
         frames,
         [HalfPixels(camera) for camera in cameras],
-        surface.points_mm[::step].astype(np.float64),
+        points,
         surface.normals[::step].astype(np.float64),
         times[order],
-        reference=reference,
+        reference=len(order) // 2,
     )
-    view = images.views[0]
-    when = np.array(
-        [np.mean(images.times_s(view, light, exposure)) for light, exposure in images.captures]
-    )
+    when = np.array([np.mean(images.times_s(images.views[0], *key)) for key in images.captures])
     if not found.usable.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no tracking frame tells where the head was; is the scan of "
             "this subject, and are the cameras calibrated?"
         )
@@ -130,13 +127,12 @@ def follow_head(
     mean[:3, :3] = head_motion.rotation_matrix(turn.mean(axis=0))
     mean[:3, 3] = shift.mean(axis=0)
     poses = found.matrices(when) @ np.linalg.inv(mean)
-    points = surface.points_mm[::step].astype(np.float64)
     moved = np.einsum("nij,pj->npi", poses[:, :3, :3], points) + poses[:, None, :3, 3] - points
     apart = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
     usable = found.covered(when)
     still = bool(usable.all() and apart.max(initial=0.0) < MAX_STILL_MOTION_PX * pixel_mm)
     if not usable.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no image lies between two tracking frames that tell where the "
             "head was; capture again, with the face at rest"
         )
@@ -146,7 +142,7 @@ def follow_head(
 def _time_s(record: Any) -> float:
     time = record.line.t_box_s
     if time is None:
-        raise EvidenceError(f"{record.file}: does not say when it was lit")
+        raise InputsError(f"{record.file}: does not say when it was lit")
     return float(time)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.pipeline.dome.calibrated import Dome, reorder_lights
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.scan import registration as scan_registration
 from reconstruction.scan.registration import RigidFit
 from reconstruction.scan.repair import TriangleMesh
@@ -32,7 +32,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         No light stands before the face, or the mesh is not found in the images.
     """
     chosen = farthest_point_sample(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
@@ -60,7 +60,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         )
     except scan_registration.RegistrationError as exc:
         lost, seen = 100.0 * np.mean(shares, axis=0)
-        raise EvidenceError(
+        raise InputsError(
             f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
             f"are saturated in every exposure, {seen:.1f} % are brighter than their noise"
         ) from exc
@@ -71,7 +71,7 @@ def farthest_point_sample(position_mm: Float64Array, usable: BoolArray, count: i
     way = unit_vectors(position_mm)
     front = np.flatnonzero(usable & (way[:, 2] > -0.1))
     if not len(front):
-        raise EvidenceError("lights: none that can be used stands before the face")
+        raise InputsError("lights: none that can be used stands before the face")
     chosen = [int(front[np.argmax(way[front, 2])])]
     nearest = way[front] @ way[chosen[0]]
     while len(chosen) < min(count, len(front)):

@@ -31,8 +31,8 @@ from reconstruction.pipeline.dome.lobes import (
 )
 from reconstruction.pipeline.dome.motion import Motion, follow_head
 from reconstruction.pipeline.dome.registration import register
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.hold_out import HoldOutError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan import mesh as scan_mesh
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
@@ -74,93 +74,60 @@ FILE_NAMES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
-    dome = _dome(evidence)
-    base: dict[str, Any] = {
-        "revision": STAGE_REVISION,
-        "inputs": dict(sorted(evidence.hashes.items())),
-    }
-    if evidence.hold_out:
-        base["held_out"] = evidence.hold_out.record()
-    weights_made = weight_names(evidence.rank or BASIS_RANK)
-
+    dome = _dome(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    if inputs.hold_out:
+        stage = partial(stage, held_out=inputs.hold_out.record())
+    weights = " ".join(weight_names(inputs.rank or BASIS_RANK))
     unscaled = (
-        ""
-        if dome.absolute
-        else (
-            "r_d: the lights are not calibrated and an albedo has no scale without them; run "
-            "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
-        )
+        "r_d: the lights are not calibrated and an albedo has no scale without them; run "
+        "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
     )
-
-    def stage(
-        name: str,
-        needs: tuple[str, ...],
-        makes: tuple[str, ...],
-        run: Any,
-        refused: str = "",
-        **more: Any,
-    ) -> stages.Stage:
-        return stages.Stage(name, needs, makes, run, {**base, **more}, refused)
-
-    known = ("surface", "lumitexels", "point_normals", "point_r_d")
+    refused = "" if dome.absolute else unscaled
+    known = "surface lumitexels point_normals point_r_d"
     return [
-        stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
-        stage("texture", ("surface",), ("texture", "position", MESH_FILE), partial(_texture, dome)),
-        stage(
-            "motion",
-            ("surface",),
-            ("motion",),
-            lambda surface: {"motion": _motion(evidence, dome, surface)},
-        ),
-        stage(
-            "lumitexels",
-            ("surface", "motion"),
-            ("lumitexels",),
-            lambda surface, motion: {"lumitexels": _lumitexels(dome, surface, motion)},
-        ),
-        stage("sample counts", ("lumitexels", "texture"), ("samples",), partial(_counts, dome)),
-        stage(
-            "half-vector normals",
-            ("lumitexels", "texture"),
-            ("half_vector_normals",),
-            partial(_half_vectors, dome),
-        ),
+        stage("surface", "", "surface", partial(_surface, inputs, dome)),
+        stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
+        stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
+        stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, dome)),
+        stage("sample counts", "lumitexels texture", "samples", _counts),
+        stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
         stage(
             "normals",
-            ("surface", "lumitexels", "texture"),
-            ("point_normals", "normals"),
+            "surface lumitexels texture",
+            "point_normals normals",
             partial(_normals, dome),
         ),
         stage(
             "albedo",
-            ("surface", "lumitexels", "point_normals", "texture"),
-            ("point_r_d", "r_d"),
+            "surface lumitexels point_normals texture",
+            "point_r_d r_d",
             partial(_albedo, dome),
-            unscaled,
+            refused,
         ),
         stage(
             "lobes",
-            ("lumitexels", "point_normals", "point_r_d"),
-            ("basis", "weights", "basis_file"),
-            partial(fit_lobes, evidence),
+            "lumitexels point_normals point_r_d",
+            "basis weights basis_file",
+            partial(fit_lobes, inputs),
             ranks=list(RECORDED_RANKS),
         ),
         stage(
             "refined normals",
-            (*known, "basis", "weights", "basis_file", "texture"),
-            ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
+            f"{known} basis weights basis_file texture",
+            f"normals_refined {weights} lobe_residual {BASIS_FILE}",
             partial(refine_normals, dome),
         ),
     ]
 
 
-def _dome(evidence: Evidence) -> Dome:
+def _dome(inputs: Inputs) -> Dome:
     """Return the dome with the images that may be fitted to."""
-    images = DomeImages(evidence.session)
-    held = evidence.hold_out = evidence.hold_out.within(images.lights, images.views)
-    evidence.noted["held_out"] = held.record()
+    images = DomeImages(inputs.session)
+    held = inputs.hold_out = inputs.hold_out.within(images.lights, images.views)
+    inputs.noted["held_out"] = held.record()
     if held:
         for field, there, least in (
             ("lights", images.lights, estimates.MIN_LIGHTS),
@@ -172,24 +139,24 @@ def _dome(evidence: Evidence) -> Dome:
                     f"hold-out: leaves {left} of {len(there)} {field}, expected at least {least}; "
                     "hold out fewer"
                 )
-        images = DomeImages(evidence.session, without=held)
-    return calibrated(evidence, images)
+        images = DomeImages(inputs.session, without=held)
+    return calibrated(inputs, images)
 
 
-def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
+def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
-    session = evidence.session
-    if evidence.scan is None and SCAN_FILE not in session.attachments():
-        raise EvidenceError(
+    session = inputs.session
+    if inputs.scan is None and SCAN_FILE not in session.attachments():
+        raise InputsError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
-    mesh = session.attachment(SCAN_FILE) if evidence.scan is None else evidence.scan
+    mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
     scan = scan_mesh.prepare(mesh, points=points)
     fit = register(dome, scan.coarse)
-    evidence.noted["registration"] = {
+    inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
         "stderr_rad_mm": fit.stderr.tolist(),
@@ -205,34 +172,28 @@ def _require(dome: Dome) -> None:
     """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
     if views < estimates.MIN_VIEWS:
-        raise EvidenceError(
-            f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}"
-        )
+        raise InputsError(f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}")
     if lights < estimates.MIN_LIGHTS:
-        raise EvidenceError(
+        raise InputsError(
             f"lights: got {lights} that can be used, expected at least {estimates.MIN_LIGHTS}"
         )
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_spread(unit_vectors(place))
 
 
-def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
+def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     side = 2 ** math.ceil(math.log2(math.sqrt(2.0 * len(surface.points_mm))))
     texture = SurfaceTexture.of(surface, size=int(np.clip(side, *TEXTURE_LIMITS)))
-    return {
-        "texture": texture,
-        "position": texture.map(
-            surface.points_mm, None, np.ones(len(surface.points_mm), bool), "mm", "rig frame"
-        ),
-        MESH_FILE: texture.wavefront(),
-    }
+    points = surface.points_mm
+    position = texture.map(points, None, np.ones(len(points), bool), "mm", "rig frame")
+    return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
 
 
-def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
+def _motion(inputs: Inputs, dome: Dome, surface: RefinedScan) -> Motion | None:
     images = dome.images.apart()
-    found = follow_head(evidence.session, images, dome.cameras, surface, dome.pixel_mm)
+    found = follow_head(inputs.session, images, dome.cameras, surface, dome.pixel_mm)
     # without tracking frames nobody knows whether the head held still
-    evidence.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
+    inputs.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
 
@@ -261,32 +222,27 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
                 continue
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return Samples(store, folder, len(dome.table.names))
+    return Samples(store, folder, len(dome.table.names), dome.tell)
 
 
-def _counts(dome: Dome, lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+def _counts(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
+    found = lumitexels.collect("sample counts", estimates.sample_counts)
+    return texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")
+
+
+def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
     found = lumitexels.collect(
-        estimates.sample_counts, progress=partial(dome.tell, "sample counts")
+        "half-vector normals", lambda _, samples: estimates.normals_from_half_vectors(samples)
     )
-    return {"samples": texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")}
-
-
-def _half_vectors(
-    dome: Dome, lumitexels: Samples, texture: SurfaceTexture
-) -> Mapping[str, SkinMap]:
-    found = lumitexels.collect(
-        lambda _, samples: estimates.normals_from_half_vectors(samples),
-        progress=partial(dome.tell, "half-vector normals"),
-    )
-    return {"half_vector_normals": texture.normals(found, "as published, world frame")}
+    return texture.normals(found, "as published, world frame")
 
 
 def _normals(
     dome: Dome, surface: RefinedScan, lumitexels: Samples, texture: SurfaceTexture
 ) -> Mapping[str, Any]:
     found = lumitexels.collect(
+        "normals",
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
-        progress=partial(dome.tell, "normals"),
     )
     found = surface_errors.of_normals(found, surface, dome.pixel_mm)
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
@@ -302,19 +258,10 @@ def _albedo(
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
     found = lumitexels.collect(
-        lambda part, samples: estimates.albedo(
-            samples, estimates.part_of(point_normals, part), stderr_rad=typical
-        ),
-        progress=partial(dome.tell, "albedo"),
+        "albedo",
+        lambda part, samples: estimates.albedo(samples, point_normals[part], stderr_rad=typical),
     )
     found = surface_errors.of_albedo(found, point_normals, surface, dome.pixel_mm)
-    return {
-        "point_r_d": found,
-        "r_d": texture.map(
-            found.values,
-            found.stderr,
-            found.valid,
-            "1",
-            "diffuse reflectance, camera RGB over that of a perfect white",
-        ),
-    }
+    what = "diffuse reflectance, camera RGB over that of a perfect white"
+    r_d = texture.map(found.values, found.stderr, found.valid, "1", what)
+    return {"point_r_d": found, "r_d": r_d}

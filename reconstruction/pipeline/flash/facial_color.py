@@ -10,18 +10,17 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, sections 3 and 4
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from model import color_table
 from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
-from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import model_error
 from reconstruction.chromophores.detectability import detectable
 from reconstruction.correspondence import expression_alignment
 from reconstruction.correspondence.expression_alignment import Alignment
@@ -29,8 +28,10 @@ from reconstruction.facial_color import registration_error as misplacement
 from reconstruction.facial_color import repeat_average, repeatability, shared_melanin
 from reconstruction.facial_color.repeatability import Drift, Repeatability, RepeatabilityError
 from reconstruction.facial_color.shared_melanin import SharedMelanin
-from reconstruction.pipeline.flash.stages import EXPOSURE_SPREAD
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.flash.stages import NOISE_STDERR, colors_of_skin, stderr_of
 from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
+from reconstruction.pipeline.masked_map import masked_map
 
 NOISE_CORRELATION_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
@@ -162,29 +163,17 @@ def fit(
     shape = base.maps["diffuse"].values.shape[:2]
     radius = max(shape) * RADIUS_SHARE if radius_px is None else radius_px
     aligned, left_out = _align(subject, base, landmarks or {}, tell)
-    kept = [state for state in states if any(one.image.state == state for one in aligned)]
-    if len(kept) < 2:
+    of_state: dict[str, list[AlignedImage]] = {
+        state: own
+        for state in states
+        if (own := [one for one in aligned if one.image.state == state])
+    }
+    if len(of_state) < 2:
         reasons = "; ".join(f"{what}: {why}" for what, why in left_out)
         raise FacialColorFitError(f"sessions: no state could be laid over the neutral: {reasons}")
     tell("one melanin for all states")
-    of_states = [[one for one in aligned if one.image.state == state] for state in kept]
-    averages = [_average(images) for images in of_states]
-    table = color_table.build(subject.camera, subject.illuminant, anisotropy=ANISOTROPY_SKIN)
-    prior = shading_prior.of_faces()
-    if not subject.has_white:
-        prior = prior.broadened(EXPOSURE_SPREAD)
-    shared = shared_melanin.estimate_shared_melanin(
-        np.stack([average[0] for average in averages]),
-        table,
-        prior=prior,
-        variance=np.stack([average[1] for average in averages]),
-        model_error=_model_error(averages),
-        own_error=np.stack([_own_error(images) for images in of_states]),
-        valid=np.stack([average[2] for average in averages]),
-        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
-        one_face=subject.has_white,
-    )
-    blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
+    shared = _one_melanin(subject, list(of_state.values()))
+    blood = {state: _blood(shared, k) for k, state in enumerate(of_state)}
     if not blood[NEUTRAL].mask.any():
         raise UnknownBloodError(
             "blood at rest: expected pixels that tell it, got a standard error of more than half "
@@ -192,40 +181,53 @@ def fit(
             "melanin alone: skinrig reconstruct --want melanin"
         )
     tell("scale and bias maps")
+    mask = {state: found.mask for state, found in blood.items()}
+    known = {state: np.where(mask[state], blood[state].values, np.nan) for state in blood}
+    noise = dict(zip(blood, shared.noise_stderr_hemoglobin, strict=True))
     rig = HemoglobinRig.from_maps(
-        np.where(blood[NEUTRAL].mask, blood[NEUTRAL].values, np.nan),
-        {
-            state: np.where(blood[state].mask, blood[state].values, np.nan)
-            for state in kept
-            if state != NEUTRAL
-        },
+        known[NEUTRAL],
+        {state: values for state, values in known.items() if state != NEUTRAL},
         radius_px=radius,
-        valid={state: blood[state].mask for state in kept},
-        stderr={
-            state: np.where(
-                blood[state].mask, shared.noise_stderr_hemoglobin[kept.index(state)], np.nan
-            )
-            for state in kept
-        },
+        valid=mask,
+        stderr={state: np.where(mask[state], noise[state], np.nan) for state in blood},
         stored_size=stored_size,
     )
     good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
-    melanin = SkinMap(
-        np.where(good, shared.melanin, 0.0),
-        MAP_UNITS["melanin"],
-        np.where(good, shared.stderr_melanin, 0.0),
-        good,
-        f"shared by {len(kept)} states",
-    )
+    what = f"shared by {len(blood)} states"
     return FacialColorFit(
         rig=rig,
-        melanin=melanin,
+        melanin=masked_map(shared.melanin, shared.stderr_melanin, good, MAP_UNITS["melanin"], what),
         hemoglobin=blood,
-        changes={state: _change(shared, k) for k, state in enumerate(kept) if state != NEUTRAL},
+        changes={state: _change(shared, k) for k, state in enumerate(blood) if state != NEUTRAL},
         aligned=tuple(aligned),
         shared=shared,
         repeats=_repeats(aligned, timed=subject.timed),
         left_out=tuple(left_out),
+    )
+
+
+def _one_melanin(subject: Subject, of_states: list[list[AlignedImage]]) -> SharedMelanin:
+    """Average the images of each state, and fit one melanin to all."""
+    averages = [
+        repeat_average.average(
+            np.stack([one.rgb for one in images]),
+            np.stack([one.variance for one in images]),
+            np.stack([one.valid for one in images]),
+        )
+        for images in of_states
+    ]
+    rgb, variance, valid = (np.stack(parts) for parts in zip(*averages, strict=True))
+    table, prior = colors_of_skin(subject.camera, subject.illuminant, has_white=subject.has_white)
+    return shared_melanin.estimate_shared_melanin(
+        rgb,
+        table,
+        prior=prior,
+        variance=variance,
+        model_error=_model_error(averages),
+        own_error=np.stack([_own_error(images) for images in of_states]),
+        valid=valid,
+        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+        one_face=subject.has_white,
     )
 
 
@@ -259,7 +261,7 @@ def _align(
         except expression_alignment.AlignmentError as error:
             left_out.append((image.name, str(error)))
             continue
-        found.append(_aligned(image, alignment.warp_map(diffuse, place=False), alignment))
+        found.append(_aligned(image, alignment.warp_map(diffuse), alignment))
     return found, left_out
 
 
@@ -269,10 +271,10 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
         return None
 
-    def over(name: str) -> tuple[Float32Array, Float32Array, BoolArray]:
+    def over(name: str) -> dict[str, Any]:
         values, errors, good = [], [], []
         for one in aligned:
-            found, noise = one.image.maps[name], one.image.maps[f"{name}_noise_stderr"]
+            found, noise = one.image.maps[name], one.image.maps[name + NOISE_STDERR]
             both, error = (found.values, found.mask), noise.values
             if one.alignment is not None:
                 error = one.alignment.warp_stderr(found.values, noise.values, found.mask)
@@ -280,29 +282,23 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
             values.append(both[0])
             errors.append(error)
             good.append(both[1])
-        return np.stack(values), np.stack(errors), np.stack(good)
+        return {
+            "maps": np.stack(values),
+            "states": states,
+            "stderr": np.stack(errors),
+            "valid": np.stack(good),
+            "correlated_px": NOISE_CORRELATION_PX,
+        }
 
-    blood, blood_error, blood_good = over("hemoglobin")
-    melanin, melanin_error, melanin_good = over("melanin")
     try:
-        compared = repeatability.compare(
-            blood, states, stderr=blood_error, valid=blood_good, correlated_px=NOISE_CORRELATION_PX
-        )
+        compared = repeatability.compare(**over("hemoglobin"))
     except RepeatabilityError:
         return None
-    if not timed:
-        return Repeats(compared, ())
-    try:
-        drifts = repeatability.drift(
-            melanin,
-            states,
-            [one.image.captured_s for one in aligned],
-            stderr=melanin_error,
-            valid=melanin_good,
-            correlated_px=NOISE_CORRELATION_PX,
-        )
-    except RepeatabilityError:
-        drifts = ()
+    drifts: tuple[Drift, ...] = ()
+    if timed:
+        with suppress(RepeatabilityError):
+            times_s = [one.image.captured_s for one in aligned]
+            drifts = repeatability.drift(times_s=times_s, **over("melanin"))
     return Repeats(compared, drifts)
 
 
@@ -311,22 +307,13 @@ def _light(diffuse: SkinMap) -> Float32Array:
 
 
 def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -> AlignedImage:
-    stderr = np.zeros_like(diffuse.values) if diffuse.stderr is None else diffuse.stderr
     good = diffuse.mask & (diffuse.values > 0).all(axis=-1)
     return AlignedImage(
         image,
         np.where(good[..., None], diffuse.values, 0.0),
-        np.where(good[..., None], stderr**2, 0.0),
+        np.where(good[..., None], stderr_of(diffuse) ** 2, 0.0),
         good,
         alignment,
-    )
-
-
-def _average(images: list[AlignedImage]) -> tuple[Float32Array, Float32Array, BoolArray]:
-    return repeat_average.average(
-        np.stack([one.rgb for one in images]),
-        np.stack([one.variance for one in images]),
-        np.stack([one.valid for one in images]),
     )
 
 
@@ -364,41 +351,30 @@ def _own_error(images: list[AlignedImage]) -> Float64Array:
 
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good = shared.valid_states[k] & ~shared.misfits[k]
-    good &= detectable(shared.hemoglobin[k], shared.stderr_hemoglobin[k], good)
-    return SkinMap(
-        np.where(good, shared.hemoglobin[k], 0.0),
-        MAP_UNITS["hemoglobin"],
-        np.where(good, shared.stderr_hemoglobin[k], 0.0),
-        good,
-        "given the melanin that all states share",
-    )
+    blood, stderr = shared.hemoglobin[k], shared.stderr_hemoglobin[k]
+    good &= detectable(blood, stderr, good)
+    what = "given the melanin that all states share"
+    return masked_map(blood, stderr, good, MAP_UNITS["hemoglobin"], what)
 
 
 def _change(shared: SharedMelanin, k: int) -> SkinMap:
     both = shared.valid_states[k] & shared.valid_states[shared.reference]
     good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
-    return SkinMap(
-        np.where(good, shared.change[k], 0.0),
-        MAP_UNITS["hemoglobin"],
-        np.where(good, shared.stderr_change[k], 0.0),
-        good,
-        "less the neutral state; errors that both share are left out",
-    )
+    what = "less the neutral state; errors that both share are left out"
+    change, stderr = shared.change[k], shared.stderr_change[k]
+    return masked_map(change, stderr, good, MAP_UNITS["hemoglobin"], what)
 
 
 def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
     """Return how each image was laid over the neutral one, as JSON values."""
     rows = []
     for one in fit.aligned:
-        if one.alignment is None:
+        if (found := one.alignment) is None:
             continue
-        found = one.alignment
         error = found.error_px[found.valid]
         rows.append(
-            {
-                "state": one.image.state,
-                "repeat": one.image.repeat,
-                "session": one.image.session,
+            stages.attributes_of(one.image, "state repeat session")
+            | {
                 "by": found.by,
                 "landmark_rms_px": _number(found.landmark_rms_px),
                 "median_error_px": _number(np.median(error)) if error.size else None,
@@ -409,7 +385,10 @@ def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
     return rows
 
 
-def _number(value: Any) -> float | None:
+def _number(value: Any) -> Any:
+    """Return a number as JSON takes it: None where it is not finite."""
+    if isinstance(value, str | bool | int):
+        return value
     return float(value) if np.isfinite(value) else None
 
 
@@ -417,32 +396,19 @@ def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
     """Return how far states repeat, as JSON values; None where nothing was repeated."""
     if fit.repeats is None:
         return None
-    regions = [
-        {
-            "region": one.name,
-            "pixels": one.pixels,
-            "within": one.within,
-            "between": one.between,
-            "correlation": _number(one.correlation),
-            "correlation_stderr": _number(one.correlation_stderr),
-            "p_value": one.p_value,
-            "scatters": bool(one.scatters),
-            "change_to_scatter": _number(one.change_to_scatter),
-        }
-        for one in fit.repeats.hemoglobin.regions
-    ]
-    drifts = [
-        {
-            "region": one.name,
-            "slope_per_minute": one.slope_per_minute,
-            "slope_stderr": one.slope_stderr,
-            "p_value": one.p_value,
-            "drifts": bool(one.drifts),
-        }
-        for one in fit.repeats.melanin_drift
-    ]
+
+    def rows(found: Sequence[Any], names: str) -> list[dict[str, Any]]:
+        values = (stages.attributes_of(one, names) for one in found)
+        return [
+            {"region": one.name} | {name: _number(value) for name, value in row.items()}
+            for one, row in zip(found, values, strict=True)
+        ]
+
+    of_regions = "pixels within between correlation correlation_stderr p_value scatters"
     return {
         "false_alarm": fit.repeats.hemoglobin.false_alarm,
-        "hemoglobin": regions,
-        "melanin_drift": drifts,
+        "hemoglobin": rows(fit.repeats.hemoglobin.regions, f"{of_regions} change_to_scatter"),
+        "melanin_drift": rows(
+            fit.repeats.melanin_drift, "slope_per_minute slope_stderr p_value drifts"
+        ),
     }

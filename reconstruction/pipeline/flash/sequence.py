@@ -8,6 +8,7 @@ moved are laid over the face at rest. The curves take the times at which the fla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,9 @@ from reconstruction.correspondence import expression_alignment, landmark_table
 from reconstruction.facial_color import perfusion_curves, perfusion_fit
 from reconstruction.facial_color.perfusion_samples import PoseStep
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.flash import sequence_blood
 from reconstruction.pipeline.flash import stages as flash_stages
+from reconstruction.pipeline.inputs import Inputs, InputsError
 
 STAGE_REVISION = 6
 CURVES_NAME = "perfusion_curves"
@@ -49,9 +50,9 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
     return {CURVES_NAME: (CURVES_FILE,)}
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    session = evidence.session
+    session = inputs.session
     refused = ""
     if not _timed(session):
         refused = (
@@ -59,21 +60,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
             "`skinrig capture flash --sequence smile` makes"
         )
 
-    def curves() -> Mapping[str, Any]:
-        return {CURVES_FILE: stages.document_bytes(_curves(evidence))}
-
-    return [
-        *flash_stages.graph(evidence),
-        stages.Stage(
-            CURVES_NAME,
-            (),
-            (CURVES_FILE,),
-            curves,
-            {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
-            | model_error.identity(),
-            refused=refused,
-        ),
-    ]
+    of_images = flash_stages.graph(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    curves, identity = partial(_curves, inputs), model_error.identity()
+    return [*of_images, stage(CURVES_NAME, "", CURVES_FILE, curves, refused, **identity)]
 
 
 def _timed(session: Session) -> list[FrameRecord]:
@@ -84,12 +74,12 @@ def _timed(session: Session) -> list[FrameRecord]:
     ]
 
 
-def _curves(evidence: Evidence) -> dict[str, Any]:
+def _curves(inputs: Inputs) -> bytes:
     """Return the document of a sequence's curves."""
-    session = evidence.session
+    session = inputs.session
     records = session.frames("subject", polarizer="crossed")
-    inputs = flash_stages.inputs_of(evidence)
-    maps = list(flash_stages.diffuse_of_each(inputs, records))
+    rig = flash_stages.rig_of(inputs)
+    maps = list(flash_stages.diffuse_of_each(rig, records))
     actual = [record.line.actual for record in records]
     time = np.array([float(a.get("time_s", np.nan)) for a in actual])
     phase = np.array([float(a.get("phase_s", np.nan)) for a in actual])
@@ -98,18 +88,20 @@ def _curves(evidence: Evidence) -> dict[str, Any]:
     moved, warped = np.zeros(len(maps), bool), maps
     if prompt_s > 0:
         phase = phase % (2 * prompt_s)
-        moved, warped = _laid_over_rest(maps, phase, prompt_s, evidence)
-    places = _places(evidence, maps, ~moved)
+        moved, warped = _laid_over_rest(maps, phase, prompt_s, inputs)
+    places = _places(inputs, maps, ~moved)
     radius_px = RADIUS_SHARE * maps[0].values.shape[1]
-    light = sequence_blood.Light.of(inputs)
+    light = sequence_blood.Light.of(rig)
     blood = sequence_blood.blood_of_discs(warped, places, radius_px, light, moved=moved)
     means = blood.means
     if not means.valid.any():
-        raise EvidenceError(
+        raise InputsError(
             f"{session.path}: no place of {', '.join(places)} shows a color of skin in "
             "enough frames; "
-            + ("check the landmarks" if inputs.white else "give it a calibration of white")
+            + ("check the landmarks" if rig.white else "give it a calibration of white")
         )
+    curves = zip(means.mean, means.stderr, means.pixels, blood.stderr_of_pose, strict=True)
+    columns = ("hemoglobin", "stderr", "pixels", "stderr_of_pose")
     document: dict[str, Any] = {
         "schema": "skinrig.perfusion-curves/1",
         "state": _state(records),
@@ -118,32 +110,21 @@ def _curves(evidence: Evidence) -> dict[str, Any]:
         "places_px": {name: list(place) for name, place in places.items()},
         "radius_px": radius_px,
         "frames": [
-            {
-                "step": record.step_id,
-                "time_s": time[k],
-                "phase_s": phase[k],
-                "late_s": actual[k].get("late_s"),
-                "time_error_s": actual[k].get("time_error_s"),
-                "block": actual[k].get("block"),
-                "moved": bool(moved[k]),
-            }
+            {"step": record.step_id, "time_s": time[k], "phase_s": phase[k]}
+            | {name: actual[k].get(name) for name in ("late_s", "time_error_s", "block")}
+            | {"moved": bool(moved[k])}
             for k, record in enumerate(records)
         ],
         "curves": {
-            name: {
-                "hemoglobin": means.mean[k],
-                "stderr": means.stderr[k],
-                "pixels": means.pixels[k],
-                "stderr_of_pose": blood.stderr_of_pose[k],
-            }
-            for k, name in enumerate(places)
+            name: dict(zip(columns, curve, strict=True))
+            for name, curve in zip(places, curves, strict=True)
         },
     }
     if prompt_s > 0:
         document |= _of_cycle(time, phase, blood, prompt_s, session, list(places))
     else:
         document |= _of_event(time, means, list(places))
-    return document
+    return stages.document_bytes(document)
 
 
 def _state(records: Sequence[FrameRecord]) -> str:
@@ -153,31 +134,31 @@ def _state(records: Sequence[FrameRecord]) -> str:
 
 
 def _places(
-    evidence: Evidence, maps: Sequence[SkinMap], at_rest: BoolArray
+    inputs: Inputs, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
     """Return where the places lie on the face at rest, px."""
     skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
-    if evidence.landmarks is None:
-        evidence.assumed.append(
+    if inputs.landmarks is None:
+        inputs.assumed.append(
             "places: by the face's outline; a table of landmarks says where they are"
         )
         return perfusion_curves.usual_places(skin)
-    table = landmark_table.read(evidence.landmarks)
+    table = landmark_table.read(inputs.landmarks)
     found = {}
     for name in perfusion_curves.FACE_PLACES:
         named = name if name in table else LANDMARK_ALIASES.get(name, name)
         if named in table:
             found[name] = table[named]
     if not found:
-        raise EvidenceError(
-            f"{evidence.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
+        raise InputsError(
+            f"{inputs.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
             f"{', '.join((*perfusion_curves.FACE_PLACES, *LANDMARK_ALIASES.values()))}"
         )
     return found
 
 
 def _laid_over_rest(
-    maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, evidence: Evidence
+    maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, inputs: Inputs
 ) -> tuple[BoolArray, list[SkinMap]]:
     """Tell in which frames the face has moved, and lay those over the face at rest."""
     settled_on = (phase > 0.5 * prompt_s) & (phase < prompt_s)
@@ -192,7 +173,7 @@ def _laid_over_rest(
             on, off, valid_moving=on_valid, valid_neutral=off_valid
         )
     except expression_alignment.AlignmentError as error:
-        evidence.assumed.append(f"the face does not move with the expression ({error})")
+        inputs.assumed.append(f"the face does not move with the expression ({error})")
         return still, list(maps)
     rows, columns = np.indices(off_valid.shape)
     shift = np.hypot(alignment.source_px[..., 0] - columns, alignment.source_px[..., 1] - rows)
@@ -202,10 +183,7 @@ def _laid_over_rest(
     moved = np.array([_more_like(m, on, off, both) for m in maps])
     # all moved frames are laid by one alignment: what it is off by is no noise from frame to frame,
     # but part of the step between poses
-    laid = [
-        alignment.warp_map(m, place=False) if is_on else m
-        for m, is_on in zip(maps, moved, strict=True)
-    ]
+    laid = [alignment.warp_map(m) if is_on else m for m, is_on in zip(maps, moved, strict=True)]
     return moved, laid
 
 
@@ -338,42 +316,24 @@ def _of_event(
 
 def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
     """Return a fit's document, and how many standard errors its levels lie apart."""
-    document = {
-        "time_constant_s": fit.time_constant_s,
-        "stderr_time_constant_s": fit.stderr_time_constant_s,
-        "interval_s": list(fit.interval_s),
-        "interval_68_s": list(fit.interval_68_s),
-        "known": fit.known,
-        "delay_s": fit.delay_s,
-        "stderr_delay_s": fit.stderr_delay_s,
-        "delay_interval_s": list(fit.delay_interval_s),
-        "text": str(fit),
-    }
+    names = "time_constant_s stderr_time_constant_s interval_s interval_68_s known delay_s"
+    document = stages.attributes_of(fit, f"{names} stderr_delay_s delay_interval_s")
+    document["text"] = str(fit)
     if curve is not None:
-        document |= {
-            "start": fit.start[curve],
-            "end": fit.end[curve],
-            "stderr_start": fit.stderr_start[curve],
-            "stderr_end": fit.stderr_end[curve],
-            "stderr_change": fit.stderr_change[curve],
-            "step_of_pose": fit.step[curve],
-            "stderr_step_of_pose": fit.stderr_step[curve],
-            "noise": fit.noise[curve],
-        }
+        names = "start end stderr_start stderr_end stderr_change step stderr_step noise"
+        of_curves = stages.attributes_of(fit, names)
+        titles = {"step": "step_of_pose", "stderr_step": "stderr_step_of_pose"}
+        document |= {titles.get(name, name): all_[curve] for name, all_ in of_curves.items()}
         apart = abs(float(fit.end[curve] - fit.start[curve]))
         document["levels_apart_sigmas"] = apart / max(float(fit.stderr_change[curve]), 1e-300)
     return document
 
 
 def _of_transition(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
+    names = "seen decided where tested false_alarm power high low noise"
+    document = stages.attributes_of(found, names)
     return {
         "seen": found.seen,
         "decided": found.decided,
-        "frames": indices[found.where],
-        "tested": found.tested,
-        "false_alarm": found.false_alarm,
-        "power": found.power,
-        "high": found.high,
-        "low": found.low,
-        "noise": found.noise,
-    }
+        "frames": indices[document.pop("where")],
+    } | document

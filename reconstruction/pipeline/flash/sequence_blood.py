@@ -14,12 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model import color_table
 from model.color_table import ColorTable
 from model.skin import SkinMap
-from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
-from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import model_error
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from reconstruction.facial_color.perfusion_curves import DiscMeans, disc_means, disc_pixels
@@ -46,13 +44,11 @@ class Light:
     """Relative covariance of the table's colors."""
 
     @staticmethod
-    def of(inputs: flash_stages.Inputs) -> Light:
+    def of(rig: flash_stages.FlashRig) -> Light:
         """Return that of a session."""
-        table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
-        prior = shading_prior.of_faces()
-        if inputs.white is None:
-            prior = prior.broadened(flash_stages.EXPOSURE_SPREAD)
-        return Light(table, prior, np.asarray(model_error.load()))
+        has_white = rig.white is not None
+        colors = flash_stages.colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
+        return Light(*colors, np.asarray(model_error.load()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,10 +91,9 @@ def blood_of_discs(
         _of_place(maps, name, place, radius_px, light, moved) for name, place in places.items()
     ]
     joined = DiscMeans(
-        *(
-            np.concatenate([getattr(one, part) for one, _ in found])
-            for part in ("mean", "stderr", "pixels")
-        )
+        np.concatenate([one.mean for one, _ in found]),
+        np.concatenate([one.stderr for one, _ in found]),
+        np.concatenate([one.pixels for one, _ in found]),
     )
     return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
@@ -119,8 +114,7 @@ def _of_place(
     patch = np.s_[top:bottom, left:right]
     valid = np.array([m.mask[patch] for m in maps])
     rgb = np.array([m.values[patch] for m in maps])
-    errors = [np.zeros_like(m.values) if m.stderr is None else m.stderr for m in maps]
-    variance = np.square([error[patch] for error in errors])
+    variance = np.square([flash_stages.stderr_of(m)[patch] for m in maps])
     at = {name: (place[0] - left, place[1] - top)}
 
     def weighed(frames: BoolArray, smooth_px: float | None) -> DiscMeans:

@@ -17,18 +17,22 @@ from capture.calibration.color.white import WhiteReference
 from capture.calibration.polarization import PolarizationCalibration
 from capture.calibration.sensor import SensorCalibration
 from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
+from capture.calibration.store import Calibration
 from capture.session import FrameRecord, Session
 from model import color_table
+from model.color_table import ColorTable
 from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import polarization
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
-from reconstruction.chromophores import face as face_chromophores
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.detectability import detectable
+from reconstruction.chromophores.face import estimate_face
+from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
+from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
@@ -61,12 +65,10 @@ class Image:
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class FlashRig:
     """What the stages read, and what they have to assume for want of a calibration."""
 
-    session: Session
-    state: str
-    repeat: int | None
+    inputs: Inputs
     sensor: SensorCalibration | None
     white: WhiteReference | None
     polarization: PolarizationCalibration | None
@@ -76,179 +78,175 @@ class Inputs:
     camera: str
     """Name of the spectral sensitivities that the color table is built for."""
     illuminant: str
-    hashes: Mapping[str, str]
+
+    @property
+    def session(self) -> Session:
+        """The session."""
+        return self.inputs.session
+
+    @property
+    def imported(self) -> bool:
+        """Whether the frames are photographs that were imported."""
+        return "photographs" in self.session.manifest.extra
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    inputs = inputs_of(evidence)
-    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
-    table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
+    rig = rig_of(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    table = {"camera": rig.camera, "illuminant": rig.illuminant}
     return [
-        stages.Stage(
+        stage(
             "frames",
-            (),
-            ("parallel", "crossed"),
-            lambda: _frames(inputs),
-            base | {"state": inputs.state, "repeat": inputs.repeat},
+            "",
+            "parallel crossed",
+            partial(_frames, rig),
+            state=inputs.state,
+            repeat=inputs.repeat,
         ),
-        stages.Stage(
-            "separation",
-            ("parallel", "crossed"),
-            ("diffuse", "specular"),
-            lambda parallel, crossed: _separate(inputs, parallel, crossed),
-            base,
-        ),
-        stages.Stage(
+        stage("separation", "parallel crossed", "diffuse specular", partial(_separate, rig)),
+        stage(
             "chromophores",
-            ("diffuse",),
-            (
-                "melanin",
-                "hemoglobin",
-                "shading",
-                "residual",
-                "gamut_distance",
-                "melanin_noise_stderr",
-                "hemoglobin_noise_stderr",
-            ),
-            lambda diffuse: _chromophores(inputs, diffuse),
-            table | model_error.identity(),
+            "diffuse",
+            "melanin hemoglobin shading residual gamut_distance melanin_noise_stderr "
+            "hemoglobin_noise_stderr",
+            partial(_chromophores, rig),
+            **table,
+            **model_error.identity(),
         ),
-        stages.Stage(
-            "tsumura",
-            ("diffuse",),
-            ("tsumura_melanin", "tsumura_hemoglobin"),
-            lambda diffuse: _tsumura(diffuse),
-            base,
-        ),
-        stages.Stage(
+        stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
+        stage(
             "pictures",
-            ("diffuse", "specular"),
-            ("picture", "specular_picture"),
-            lambda diffuse, specular: _pictures(inputs, diffuse, specular),
-            table,
+            "diffuse specular",
+            "picture specular_picture",
+            partial(_pictures, rig),
+            **table,
         ),
     ]
 
 
-def inputs_of(evidence: Evidence) -> Inputs:
+def rig_of(inputs: Inputs) -> FlashRig:
     """Return what the stages of a flash session read, and note what is assumed."""
-    session = evidence.session
-    shots = session.frames("subject", state=evidence.state)
+    session = inputs.session
+    shots = session.frames("subject", state=inputs.state)
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
-    imported = "photographs" in session.manifest.extra
 
-    sensor = evidence.load(
-        "sensor", [view.serial], "the frames are as noisy as they say of themselves"
-    )
-    white = evidence.load(
+    def load(kind: str, otherwise: str) -> Calibration | None:
+        return inputs.load(kind, [view.serial], otherwise)
+
+    sensor = load("sensor", "the frames are as noisy as they say of themselves")
+    white = load(
         "white",
-        [view.serial],
         "the light is even and white is what the file's own white balance says"
-        if imported
+        if "photographs" in session.manifest.extra
         else "the light is even and a white tile would fill 80 % of the range",
     )
-    malus = evidence.load("polarization", [view.serial], "the polarizers are perfect")
-    matrix = evidence.load(
-        "color", [view.serial], "pictures show balanced camera RGB as if it were linear sRGB"
-    )
+    malus = load("polarization", "the polarizers are perfect")
+    matrix = load("color", "pictures show balanced camera RGB as if it were linear sRGB")
     illuminant = session.rig.lights[0].illuminant
-    evidence.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
-    return Inputs(
-        session=session,
-        state=evidence.state,
-        repeat=evidence.repeat,
-        sensor=SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
-        white=WhiteReference.from_calibration(white, view.serial) if white else None,
-        polarization=PolarizationCalibration.from_calibration(malus, view.serial)
-        if malus
-        else None,
-        color=color_matrix_from(matrix, view.serial) if matrix else None,
-        neutral=matrix.quantity(view.serial, "white_rgb").value if matrix else None,
-        camera=view.spectral_sensitivity,
-        illuminant=illuminant,
-        hashes=evidence.hashes,
+    inputs.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
+    return FlashRig(
+        inputs,
+        SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
+        WhiteReference.from_calibration(white, view.serial) if white else None,
+        PolarizationCalibration.from_calibration(malus, view.serial) if malus else None,
+        color_matrix_from(matrix, view.serial) if matrix else None,
+        matrix.quantity(view.serial, "white_rgb").value if matrix else None,
+        view.spectral_sensitivity,
+        illuminant,
     )
 
 
-def _frames(inputs: Inputs) -> Mapping[str, Any]:
+def colors_of_skin(
+    camera: str, illuminant: str, *, has_white: bool
+) -> tuple[ColorTable, ShadingPrior]:
+    """Return what colors of skin are compared with: the table, and how bright pixels may be.
+
+    Parameters
+    ----------
+    camera, illuminant
+        Names of spectra.
+    has_white
+        Whether a white tile says how long was exposed.
+    """
+    table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
+    prior = shading_prior.of_faces()
+    return table, prior if has_white else prior.broadened(EXPOSURE_SPREAD)
+
+
+def _frames(rig: FlashRig) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
-    session = inputs.session
-    linear_light, dark, dark_variance = _light_without_darks(inputs)
+    session, state, repeat = rig.session, rig.inputs.state, rig.inputs.repeat
+    mean_image = _image_reader(rig)
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
-        which: dict[str, str | int | float] = {"state": inputs.state, "polarizer": polarizer}
-        if inputs.repeat is not None:
-            which["repeat"] = inputs.repeat
+        which: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
+        if repeat is not None:
+            which["repeat"] = repeat
         shots = session.frames("subject", **which)
-        linear = [linear_light(record) for record in shots]
-        if not linear:
-            images[polarizer] = None
-            continue
-        if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
-            raise EvidenceError(f"{polarizer} frames: differ in size, expected one camera setting")
-        power = [float(record.settings.get("power", 1.0)) for record in shots]
-        total = sum(power)
-        rgb: NDArray[Any] = np.asarray(
-            np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
-        )
-        rgb -= len(linear) * dark
-        variance: NDArray[Any] = np.asarray(
-            np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
-        )
-        variance += len(linear) ** 2 * dark_variance
-        images[polarizer] = Image(
-            (rgb / total).astype(np.float32),
-            (variance / total**2).astype(np.float32),
-            np.logical_and.reduce([image.valid for image in linear]),
-        )
+        images[polarizer] = mean_image(shots) if shots else None
     if images["crossed"] is None:
         crossed = session.frames("subject", polarizer="crossed")
         states = sorted({str(record.index.get("state")) for record in crossed})
-        lacking = f"has no crossed frame of state {inputs.state!r}"
-        if "photographs" in session.manifest.extra:  # whose polarizers nobody was asked for
-            lacking = f"has no photograph of state {inputs.state!r}"
+        # nobody was asked for the polarizers of photographs
+        what = "photograph" if rig.imported else "crossed frame"
         there = "none at all: is it finished?"
         if states:
             there = f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
-        raise EvidenceError(f"{session.path}: {lacking}; it has {there}")
+        raise InputsError(f"{session.path}: has no {what} of state {state!r}; it has {there}")
     return images
 
 
-def _light_without_darks(
-    inputs: Inputs,
-) -> tuple[Callable[[FrameRecord], raw.LinearImage], Float64Array | float, Float64Array | float]:
-    """Return how to read a frame's light, and the mean dark frame with its variance."""
-    session = inputs.session
+def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
+    """Return what averages frames of one polarizer state and subtracts the darks."""
+    session = rig.session
     # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
-    imported = "photographs" in session.manifest.extra
-    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
-    gain, read_noise = _noise(inputs.sensor)
+    demosaic: raw.Demosaic = "superpixel" if rig.imported else "centered"
+    gain, read_noise = _noise(rig.sensor)
 
-    def linear_light(record: FrameRecord) -> raw.LinearImage:
-        frame = session.read(record)
-        return raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
+    def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
+        frames = (session.read(record) for record in records)
+        return [
+            raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
+            for frame in frames
+        ]
 
-    darks = [linear_light(record) for record in session.frames("dark")]
-    if not darks:
-        return linear_light, 0.0, 0.0
-    dark = np.mean([d.rgb for d in darks], axis=0, dtype=np.float64)
-    dark_variance = np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
-    return linear_light, dark, dark_variance
+    def total(images: list[raw.LinearImage], name: str) -> NDArray[Any]:
+        parts = [getattr(image, name) for image in images]
+        return np.asarray(np.sum(parts, axis=0, dtype=np.float64))
 
+    darks = linear_light(session.frames("dark"))
+    count = max(len(darks), 1)
+    dark, dark_variance = (
+        (total(darks, "rgb") / count, total(darks, "variance") / count / count)
+        if darks
+        else (0.0, 0.0)
+    )
 
-def diffuse_of_each(inputs: Inputs, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
-    """Yield the diffuse reflectance that each of some crossed frames shows alone."""
-    linear_light, dark, dark_variance = _light_without_darks(inputs)
-    for record in records:
-        image = linear_light(record)
-        power = float(record.settings.get("power", 1.0))
-        crossed = Image(
-            ((image.rgb - dark) / power).astype(np.float32),
-            ((image.variance + dark_variance) / power**2).astype(np.float32),
-            image.valid,
+    def mean_image(records: Sequence[FrameRecord]) -> Image:
+        linear = linear_light(records)
+        if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
+            raise InputsError(
+                f"{records[0].index['polarizer']} frames: differ in size, expected one camera "
+                "setting"
+            )
+        power = sum(float(record.settings.get("power", 1.0)) for record in records)
+        rgb = total(linear, "rgb") - len(linear) * dark
+        variance = total(linear, "variance") + len(linear) ** 2 * dark_variance
+        return Image(
+            (rgb / power).astype(np.float32),
+            (variance / power**2).astype(np.float32),
+            np.logical_and.reduce([image.valid for image in linear]),
         )
-        yield _separate(inputs, None, crossed)["diffuse"]
+
+    return mean_image
+
+
+def diffuse_of_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
+    """Yield the diffuse reflectance that each of some crossed frames shows alone."""
+    mean_image = _image_reader(rig)
+    for record in records:
+        yield _separate(rig, None, mean_image([record]))["diffuse"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
@@ -263,16 +261,16 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
     return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
 
 
-def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
+def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
     """Split into diffuse and specular light, relative to a white tile in the same place."""
-    white = inputs.white
+    white = rig.white
     if parallel is None:
         diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
         specular = np.zeros_like(crossed.rgb)
         specular_error = np.zeros_like(crossed.rgb)
         specular_valid = np.zeros(crossed.valid.shape, bool)
     else:
-        leak = inputs.polarization.crossed_leak() if inputs.polarization is not None else None
+        leak = rig.polarization.crossed_leak() if rig.polarization is not None else None
         separated = polarization.separate(
             np.where(parallel.valid[..., None], parallel.rgb, np.nan),
             np.where(crossed.valid[..., None], crossed.rgb, np.nan),
@@ -280,7 +278,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
             variance=(parallel.variance, crossed.variance),
         )
         if separated.stderr is None or separated.stderr_specular is None:
-            raise EvidenceError("separation: gave no standard errors; give it variances")
+            raise InputsError("separation: gave no standard errors; give it variances")
         specular = separated.specular.astype(np.float32)
         specular_error = separated.stderr_specular.astype(np.float32)
         specular_valid = np.asarray(separated.valid)
@@ -293,7 +291,7 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
         reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
         level = white.signal
     else:
-        level = np.full_like(diffuse.rgb, _assumed_white(inputs))
+        level = np.full_like(diffuse.rgb, _assumed_white(rig))
         reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
         valid = np.ones(diffuse.valid.shape, bool)
     dim = (reflectance < MIN_SIGNAL_SIGMAS * np.sqrt(variance)).any(axis=-1)
@@ -315,9 +313,9 @@ ASSUMED_WHITE = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
 
 
-def _assumed_white(inputs: Inputs) -> Float32Array:
-    record = inputs.session.frames("subject", state=inputs.state)[0]
-    neutral = inputs.session.read(record).neutral
+def _assumed_white(rig: FlashRig) -> Float32Array:
+    record = rig.session.frames("subject", state=rig.inputs.state)[0]
+    neutral = rig.session.read(record).neutral
     level = np.full(3, ASSUMED_WHITE)
     if neutral is not None:
         level = ASSUMED_WHITE * np.asarray(neutral, float) / max(neutral)
@@ -328,81 +326,54 @@ def _map3(
     values: NDArray[Any], stderr: NDArray[Any], valid: BoolArray, description: str
 ) -> SkinMap:
     good = valid & np.isfinite(values).all(axis=-1) & np.isfinite(stderr).all(axis=-1)
-    keep = good[..., None]
-    return SkinMap(
-        np.where(keep, values, 0.0),
-        "1",
-        np.where(keep, stderr, 0.0),
-        good,
-        f"camera RGB, {description}",
-    )
+    return masked_map(values, stderr, good, "1", f"camera RGB, {description}")
 
 
-def _stderr(skin_map: SkinMap) -> Float32Array:
+def stderr_of(skin_map: SkinMap) -> Float32Array:
+    """Return a map's standard error; 0 where it has none."""
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
 
-def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
-    prior = shading_prior.of_faces()
-    if inputs.white is None:
-        prior = prior.broadened(EXPOSURE_SPREAD)
+def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    has_white = rig.white is not None
+    table, prior = colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
-    variance = np.square(_stderr(diffuse))
+    variance = np.square(stderr_of(diffuse))
     errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
-    # of a face in light of unknown strength its pixels together tell no more
-    face = (
-        None
-        if inputs.white is None
-        else face_chromophores.fit_with_white_reference(
-            rgb, table, variance=variance, model_error=errors
-        )
+    whole = estimate_face(
+        rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
     )
-    known = partial(chromophore_posterior.estimate, rgb, table, prior=prior)
-    found = by_face = known(face=face, variance=variance, model_error=errors)
-    noise_alone = known(face=face, variance=variance)
-    if face is not None:  # moles, lips and lids may be no skin of that face's usual kind
-        alone = known(variance=variance, model_error=errors)
-        spots = dark_spots.is_locally_dark(rgb, variance=variance)
-        spots |= dark_spots.is_lighter_than_face_prior(by_face, alone)
-        found = dark_spots.average_hypotheses(by_face, alone, spots)
+    found, by_face = whole.found, whole.by_face
+    by_noise = partial(chromophore_posterior.estimate, rgb, table, prior=prior, variance=variance)
+    noise_alone = by_noise(face=whole.face)
+    if whole.face is not None:  # moles, lips and lids may be no skin of that face's usual kind
         noise_alone = dark_spots.average_hypotheses(
-            noise_alone, known(variance=variance, valid=spots), spots
+            noise_alone, by_noise(valid=whole.spots), whole.spots
         )
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:
-        values, stderr = (getattr(found, key) for key in (name, f"stderr_{name}"))
-        without_model_error = getattr(noise_alone, f"stderr_{name}")
+        error = f"stderr_{name}"
+        noise = getattr(noise_alone, error)
         # spots are wide on purpose; they say nothing of what is known of the skin around them
         good = detectable(
-            getattr(by_face, name),
-            getattr(by_face, f"stderr_{name}"),
-            usable & np.isfinite(without_model_error),
+            getattr(by_face, name), getattr(by_face, error), usable & np.isfinite(noise)
         )
+        values, stderr, unit = getattr(found, name), getattr(found, error), MAP_UNITS[name]
         why = "invalid where noise and model error leave it unknown"
+        alone = "standard error that noise alone would leave, without model error"
         return {
-            name: SkinMap(
-                np.where(good, values, 0.0), MAP_UNITS[name], np.where(good, stderr, 0.0), good, why
-            ),
-            name + NOISE_STDERR: SkinMap(
-                np.where(good, without_model_error, 0.0),
-                MAP_UNITS[name],
-                valid=good,
-                description="standard error that noise alone would leave, without model error",
-            ),
+            name: masked_map(values, stderr, good, unit, why),
+            name + NOISE_STDERR: masked_map(noise, None, good, unit, alone),
         }
 
+    what = "how far the color lies outside the model's, relative"
     return {
         **chromophore("melanin"),
         **chromophore("hemoglobin"),
-        "shading": SkinMap(np.where(usable, found.shading, 0.0), "1", valid=usable),
-        "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
-        "gamut_distance": SkinMap(
-            np.nan_to_num(found.gamut_distance),
-            "1",
-            description="how far the color lies outside the model's, relative",
-        ),
+        "shading": masked_map(found.shading, None, usable),
+        "residual": masked_map(found.residual, None, usable),
+        "gamut_distance": SkinMap(np.nan_to_num(found.gamut_distance), "1", description=what),
     }
 
 
@@ -417,21 +388,16 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
     found = tsumura.tsumura_ica(diffuse.values, valid)
     note = "independent component of optical density, no absolute scale"
     return {
-        f"tsumura_{name}": SkinMap(
-            np.where(found.valid, getattr(found, name), 0.0),
-            "1",
-            valid=found.valid,
-            description=note,
-        )
+        f"tsumura_{name}": masked_map(getattr(found, name), None, found.valid, "1", note)
         for name in ("melanin", "hemoglobin")
     }
 
 
-def _pictures(inputs: Inputs, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+def _pictures(rig: FlashRig, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
     """Show diffuse and specular light in linear sRGB."""
     picture = diffuse.values.astype(np.float64)
-    if inputs.color is not None and inputs.neutral is not None:
-        picture = inputs.color.to_linear_srgb(picture * inputs.neutral)
+    if rig.color is not None and rig.neutral is not None:
+        picture = rig.color.to_linear_srgb(picture * rig.neutral)
     return {
         "picture": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
         "specular_picture": SkinMap(specular.values, "1", valid=specular.valid),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,8 +13,8 @@ import numpy as np
 from capture.session import Session
 from model.skin import SkinMap
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
 from reconstruction.pipeline.flash import stages as flash_stages
+from reconstruction.pipeline.inputs import Inputs, InputsError
 
 NEUTRAL = "neutral"
 SINGLE_MAPS = ("diffuse",)
@@ -112,7 +111,6 @@ def read(
     sessions: Sequence[Path],
     *,
     calibration: Path | None,
-    on_date: date | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Subject:
     """Reconstruct every state and repeat of flash sessions.
@@ -123,29 +121,27 @@ def read(
         SESSION/ folders of one subject and one camera, with a neutral state among them.
     calibration
         CALIBRATION/ folder; None: everything is assumed.
-    on_date
-        The date that calibrations must be valid on; None: that of each session.
     progress
         Called with one line before each image.
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When a session shows no subject, no state is neutral, or sizes or cameras differ.
     """
     if not sessions:
-        raise EvidenceError("sessions: got none, expected at least one of the flash rig")
+        raise InputsError("sessions: got none, expected at least one of the flash rig")
     opened = [Session.open(path) for path in sessions]
     start = min(session.manifest.created_at for session in opened)
     images: list[StateImage] = []
-    inputs: dict[str, str] = {}
+    read_hashes: dict[str, str] = {}
     assumed: dict[str, None] = {}
     table: set[tuple[str, str]] = set()
     has_white = True
     pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
     named = [state for group in pairs for state, _, _ in group]
     if NEUTRAL not in named:  # told before minutes are spent on images
-        raise EvidenceError(
+        raise InputsError(
             f"sessions: show {', '.join(sorted(set(named)))}, expected a state {NEUTRAL!r} that "
             "the others are laid over"
         )
@@ -155,30 +151,28 @@ def read(
         for state, repeat, since_s in pairs[number]:
             if progress is not None:
                 progress(f"{path.name}: {state}, repeat {repeat}")
-            evidence = Evidence.of(session, calibration, state=state, on_date=on_date)
-            evidence.repeat = repeat
-            found = stages.run(flash_stages.graph(evidence), list(maps)).products
-            images.append(
-                StateImage(state, repeat, number, began_s + since_s, MappingProxyType(dict(found)))
-            )
-            inputs |= {
-                f"session {number}" if key == "session" else key: value
-                for key, value in evidence.hashes.items()
-            }
-            assumed |= dict.fromkeys(evidence.assumed)
-            spectra = evidence.noted["color_table"]
+            inputs = Inputs.of(session, calibration, state=state)
+            inputs.repeat = repeat
+            found = stages.run(flash_stages.graph(inputs), list(maps)).products
+            kept = MappingProxyType(dict(found))
+            images.append(StateImage(state, repeat, number, began_s + since_s, kept))
+            hashes = dict(inputs.hashes)
+            read_hashes[f"session {number}"] = hashes.pop("session")
+            read_hashes |= hashes
+            assumed |= dict.fromkeys(inputs.assumed)
+            spectra = inputs.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
-            has_white = has_white and "calibration white" in evidence.hashes
+            has_white = has_white and "calibration white" in inputs.hashes
     if len(table) > 1:
-        raise EvidenceError(f"sessions: of {len(table)} cameras or lights, expected one of each")
+        raise InputsError(f"sessions: of {len(table)} cameras or lights, expected one of each")
     shapes = {image.maps["diffuse"].values.shape for image in images}
     if len(shapes) > 1:
-        raise EvidenceError(f"sessions: images of sizes {sorted(shapes)}, expected one size")
+        raise InputsError(f"sessions: images of sizes {sorted(shapes)}, expected one size")
     ((camera, illuminant),) = table
     simulated = any(session.source == "simulated" for session in opened)
     return Subject(
         images=tuple(sorted(images, key=lambda image: image.captured_s)),
-        inputs=inputs,
+        inputs=read_hashes,
         assumed=tuple(assumed),
         source="simulated" if simulated else "measured",
         seed=opened[0].seed,
@@ -194,7 +188,7 @@ def _pairs(session: Session, path: Path) -> list[tuple[str, int, float]]:
     """Return state, repeat and seconds since the first frame of each crossed image."""
     crossed = session.frames("subject", polarizer="crossed")
     if not crossed:
-        raise EvidenceError(
+        raise InputsError(
             f"{path}: has no crossed frame of a subject, expected a session of the flash rig"
         )
     first = min(record.line.t_host_s for record in session.frames())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from capture import raw
 from capture.plan.gradient import state_name
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 Key = tuple[str, str]
@@ -54,29 +55,27 @@ class Patterns:
     variance: Mapping[Key, Float32Array]
     valid: BoolArray
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the pictures."""
+        return self.valid.shape[0], self.valid.shape[1]
+
     def crossed(self) -> Float32Array:
         """Return the light from inside the skin: all crossed pictures together.
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When there is none.
         """
-        return self._sum("crossed")
-
-    def parallel(self) -> Float32Array:
-        """Return all pictures with parallel polarizers together, as `crossed`."""
-        return self._sum("parallel")
-
-    def _sum(self, polarizer: str) -> Float32Array:
-        chosen = [
+        lit = [
             picture
-            for (pattern, turned), picture in self.values.items()
-            if turned == polarizer and pattern != "dark"
+            for (pattern, polarizer), picture in self.values.items()
+            if polarizer == "crossed" and pattern != "dark"
         ]
-        if not chosen:
-            raise EvidenceError(f"state: has no lit picture with {polarizer} polarizers")
-        return np.mean(chosen, axis=0, dtype=np.float32)
+        if not lit:
+            raise InputsError("state: has no lit picture with crossed polarizers")
+        return np.mean(lit, axis=0, dtype=np.float32)
 
 
 class GradientImages:
@@ -96,7 +95,7 @@ class GradientImages:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session holds no such frames, or no neutral state to compare with.
     """
 
@@ -109,25 +108,18 @@ class GradientImages:
             index = record.index
             angle, step = float(index["angle"]), int(index["caliper"])
             name = state_name(angle, step)
-            actual = record.actual
-            found.setdefault(
-                name,
-                SkinState(
-                    name,
-                    angle,
-                    step,
-                    float(actual.get("aperture_mm", math.nan)),
-                    float(actual.get("force_n", math.nan)),
-                ),
+            aperture_mm, force_n = (
+                float(record.actual.get(key, math.nan)) for key in ("aperture_mm", "force_n")
             )
+            found.setdefault(name, SkinState(name, angle, step, aperture_mm, force_n))
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
-            raise EvidenceError(f"{session.path}: has no frames of kind 'gradient'")
+            raise InputsError(f"{session.path}: has no frames of kind 'gradient'")
         states = list(found.values())
         first = next((state for state in states if state.step == 0), None)
         if first is None:
-            raise EvidenceError(
+            raise InputsError(
                 f"{session.path}: has no neutral state, caliper step 0, that the others "
                 "could be compared with"
             )
@@ -147,7 +139,7 @@ class GradientImages:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When frames differ in size.
         """
         values: dict[Key, Float32Array] = {}
@@ -164,27 +156,19 @@ class GradientImages:
             variance[key] = spread + np.float32(self._dark_variance)
             valid = good if valid is None else valid & good
             if mean.shape != next(iter(values.values())).shape:
-                raise EvidenceError(f"state {state.name}: its frames differ in size")
+                raise InputsError(f"state {state.name}: its frames differ in size")
         if valid is None:
-            raise EvidenceError(f"state {state.name}: has no lit picture")
+            raise InputsError(f"state {state.name}: has no lit picture")
         return Patterns(values, variance, valid)
 
     def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
-        total: Float32Array | None = None
-        for record in records:
-            frame = self._session.read(record)
-            noise = self._noise
-            value, spread, good = raw.linear_mono(
-                frame,
-                gain=None if noise is None else noise.gain,
-                read_noise=None if noise is None else noise.read_noise,
-            )
-            if total is None:
-                total, variance, valid = value, spread, good
-            else:
-                total, variance, valid = total + value, variance + spread, valid & good
-        if total is None:
-            raise EvidenceError("a pattern has no frame")
+        if not records:
+            raise InputsError("a pattern has no frame")
+        noise = {} if self._noise is None else dataclasses.asdict(self._noise)
+        frames = (raw.linear_mono(self._session.read(record), **noise) for record in records)
+        total, variance, valid = next(frames)
+        for value, spread, good in frames:
+            total, variance, valid = total + value, variance + spread, valid & good
         count = np.float32(len(records))
         return total / count, variance / count**2, valid
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -16,16 +17,16 @@ from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
 from model.skin import MAP_UNITS, SkinMap
 from model.vectors import unit_vectors
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
 from reconstruction.gradient_normals.sphere_lights import SphereLights
-from reconstruction.normal_integration import integrate_map, relief_errors
+from reconstruction.normal_histogram.statistics import NormalStatistics
+from reconstruction.normal_integration import HeightMap, integrate_map, relief_errors
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.lens_restoration import Aperture, Restored, restore
 from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.gradient.images import GradientImages, Patterns, SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
@@ -33,6 +34,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
     fit_kernels,
     histogram_document,
 )
+from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 STAGE_REVISION = 7
@@ -103,74 +105,56 @@ class Rig:
         return Perspective(self.focal_px, ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session of the gradient sphere can go through."""
-    rig = _rig(evidence)
-    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
-    states = rig.images.states
-    neutral = rig.images.neutral
-    heights = tuple(f"height_{state.name}" for state in states)
+    rig = _rig(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    neutral = rig.images.neutral.name
+    heights = " ".join(f"height_{state.name}" for state in rig.images.states)
     made = [
-        stages.Stage("strain", (), ("_strains", STRAIN_FILE), lambda: _strain(evidence, rig), base),
-        stages.Stage("facets", (), ("_facets",), lambda: _facets(evidence, rig), base),
-        stages.Stage(
-            f"diffuse normals {neutral.name}",
-            (),
-            (f"diffuse_normals_{neutral.name}",),
-            lambda: _diffuse(rig),
-            base,
+        stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, inputs, rig)),
+        stage("facets", "", "_facets", partial(_facets, inputs, rig)),
+        stage(
+            f"diffuse normals {neutral}", "", f"diffuse_normals_{neutral}", partial(_diffuse, rig)
         ),
-        stages.Stage(
+        stage(
             "histograms",
-            ("_strains", *heights),
-            (HISTOGRAM_FILE, "_histograms"),
-            lambda **made: _histograms(rig, made),
-            base,
+            f"_strains {heights}",
+            f"{HISTOGRAM_FILE} _histograms",
+            partial(_histograms, rig),
         ),
-        stages.Stage(
+        stage(
             "kernels",
-            ("_strains", "_histograms", *heights),
-            (KERNEL_FILE,),
-            lambda **made: _kernels(evidence, rig, made),
-            base,
+            f"_strains _histograms {heights}",
+            KERNEL_FILE,
+            partial(_kernels, inputs, rig),
         ),
     ]
-    for state in states:
-        made.append(
-            stages.Stage(
-                f"crossed {state.name}",
-                (),
-                (f"crossed_{state.name}",),
-                partial(_crossed, rig, state),
-                base,
-            )
-        )
-        made.append(
-            stages.Stage(
-                f"normals {state.name}",
-                ("_facets",),
-                (f"normals_{state.name}", f"_restored_{state.name}"),
+    for state in rig.images.states:
+        name = state.name
+        made += [
+            stage(f"crossed {name}", "", f"crossed_{name}", partial(_crossed, rig, state)),
+            stage(
+                f"normals {name}",
+                "_facets",
+                f"normals_{name} _restored_{name}",
                 partial(_normals, rig, state),
-                base,
-            )
-        )
-        made.append(
-            stages.Stage(
-                f"height {state.name}",
-                (f"_restored_{state.name}",),
-                (f"height_{state.name}",),
+            ),
+            stage(
+                f"height {name}",
+                f"_restored_{name}",
+                f"height_{name}",
                 partial(_height, rig, state),
-                base,
-            )
-        )
+            ),
+        ]
     return made
 
 
-def _rig(evidence: Evidence) -> Rig:
-    session = evidence.session
+def _rig(inputs: Inputs) -> Rig:
+    session = inputs.session
     shots = session.frames("gradient")
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
-    sensor = evidence.load(
+    sensor = inputs.load(
         "sensor", [view.serial], "the frames are as noisy as they say of themselves"
     )
     noise = None
@@ -178,15 +162,15 @@ def _rig(evidence: Evidence) -> Rig:
         known = SensorCalibration.from_calibration(sensor, view.serial)
         noise = SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
     pixel_um = view.pixel_um * view.distance_mm / view.focal_mm
-    evidence.noted["pixel_um"] = pixel_um
+    inputs.noted["pixel_um"] = pixel_um
     images = GradientImages(session, noise=noise)
-    evidence.noted["states"] = [state.name for state in images.states]
+    inputs.noted["states"] = [state.name for state in images.states]
     return Rig(
         images,
         pixel_um,
         view.focal_px,
         np.array(view.position_mm),
-        _lights(evidence, view.serial),
+        _lights(inputs, view.serial),
         Aperture.of(
             f_number=view.f_number,
             magnification=view.pixel_um / pixel_um,
@@ -196,15 +180,15 @@ def _rig(evidence: Evidence) -> Rig:
     )
 
 
-def _lights(evidence: Evidence, serial: str) -> SphereLights:
+def _lights(inputs: Inputs, serial: str) -> SphereLights:
     """Return the sphere's lights as calibrated, or as the rig's file describes them."""
-    rig = evidence.session.rig
+    rig = inputs.session.rig
     names = [light.name for light in rig.lights]
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     nominal = SphereLightTable.nominal(rig)
-    found = evidence.load("lights", names, "the lights stand and shine as the rig file says")
+    found = inputs.load("lights", names, "the lights stand and shine as the rig file says")
     table = nominal if found is None else SphereLightTable.from_calibration(found, rig)
-    leak = evidence.load(
+    leak = inputs.load(
         "polarization", [*names, serial], "crossed polarizers stop all that the surface reflects"
     )
     leakage = np.zeros(len(names))
@@ -227,11 +211,11 @@ def _lights(evidence: Evidence, serial: str) -> SphereLights:
     )
 
 
-def _strain(evidence: Evidence, rig: Rig) -> Mapping[str, Any]:
+def _strain(inputs: Inputs, rig: Rig) -> Mapping[str, Any]:
     found = measure_states(rig.images)
     lost = [each.state.name for each in found if not each.usable]
     if lost:
-        evidence.assumed.append(
+        inputs.assumed.append(
             f"strain of {', '.join(lost)}: no texture could be followed; these states are left out "
             "of histograms and kernels"
         )
@@ -244,19 +228,12 @@ def _strain(evidence: Evidence, rig: Rig) -> Mapping[str, Any]:
     return {"_strains": found, STRAIN_FILE: stages.document_bytes(document)}
 
 
-def _crossed(rig: Rig, state: SkinState) -> Mapping[str, SkinMap]:
+def _crossed(rig: Rig, state: SkinState) -> SkinMap:
     patterns = rig.images.of(state)
     lit = [key for key in patterns.values if key[1] == "crossed"]
     variance = np.sum([patterns.variance[key] for key in lit], axis=0) / len(lit) ** 2
-    return {
-        f"crossed_{state.name}": SkinMap(
-            patterns.crossed(),
-            "1",
-            np.sqrt(variance),
-            patterns.valid,
-            "light from inside the skin, mean of all crossed pictures, fraction of full scale",
-        )
-    }
+    what = "light from inside the skin, mean of all crossed pictures, fraction of full scale"
+    return SkinMap(patterns.crossed(), "1", np.sqrt(variance), patterns.valid, what)
 
 
 def _patterns_normals(
@@ -268,15 +245,15 @@ def _patterns_normals(
     wiener: bool = False,
     alpha: Roughness | None = None,
 ) -> NormalMaps:
-    shape = patterns.valid.shape
+    shape = patterns.shape
     return from_patterns(
         patterns.values,
         component=component,
-        view=rig.views((shape[0], shape[1])),
+        view=rig.views(shape),
         variance=patterns.variance,
         valid=patterns.valid,
         lights=rig.lights,
-        points_mm=rig.points_mm((shape[0], shape[1])),
+        points_mm=rig.points_mm(shape),
         smooth_px=smooth_px,
         smooth_crossed_px=None if wiener or component == "diffuse" else CROSSED_SMOOTH_PX,
         wiener=wiener,
@@ -284,49 +261,44 @@ def _patterns_normals(
     )
 
 
-def _facets(evidence: Evidence, rig: Rig) -> Mapping[str, Roughness]:
+def _facets(inputs: Inputs, rig: Rig) -> Roughness:
     """Estimate the roughness of facets below a pixel, once: strain turns facets, not their own."""
     patterns = rig.images.of(rig.images.neutral)
-    shape = patterns.valid.shape
     found = estimate_roughness(
         patterns.values,
         lights=rig.lights,
-        view=rig.views((shape[0], shape[1])),
+        view=rig.views(patterns.shape),
         variance=patterns.variance,
         valid=patterns.valid,
         smooth_px=SMOOTH_PX,
     )
-    evidence.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
-    return {"_facets": found}
+    inputs.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
+    return found
 
 
-def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
+def _normals(rig: Rig, state: SkinState, _facets: Roughness) -> Mapping[str, Any]:
     """Return normals as the lens shows them, and the slopes of the surface before the lens."""
     patterns = rig.images.of(state)
     skin = skin_mask(patterns.crossed())
-    facets: Roughness = made["_facets"]
-    smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=facets)
-    sharp = _patterns_normals(rig, patterns, "specular", alpha=facets)
+    smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=_facets)
+    sharp = _patterns_normals(rig, patterns, "specular", alpha=_facets)
     # noise takes single pixels of steep furrows beyond what a lobe can tell; a hole there would cut
     # the height, so that the filtered normal stands in
     normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
     known = (sharp.valid | smooth.valid) & skin
+    shown = _normal_map(smooth, skin, "of the surface's reflection", relief=True)
     restored = restore(normals, lens=rig.lens, valid=known)
     return {
-        f"normals_{state.name}": _normal_map(
-            smooth, skin, "of the surface's reflection", relief=True
-        ),
+        f"normals_{state.name}": shown,
         f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
     }
 
 
-def _diffuse(rig: Rig) -> Mapping[str, SkinMap]:
-    state = rig.images.neutral
-    patterns = rig.images.of(state)
+def _diffuse(rig: Rig) -> SkinMap:
+    patterns = rig.images.of(rig.images.neutral)
     found = _patterns_normals(rig, patterns, "diffuse", smooth_px=DIFFUSE_SMOOTH_PX)
-    skin = skin_mask(patterns.crossed())
     what = "of the light from inside the skin, which spreads over tenths of a millimetre"
-    return {f"diffuse_normals_{state.name}": _normal_map(found, skin, what)}
+    return _normal_map(found, skin_mask(patterns.crossed()), what)
 
 
 def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool = False) -> SkinMap:
@@ -344,36 +316,37 @@ def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool =
     )
 
 
-def _height(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, SkinMap]:
+def _height(rig: Rig, state: SkinState, **made: Any) -> SkinMap:
     """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
     restored: Restored
     valid: BoolArray
     restored, valid, stderr_rad = made[f"_restored_{state.name}"]
     shape = valid.shape
-    settings: dict[str, Any] = {
-        "pixel": rig.pixel_um,
-        "camera": rig.perspective((shape[0], shape[1])),
+
+    def relief(normals: FloatArray, known: BoolArray) -> HeightMap:
         # steep walls of furrows, dim and partly hidden, count less
-        "stderr_rad": stderr_rad,
-    }
-    found = integrate_map(restored.normals, valid=valid, **settings)
-    height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
-    by_noise = _height_stderr(restored, found.valid, settings)
-    stderr = relief_errors.of_height(height, by_noise, found.valid)
-    return {
-        f"height_{state.name}": SkinMap(
-            height.astype(np.float32),
-            "um",
-            stderr,
-            found.valid,
-            f"height towards the camera, the lens's blur undone as far as noise allows, without "
-            f"what is longer than {CUTOFF_UM / 1e3:g} mm",
+        found = integrate_map(
+            normals,
+            valid=known,
+            pixel=rig.pixel_um,
+            camera=rig.perspective((shape[0], shape[1])),
+            stderr_rad=stderr_rad,
         )
-    }
+        height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
+        return dataclasses.replace(found, height=height)
+
+    found = relief(restored.normals, valid)
+    by_noise = _height_stderr(restored, found.valid, relief)
+    stderr = relief_errors.of_height(found.height, by_noise, found.valid)
+    what = (
+        "height towards the camera, the lens's blur undone as far as noise allows, without "
+        f"what is longer than {CUTOFF_UM / 1e3:g} mm"
+    )
+    return SkinMap(found.height.astype(np.float32), "um", stderr, found.valid, what)
 
 
 def _height_stderr(
-    restored: Restored, valid: BoolArray, settings: Mapping[str, Any]
+    restored: Restored, valid: BoolArray, relief: Callable[[FloatArray, BoolArray], HeightMap]
 ) -> Float32Array:
     """Return the standard error of a height by what fields of noise become on the same way."""
     rng = np.random.default_rng(0)
@@ -381,35 +354,32 @@ def _height_stderr(
     for _ in range(STDERR_SAMPLES):
         x, y = restored.noise_field(rng)
         field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
-        found = integrate_map(field, valid=valid, **settings)
-        rough = high_pass(
-            found.height, pixel=settings["pixel"], cutoff=CUTOFF_UM, valid=found.valid
-        )
-        total += rough.astype(np.float64) ** 2
+        total += relief(field, valid).height.astype(np.float64) ** 2
     # the noise is about the same everywhere: its variance varies slowly, borders aside
     weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
     even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
     return np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
 
 
-def _histograms(rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
-    strains: list[StateStrain] = made["_strains"]
-    found = count_normals(strains, _heights(strains, made), pixel_um=rig.pixel_um)
-    document = histogram_document(strains, found)
+def _histograms(rig: Rig, _strains: list[StateStrain], **heights: SkinMap) -> Mapping[str, Any]:
+    found = count_normals(_strains, _by_state(heights), pixel_um=rig.pixel_um)
+    document = histogram_document(_strains, found)
     return {"_histograms": found, HISTOGRAM_FILE: stages.document_bytes(document)}
 
 
-def _kernels(evidence: Evidence, rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
-    strains: list[StateStrain] = made["_strains"]
+def _kernels(
+    inputs: Inputs,
+    rig: Rig,
+    _strains: list[StateStrain],
+    _histograms: Mapping[str, NormalStatistics],
+    **heights: SkinMap,
+) -> bytes:
+    tell = partial(inputs.tell, "kernels")
     document = fit_kernels(
-        strains,
-        _heights(strains, made),
-        made["_histograms"],
-        pixel_um=rig.pixel_um,
-        tell=lambda share: evidence.tell("kernels", share),
+        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, tell=tell
     )
-    return {KERNEL_FILE: stages.document_bytes(document)}
+    return stages.document_bytes(document)
 
 
-def _heights(strains: list[StateStrain], made: Mapping[str, Any]) -> dict[str, SkinMap]:
-    return {each.state.name: made[f"height_{each.state.name}"] for each in strains}
+def _by_state(heights: Mapping[str, SkinMap]) -> dict[str, SkinMap]:
+    return {name.removeprefix("height_"): height for name, height in heights.items()}

@@ -19,6 +19,7 @@ from reconstruction.kernel_fit.table import KernelTableFitError, direction_depen
 from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, grid_of
 from reconstruction.normal_histogram.statistics import NormalStatistics, measure
 from reconstruction.pipeline.gradient.skin_strain import StateStrain
+from reconstruction.pipeline.graph import attributes_of
 
 MIN_SAMPLES = 1000
 """Fewer pixels make no histogram."""
@@ -75,6 +76,11 @@ def histogram_document(
     and `HIDDEN_VARIANCE_RATIO`; of histograms and variances alike the relief is the one that
     heights show.
     """
+    of_samples = "samples outside effective_samples samples_per_bucket aliased"
+
+    def hidden(stderr: float, variance: float) -> float:
+        return math.hypot(stderr, HIDDEN_VARIANCE_RATIO * variance)
+
     return {
         "schema": "skinrig.histograms/1",
         "axes": "rows n across the jaws, columns n along them, each -1 to 1",
@@ -83,19 +89,11 @@ def histogram_document(
                 "name": each.state.name,
                 "angle_deg": each.state.angle_deg,
                 "counts": one.histogram,
-                "samples": one.samples,
-                "outside": one.outside,
-                "effective_samples": one.effective_samples,
-                "samples_per_bucket": one.samples_per_bucket,
-                "aliased": one.aliased,
+                **attributes_of(one, of_samples),
                 "variance_s": one.variance_x,
-                "variance_s_stderr": math.hypot(
-                    one.stderr_x, HIDDEN_VARIANCE_RATIO * one.variance_x
-                ),
+                "variance_s_stderr": hidden(one.stderr_x, one.variance_x),
                 "variance_t": one.variance_y,
-                "variance_t_stderr": math.hypot(
-                    one.stderr_y, HIDDEN_VARIANCE_RATIO * one.variance_y
-                ),
+                "variance_t_stderr": hidden(one.stderr_y, one.variance_y),
             }
             for each in strains
             if (one := found.get(each.state.name)) is not None
@@ -267,32 +265,21 @@ def fit_kernels(
 
 
 def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
+    names = (
+        "alpha alpha_stderr sigma_um sigma_stderr_um alpha_95 sigma_95_um alpha_interval "
+        "sigma_interval_um alpha_refined sigma_refined_um distance distance_before"
+    )
     return {
         "name": each.state.name,
         "angle_deg": each.state.angle_deg,
         "stretch_s": each.stretch_s[0],
         "stretch_s_stderr": each.stretch_s[1],
         "stretch_t": each.stretch_t[0],
-        "alpha": fit.alpha,
-        "alpha_stderr": fit.alpha_stderr,
-        "sigma_um": fit.sigma_um,
-        "sigma_stderr_um": fit.sigma_stderr_um,
-        "alpha_95": fit.alpha_95,
-        "sigma_95_um": fit.sigma_95_um,
-        "alpha_interval": fit.alpha_interval,
-        "sigma_interval_um": fit.sigma_interval_um,
-        "alpha_refined": fit.alpha_refined,
-        "sigma_refined_um": fit.sigma_refined_um,
-        "distance": fit.distance,
-        "distance_before": fit.distance_before,
+        **attributes_of(fit, names),
         "distance_noise": fit.noise,
         "noise_floor": fit.floor,
         "near_best_count": len(fit.near_best),
-        "at_edge": fit.at_edge,
-        "aliased": fit.aliased,
-        "search": fit.search,
-        "valid": fit.valid,
-        "reason": fit.reason,
+        **attributes_of(fit, "at_edge aliased search valid reason"),
     }
 
 
@@ -309,29 +296,22 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
         )
     except (KernelTableFitError, KernelTableError):  # too few points, or lines that reach sigma 0
         return None
-    low, high = found.table.stretch_range
+    table = found.table
+    low, high = table.stretch_range
     r = np.linspace(low, high, LINE_POINTS)
-    lines = {
-        "compression": found.table.sigma_compression_um,
-        "stretch": found.table.sigma_stretch_um,
-    }
     sigma = np.full(r.size, np.nan)
-    for side, line in lines.items():
+    for line, part in ((table.sigma_compression_um, r < 1.0), (table.sigma_stretch_um, r >= 1.0)):
         if line is not None:
-            part = r < 1.0 if side == "compression" else r >= 1.0
             sigma[part] = line[0] * r[part] + line[1]
+    lines = "alpha_breaks alpha_lines sigma_compression_um sigma_stretch_um"
     return {
         "name": "all angles" if angle is None else f"{angle:.0f} degrees",
-        "alpha_breaks": found.table.alpha_breaks,
-        "alpha_lines": found.table.alpha_lines,
-        "sigma_compression_um": found.table.sigma_compression_um,
-        "sigma_stretch_um": found.table.sigma_stretch_um,
+        **attributes_of(table, lines),
         "stretch_range": (low, high),
-        "alpha_rms": found.alpha_rms,
-        "sigma_rms_um": found.sigma_rms_um,
+        **attributes_of(found, "alpha_rms sigma_rms_um"),
         "lines": {
             "stretch": r,
-            "alpha": np.clip(found.table.unlimited_alpha(r), -2.0, 1.0),
+            "alpha": np.clip(table.unlimited_alpha(r), -2.0, 1.0),
             "sigma_um": sigma,
         },
     }
@@ -340,26 +320,12 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
 def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Return how kernels depend on the direction of stretch; None where it cannot be told."""
     chosen = [fit for fit in fits if fit["valid"]]
-    columns = {
-        key: [fit[key] for fit in chosen] for key in ("stretch_s", "alpha", "sigma_um", "angle_deg")
-    }
+    names = ("stretch_s", "alpha", "sigma_um", "angle_deg")
+    stretch, alpha, sigma, angle_deg = ([fit[name] for fit in chosen] for name in names)
     try:
-        table = fit_table(columns["stretch_s"], columns["alpha"], columns["sigma_um"]).table
-        found = direction_dependence(
-            table,
-            columns["stretch_s"],
-            columns["alpha"],
-            columns["sigma_um"],
-            np.radians(columns["angle_deg"]),
-        )
+        table = fit_table(stretch, alpha, sigma).table
+        found = direction_dependence(table, stretch, alpha, sigma, np.radians(angle_deg))
     except (KernelTableFitError, KernelTableError):
         return None
-    return {
-        "angle_deg": np.degrees(found.angle_rad),
-        "alpha_offset": found.alpha_offset,
-        "alpha_stderr": found.alpha_stderr,
-        "sigma_offset_um": found.sigma_offset_um,
-        "sigma_stderr_um": found.sigma_stderr_um,
-        "p_alpha": found.p_alpha,
-        "p_sigma": found.p_sigma,
-    }
+    errors = "alpha_offset alpha_stderr sigma_offset_um sigma_stderr_um p_alpha p_sigma"
+    return {"angle_deg": np.degrees(found.angle_rad), **attributes_of(found, errors)}

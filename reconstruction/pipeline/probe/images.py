@@ -12,7 +12,7 @@ from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_dark
 from capture.calibration.fiber.merge import MergedSeries, merge_series
 from capture.plan.suction import Placement, placement_of
 from capture.session import FrameRecord, Session
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 
 
 def measurement_name(placement: Placement) -> str:
@@ -65,7 +65,7 @@ class ProbeImages:
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session holds no such frames.
     """
 
@@ -78,7 +78,7 @@ class ProbeImages:
             if placement is not None:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
-            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
+            raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
         self.measurements = tuple(
             Measurement(
                 placement,
@@ -97,13 +97,13 @@ class ProbeImages:
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When the session has no dark frames.
         """
         if self._darks is None:
             records = self._session.frames("dark")
             if not records:
-                raise EvidenceError(
+                raise InputsError(
                     f"{self._session.path}: has no frames of kind 'dark'; the camera's dark "
                     "current is not known: capture with darks"
                 )
@@ -143,7 +143,7 @@ def _light_s(record: FrameRecord) -> float:
 def _level(records: list[FrameRecord]) -> float:
     levels = {float(record.settings.get("level", 1.0)) for record in records}
     if len(levels) > 1:
-        raise EvidenceError(
+        raise InputsError(
             f"step {records[0].step_id}: got levels {sorted(levels)} in one series, expected one"
         )
     return levels.pop()

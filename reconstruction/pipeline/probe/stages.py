@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
 from reconstruction.anisotropy.one_direction_bias import one_direction_bias
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages
 from reconstruction.pipeline.probe.profile_fits import (
     METHOD_NAMES,
@@ -58,87 +59,68 @@ def products(_: Session) -> Mapping[str, tuple[str, ...]]:
     }
 
 
-def graph(evidence: Evidence) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a session of the fibre probe can go through.
 
     Raises
     ------
-    EvidenceError
+    InputsError
         When the session's rig has no probe, or the table of landmarks cannot be read.
     """
-    probe = evidence.session.rig.probe
+    probe = inputs.session.rig.probe
     if probe is None:
-        raise EvidenceError(
-            f"{evidence.session.path}: its rig has no probe, expected one with fibres"
-        )
-    serial = evidence.session.rig.views[0].serial
+        raise InputsError(f"{inputs.session.path}: its rig has no probe, expected one with fibres")
+    view = inputs.session.rig.views[0]
     nominal = "the camera's gain and read noise are those of the rig file"
-    sensor = evidence.load("sensor", [serial], nominal)
-    fibres = _fibres(evidence)
-    places = _places(evidence)
-    base = {"revision": STAGE_REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    sensor = inputs.load("sensor", [view.serial], nominal)
+    fibres = _fibres(inputs)
+    places = _places(inputs)
+    stage = inputs.stage_maker(STAGE_REVISION)
+    noise = CameraNoise.of_view(view)
+    if sensor is not None:
+        noise = CameraNoise.of_sensor(SensorCalibration.from_calibration(sensor, view.serial))
+    uncalibrated = (
+        "the fibres are not calibrated: capture a phantom of known optics (`--target phantom`), "
+        "and give the folder that `skinrig calibrate fibre` makes of it as --calibration"
+    )
     return [
-        stages.Stage(
+        stage(
             "profiles",
-            (),
-            ("_profiles", PROFILE_FILE),
-            lambda: _profiles(evidence, fibres, sensor),
-            base,
-            refused=""
-            if fibres is not None
-            else (
-                "the fibres are not calibrated: capture a phantom of known optics "
-                "(`--target phantom`), and give the folder that `skinrig calibrate fibre` makes of "
-                "it as --calibration"
-            ),
+            "",
+            f"_profiles {PROFILE_FILE}",
+            partial(_profiles, inputs, fibres, noise),
+            "" if fibres is not None else uncalibrated,
         ),
-        stages.Stage(
+        stage(
             "subsurface",
-            ("_profiles",),
-            ("_fits", "_sites", SUBSURFACE_FILE),
-            lambda _profiles: _subsurface(_profiles, probe),
-            base,
+            "_profiles",
+            f"_fits _sites {SUBSURFACE_FILE}",
+            partial(_subsurface, probe),
         ),
-        stages.Stage(
-            "anisotropy",
-            ("_fits",),
-            (ANISOTROPY_FILE,),
-            lambda _fits: {ANISOTROPY_FILE: _anisotropy(_fits)},
-            base,
-        ),
-        stages.Stage(
-            "translucency",
-            ("_sites",),
-            ("translucency",),
-            lambda _sites: _translucency(_sites, places, evidence),
-            base,
-        ),
+        stage("anisotropy", "_fits", ANISOTROPY_FILE, _anisotropy),
+        stage("translucency", "_sites", "translucency", partial(_translucency, places, inputs)),
     ]
 
 
-def _fibres(evidence: Evidence) -> FiberCalibration | None:
-    rig = evidence.session.rig
+def _fibres(inputs: Inputs) -> FiberCalibration | None:
+    rig = inputs.session.rig
     serial = rig.views[0].serial
-    found = evidence.load("fibre", [serial], "nothing of the fibres")
+    found = inputs.load("fibre", [serial], "nothing of the fibres")
     if found is None:
-        evidence.assumed.remove("nothing of the fibres")
+        inputs.assumed.remove("nothing of the fibres")
         return None
     return FiberCalibration.from_calibration(found, rig, serial)
 
 
 def _profiles(
-    evidence: Evidence, fibres: FiberCalibration | None, sensor: Any
+    inputs: Inputs, fibres: FiberCalibration | None, noise: CameraNoise
 ) -> Mapping[str, Any]:
     if fibres is None:
-        raise EvidenceError("the fibres are not calibrated")
-    view = evidence.session.rig.views[0]
-    noise = CameraNoise.of_view(view)
-    if sensor is not None:
-        noise = CameraNoise.of_sensor(SensorCalibration.from_calibration(sensor, view.serial))
-    images = ProbeImages(evidence.session, noise=noise)
+        raise InputsError("the fibres are not calibrated")
+    images = ProbeImages(inputs.session, noise=noise)
     found = []
     for number, measurement in enumerate(images.measurements):
-        evidence.tell("profiles", number / len(images.measurements))
+        inputs.tell("profiles", number / len(images.measurements))
         merged = images.merged(measurement)
         # the camera may have moved against the fibres since they were calibrated
         spots, _ = fibres.spots.moved(merged, noise.pattern)
@@ -156,9 +138,7 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
         "measurements": [
             {
                 **_head(profile.measurement),
-                "brackets": profile.measurement.brackets,
-                "suction_mbar": profile.measurement.suction_mbar,
-                "camera_c": profile.measurement.camera_c,
+                **stages.attributes_of(profile.measurement, "brackets suction_mbar camera_c"),
                 "left_out": dict(profile.reflectance.reasons),
                 "channels": {
                     channel: {
@@ -175,8 +155,8 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
     }
 
 
-def _subsurface(profiles: Sequence[Profile], probe: Probe) -> Mapping[str, Any]:
-    fits = {method: fit_profiles(profiles, probe, method) for method in METHOD_NAMES}
+def _subsurface(probe: Probe, _profiles: Sequence[Profile]) -> Mapping[str, Any]:
+    fits = {method: fit_profiles(_profiles, probe, method) for method in METHOD_NAMES}
     sites = site_values(fits[METHOD_NAMES[0]])
     document = {
         "schema": "skinrig.subsurface/1",
@@ -193,7 +173,7 @@ def _subsurface(profiles: Sequence[Profile], probe: Probe) -> Mapping[str, Any]:
                     for method in METHOD_NAMES
                 ],
             }
-            for number, profile in enumerate(profiles)
+            for number, profile in enumerate(_profiles)
         ],
         "sites": [_site_document(site, c) for site in sites for c in range(len(CHANNEL_NAMES))],
     }
@@ -227,18 +207,19 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
         "sigma_s_prime_stderr": np.hypot(
             fit.sigma_s_prime_stderr[c], shared[1] * fit.sigma_s_prime_per_mm[c]
         ),
-        "correlation": fit.correlation[c],
-        "coefficients_identified": fit.coefficients_identified[c],
-        "chi2": fit.chi2[c],
-        "dof": fit.dof[c],
-        "p_value": fit.p_value[c],
-        "inflation": fit.inflation[c],
-        "used": fit.used[c],
-        "predicted_per_mm2": fit.predicted_per_mm2[c],
-        "residual": fit.residual[c],
-        "valid": fit.valid[c],
+        **_of_channel(
+            fit,
+            "correlation coefficients_identified chi2 dof p_value inflation used "
+            "predicted_per_mm2 residual valid",
+            c,
+        ),
         "reason": fit.reason(c),
     }
+
+
+def _of_channel(record: Any, names: str, c: int) -> dict[str, Any]:
+    """Return one channel of a record's attributes, by their names, parted by spaces."""
+    return {name: values[c] for name, values in stages.attributes_of(record, names).items()}
 
 
 def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
@@ -254,12 +235,12 @@ def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
     }
 
 
-def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
+def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
     """Tell the dependence on direction at every site and repeat with enough directions."""
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
-    for (site, repeat), group in profile_groups([fit.profile for fit in fits]).items():
-        own = [fits[number] for number in group]
+    for (site, repeat), group in profile_groups([fit.profile for fit in _fits]).items():
+        own = [_fits[number] for number in group]
         if len(own) < MIN_DIRECTIONS:
             skipped.append(
                 f"{site}, repeat {repeat}: {len(own)} directions, expected at least "
@@ -282,16 +263,12 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
                     "repeat": repeat,
                     "channel": channel,
                     "directions": int(found.used[:, c].sum()),
-                    "ratio": found.ratio[c],
-                    "ratio_stderr": found.ratio_stderr[c],
+                    **_of_channel(found, "ratio ratio_stderr", c),
                     "axis_deg": math.degrees(found.axis_rad[c]),
                     "axis_stderr_deg": math.degrees(found.axis_stderr_rad[c]),
                     "p_value": found.p_value[c],
                     "anisotropic": bool(found.valid[c] and found.p_value[c] < FALSE_ALARMS),
-                    "mean_per_mm": found.mean_per_mm[c],
-                    "mean_stderr_per_mm": found.mean_stderr_per_mm[c],
-                    "tilt": found.tilt[c],
-                    "tilt_p_value": found.tilt_p_value[c],
+                    **_of_channel(found, "mean_per_mm mean_stderr_per_mm tilt tilt_p_value", c),
                     "worst_direction_percent": 100.0 * off[c],
                     "valid": found.valid[c],
                     "reason": str(found.reason[c]),
@@ -307,25 +284,25 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
     )
 
 
-def _places(evidence: Evidence) -> Mapping[str, tuple[float, float]]:
+def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
     """Return where sites lie on a face's texture, u and v by name; a bad table is told at once."""
     places = dict(probe_sites.SITE_UV)
-    if evidence.landmarks is None:
+    if inputs.landmarks is None:
         return places
     try:
-        return places | probe_sites.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
+        return places | probe_sites.read_landmarks(inputs.landmarks, texture_px=MAP_SHAPE)
     except translucency.TranslucencyError as error:
-        raise EvidenceError(f"landmarks: {error}") from error
+        raise InputsError(f"landmarks: {error}") from error
 
 
 def _translucency(
-    sites: Sequence[SiteValue], places: Mapping[str, tuple[float, float]], evidence: Evidence
-) -> Mapping[str, SkinMap]:
+    places: Mapping[str, tuple[float, float]], inputs: Inputs, _sites: Sequence[SiteValue]
+) -> SkinMap:
     """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
-    placed = [site for site in sites if site.site in places]
-    unplaced = [site.site for site in sites if site.site not in places]
+    placed = [site for site in _sites if site.site in places]
+    unplaced = [site.site for site in _sites if site.site not in places]
     if not placed:
-        raise EvidenceError(
+        raise InputsError(
             f"translucency: got measurements of {', '.join(unplaced)}, expected some of "
             f"{', '.join(places)}, whose places on a face are known; a table of landmarks may "
             "name others"
@@ -340,25 +317,13 @@ def _translucency(
     )
     left_out = [f"{site}: its place on a face is not known" for site in unplaced]
     left_out += [f"{site}: {why}" for site, why in found.left_out]
-    evidence.noted["translucency_left_out"] = left_out
-    evidence.assumed += [f"translucency goes without {text}" for text in left_out]
-    evidence.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
-    return {
-        "translucency": SkinMap(
-            found.values,
-            "mm",
-            found.stderr,
-            np.asarray(found.valid.all(axis=-1)),
-            "1/sigma_tr of red, green and blue light, between measured sites by kriging",
-        )
-    }
+    inputs.noted["translucency_left_out"] = left_out
+    inputs.assumed += [f"translucency goes without {text}" for text in left_out]
+    inputs.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
+    what = "1/sigma_tr of red, green and blue light, between measured sites by kriging"
+    return SkinMap(found.values, "mm", found.stderr, np.asarray(found.valid.all(axis=-1)), what)
 
 
 def _head(measurement: Measurement) -> dict[str, Any]:
-    placement = measurement.placement
-    return {
-        "name": measurement.name,
-        "site": placement.site,
-        "repeat": placement.repeat,
-        "angle_deg": placement.angle_deg,
-    }
+    where = stages.attributes_of(measurement.placement, "site repeat angle_deg")
+    return {"name": measurement.name} | where

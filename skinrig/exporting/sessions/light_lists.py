@@ -16,7 +16,7 @@ from capture import raw
 from capture.session import Session
 from reconstruction.pipeline.dome.calibrated import calibrated
 from reconstruction.pipeline.dome.images import DomeImages
-from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
 from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.handing import allowed
@@ -88,9 +88,9 @@ def _write(
 ) -> list[tuple[str, str]]:
     import tifffile
 
-    evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
+    inputs = Inputs.of(session, calibration, state="neutral", on_date=None)
     images = DomeImages(session)
-    dome = calibrated(evidence, images)
+    dome = calibrated(inputs, images)
     view = _view(images.views, dome.cameras, camera)
     pose = dome.cameras[view]
     good = [k for k in range(len(images.lights)) if dome.table.valid[k]]
@@ -143,8 +143,8 @@ def _write(
             "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
             f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
             "source": session.source,
-            "inputs": evidence.hashes,
-            "assumed": list(evidence.assumed),
+            "inputs": inputs.hashes,
+            "assumed": list(inputs.assumed),
             "consent": [session.manifest.to_json()["subject"]],
             "left_out": [list(row) for row in left_out],
         },

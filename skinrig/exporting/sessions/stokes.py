@@ -23,9 +23,9 @@ import numpy as np
 
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
-from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.gradient.images import GradientImages
 from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
+from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
@@ -122,9 +122,9 @@ def _write(
     calibration: str | Path | None,
 ) -> list[tuple[str, str]]:
 
-    evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
+    inputs = Inputs.of(session, calibration, state="neutral", on_date=None)
     shots = session.frames("gradient")
-    images = GradientImages(session, noise=_noise(evidence, shots[0].camera))
+    images = GradientImages(session, noise=_noise(inputs, shots[0].camera))
     names = [state.name for state in images.states]
     unknown = [name for name in only if name not in names]
     if unknown:
@@ -195,8 +195,8 @@ def _write(
             "orientation": "as the camera sees it, row 0 is the top",
             "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
             "source": session.source,
-            "inputs": evidence.hashes,
-            "assumed": list(evidence.assumed),
+            "inputs": inputs.hashes,
+            "assumed": list(inputs.assumed),
             "consent": [session.manifest.to_json()["subject"]],
             "files": files,
             "left_out": [list(row) for row in left_out],
@@ -205,10 +205,10 @@ def _write(
     return left_out
 
 
-def _noise(evidence: Any, camera: str) -> Any:
+def _noise(inputs: Any, camera: str) -> Any:
 
-    serial = evidence.session.rig.view(camera).serial
-    found = evidence.load("sensor", [serial], "the frames are as noisy as they say of themselves")
+    serial = inputs.session.rig.view(camera).serial
+    found = inputs.load("sensor", [serial], "the frames are as noisy as they say of themselves")
     if found is None:
         return None
     known = SensorCalibration.from_calibration(found, serial)

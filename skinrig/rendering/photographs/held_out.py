@@ -14,8 +14,8 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline.dome.calibrated import Dome, calibrated, seen_from
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.dome.registration import register
-from reconstruction.pipeline.evidence import Evidence
 from reconstruction.pipeline.hold_out import HoldOut
+from reconstruction.pipeline.inputs import Inputs
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.surface.estimates import MIN_LIGHTS
 from skinrig.rendering.camera import Camera, binned
@@ -78,7 +78,7 @@ class Photographs:
         ------
         PhotographsError
             The session was fitted to whole, or is none of the dome.
-        EvidenceError, CalibrationError
+        InputsError, CalibrationError
             It lacks frames, or a calibration is damaged or of another rig.
         """
         opened = Session.open(session)
@@ -87,8 +87,8 @@ class Photographs:
                 f"{opened.path}: has no photographs under one light each; give one of the "
                 "dome with a face"
             )
-        evidence = Evidence.of(opened, calibration, state="neutral", on_date=None)
-        dome = calibrated(evidence, DomeImages(opened))
+        inputs = Inputs.of(opened, calibration, state="neutral", on_date=None)
+        dome = calibrated(inputs, DomeImages(opened))
         same = appearance.inputs.get("session") == opened.content_hash
         held = _held_out(appearance) if same else HoldOut()
         if same and not held:
@@ -106,7 +106,7 @@ class Photographs:
         ]
         if not shots:
             raise PhotographsError(f"{opened.path}: none of its lights is calibrated")
-        assumed = list(evidence.assumed)
+        assumed = list(inputs.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
             dome, told = _where_the_head_is(dome, appearance)

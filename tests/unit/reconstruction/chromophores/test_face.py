@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from twins import chromophores as chromophore_reference
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores import reference as chromophore_reference
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.face import fit_face_distribution
 from reconstruction.chromophores.face_distribution import ContaminatedNormal, FaceDistribution

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from twins import chromophores as chromophore_reference
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction.chromophores import inversion as chromophores
-from reconstruction.chromophores import reference as chromophore_reference
 from reconstruction.chromophores.inversion import ChromophoreError, identifiability, invert
 
 CAMERA = "Nikon 5100 (NPL)"

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
+from twins import chromophores as chromophore_reference
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores import reference as chromophore_reference
 from reconstruction.chromophores.inversion import ChromophoreError, invert, without_brightness
 from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.shading_prior import lognormal

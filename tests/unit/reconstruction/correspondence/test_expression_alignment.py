@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from twins.alignments import place_stderr
 
 from model.skin import SkinMap
 from reconstruction.correspondence import expression_alignment as alignment
@@ -208,17 +209,16 @@ def test_the_error_of_a_warped_map_grows_with_its_slope_times_that_of_the_place(
 def test_the_error_of_the_place_alone_is_that_of_the_slope_on_the_neutral_picture():
     ramp = np.broadcast_to(0.5 * np.arange(40.0), (40, 40))
     found = alignment_of(identity((40, 40)), error=2.0)
-    stderr = found.place_stderr(ramp)
+    stderr = place_stderr(found, ramp)
     np.testing.assert_allclose(stderr[10:-10, 10:-10], 0.5 * np.sqrt(2.0), rtol=1e-3)
-    masked = found.place_stderr(np.where(np.eye(40) > 0, np.nan, ramp))
+    masked = place_stderr(found, np.where(np.eye(40) > 0, np.nan, ramp))
     assert np.isfinite(masked).all()
     assert not masked[np.eye(40) > 0].any()
-    whole = found.warp_map(SkinMap(ramp, "1", np.full((40, 40), 0.3)))
-    own = found.warp_map(SkinMap(ramp, "1", np.full((40, 40), 0.3)), place=False)
+    noise = np.full((40, 40), 0.3)
+    own = found.warp_map(SkinMap(ramp, "1", noise))
     np.testing.assert_allclose(own.stderr, 0.3, rtol=1e-5)
-    np.testing.assert_allclose(
-        whole.stderr[10:-10, 10:-10] ** 2, 0.09 + stderr[10:-10, 10:-10] ** 2, rtol=1e-3
-    )
+    whole = found.warp_stderr(ramp, noise)[10:-10, 10:-10]
+    np.testing.assert_allclose(whole**2, 0.09 + stderr[10:-10, 10:-10] ** 2, rtol=1e-3)
 
 
 def test_a_skin_map_keeps_its_unit_and_gets_its_mask():
@@ -303,7 +303,7 @@ def test_the_field_on_the_grid_is_the_field_at_the_points(rng):
 def test_a_table_of_landmarks_is_read_and_its_faults_are_named_by_line_and_column(tmp_path):
     path = tmp_path / "landmarks.csv"
     path.write_text('# somebody\nname,x,y\n\nnose tip, 10.5 ,20\n"chin, low",1,-2\n')
-    assert alignment.read_landmarks(path) == {"nose tip": (10.5, 20.0), "chin, low": (1.0, -2.0)}
+    assert landmark_table.read(path) == {"nose tip": (10.5, 20.0), "chin, low": (1.0, -2.0)}
     cases = (
         ("", "is empty"),
         ("label,x,y\n", "line 1: got columns"),
@@ -316,7 +316,7 @@ def test_a_table_of_landmarks_is_read_and_its_faults_are_named_by_line_and_colum
     for text, message in cases:
         path.write_text(text)
         with pytest.raises(landmark_table.LandmarkError, match=message):
-            alignment.read_landmarks(path)
+            landmark_table.read(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(landmark_table.LandmarkError, match="UTF-8"):
-        alignment.read_landmarks(path)
+        landmark_table.read(path)

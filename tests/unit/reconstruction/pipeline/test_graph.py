@@ -3,14 +3,6 @@ import pytest
 from reconstruction.pipeline.graph import Stage, StageError, order, run
 
 
-class Memory(dict):
-    def load(self, key):
-        return self.get(key)
-
-    def save(self, key, products):
-        self[key] = dict(products)
-
-
 def graph(calls, gain=2):
     def note(name, result):
         def work(**inputs):
@@ -47,7 +39,7 @@ def test_only_the_ancestors_of_what_is_wanted_run():
 
 
 def test_asking_for_nothing_new_does_no_work():
-    calls, cache = [], Memory()
+    calls, cache = [], {}
     run(graph(calls), ["map"], cache=cache)
     calls.clear()
     outcome = run(graph(calls), ["map"], cache=cache)
@@ -57,7 +49,7 @@ def test_asking_for_nothing_new_does_no_work():
 
 
 def test_a_changed_parameter_runs_again_what_depends_on_it_and_no_more():
-    calls, cache = [], Memory()
+    calls, cache = [], {}
     run(graph(calls), ["map"], cache=cache)
     calls.clear()
     outcome = run(graph(calls, gain=5), ["map"], cache=cache)
@@ -88,20 +80,17 @@ def test_a_stage_that_makes_something_else_is_found_out():
         run([Stage("a", (), ("x",), lambda: {"z": 1})], ["x"])
 
 
-class Folder:
+class Folder(dict):
     """Keeps maps and files alone, as a finished folder does, not what stages hand each other."""
 
     def __init__(self, *kept):
+        super().__init__()
         self.kept = kept
-        self.by_key = {}
 
-    def load(self, key):
-        return self.by_key.get(key)
-
-    def save(self, key, products):
+    def __setitem__(self, key, products):
         kept = {name: value for name, value in products.items() if name in self.kept}
         if kept:
-            self.by_key[key] = kept
+            super().__setitem__(key, kept)
 
 
 def surface_graph(calls):

@@ -6,22 +6,8 @@ import numpy as np
 import pytest
 
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline import record as stage_record
-from reconstruction.pipeline.evidence import EvidenceError
 from reconstruction.pipeline.graph import Stage
-
-
-class Memory:
-    """A cache that keeps everything."""
-
-    def __init__(self):
-        self.kept = {}
-
-    def load(self, key):
-        return self.kept.get(key)
-
-    def save(self, key, products):
-        self.kept[key] = dict(products)
+from reconstruction.pipeline.inputs import InputsError
 
 
 def graph(gain=2.0):
@@ -49,7 +35,7 @@ def why(entries):
 
 def test_what_nothing_wanted_needs_is_skipped():
     outcome = stages.run(graph(), ["melanin"])
-    entries = stage_record.record(graph(), outcome, {})
+    entries = stages.record(graph(), outcome, {})
     assert done(entries) == {"frames": "run", "separate": "run", "invert": "run", "draw": "skipped"}
     assert why(entries)["draw"] == "nothing wanted depends on it"
     assert why(entries)["invert"] == "it was not made before"
@@ -57,11 +43,11 @@ def test_what_nothing_wanted_needs_is_skipped():
 
 
 def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
-    cache = Memory()
+    cache = {}
     first = stages.run(graph(), ["melanin"], cache=cache)
-    cache.kept = {key: made for key, made in cache.kept.items() if "melanin" in made}
+    cache = {key: made for key, made in cache.items() if "melanin" in made}
     again = stages.run(graph(), ["melanin"], cache=cache)
-    entries = stage_record.record(graph(), again, first.keys)
+    entries = stages.record(graph(), again, first.keys)
     assert done(entries) == {
         "frames": "skipped",
         "separate": "skipped",
@@ -73,10 +59,10 @@ def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
 
 
 def test_a_changed_setting_runs_what_depends_on_it_and_says_so():
-    cache = Memory()
+    cache = {}
     first = stages.run(graph(), ["melanin"], cache=cache)
     again = stages.run(graph(gain=3.0), ["melanin"], cache=cache)
-    entries = stage_record.record(graph(gain=3.0), again, first.keys)
+    entries = stages.record(graph(gain=3.0), again, first.keys)
     assert done(entries)["separate"] == done(entries)["invert"] == "run"
     assert why(entries)["invert"] == "its inputs have changed"
     assert done(entries)["frames"] == "reused"
@@ -128,9 +114,9 @@ def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, mon
     # a folder that lost a map, or holds another than was written, is neither used nor replaced
     (out / "melanin.exr").write_bytes(b"x" + (out / "melanin.exr").read_bytes()[1:])
     damaged = standing()
-    with pytest.raises(EvidenceError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
+    with pytest.raises(InputsError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
         pipeline.reconstruct(session, want=["melanin"], out=out)
     assert standing() == damaged
     (out / "melanin.exr").unlink()
-    with pytest.raises(EvidenceError, match=r"melanin\.exr: is missing.*remove"):
+    with pytest.raises(InputsError, match=r"melanin\.exr: is missing.*remove"):
         pipeline.reconstruct(session, want=["melanin"], out=out)

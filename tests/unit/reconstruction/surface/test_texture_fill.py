@@ -2,14 +2,9 @@
 
 import numpy as np
 import pytest
+from twins.textures import points_from_texels
 
-from reconstruction.surface.texture_fill import (
-    densify,
-    points_from_texels,
-    push_pull,
-    rasterize,
-    texels_from_points,
-)
+from reconstruction.surface.texture_fill import densify, push_pull, rasterize, texels_from_points
 
 
 def grid(side=17, *, low=0.05, high=0.95):

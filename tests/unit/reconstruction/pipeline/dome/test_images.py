@@ -10,7 +10,7 @@ from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.sensor_noise import SensorNoise
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
@@ -116,7 +116,7 @@ def test_the_light_of_the_room_is_taken_off_with_the_darks(tmp_path, rng):
 
 def test_a_sensor_of_unknown_noise_is_named_and_a_calibrated_one_is_not(tmp_path, rng):
     session = make(tmp_path / "s", rng, profile=False)
-    with pytest.raises(EvidenceError, match="calibrate the sensor"):
+    with pytest.raises(InputsError, match="calibrate the sensor"):
         DomeImages(session).image("C00", "L000")
     noise = {VIEW.serial: SensorNoise(VIEW.gain_e_per_dn, VIEW.read_noise_e)}
     assert DomeImages(session, noise=noise).image("C00", "L000").valid.all()
@@ -124,9 +124,9 @@ def test_a_sensor_of_unknown_noise_is_named_and_a_calibrated_one_is_not(tmp_path
 
 def test_what_the_session_lacks_is_named(tmp_path, rng):
     images = DomeImages(make(tmp_path / "s", rng))
-    with pytest.raises(EvidenceError, match="lacks camera C00, light L001"):
+    with pytest.raises(InputsError, match="lacks camera C00, light L001"):
         images.image("C00", "L001")
-    with pytest.raises(EvidenceError, match="no frames of kind 'mirror'"):
+    with pytest.raises(InputsError, match="no frames of kind 'mirror'"):
         DomeImages(images._session, kind="mirror")
 
 

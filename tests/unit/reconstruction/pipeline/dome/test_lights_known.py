@@ -12,7 +12,7 @@ from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject
 from reconstruction.pipeline.dome import stages as dome_stages
-from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.inputs import Inputs
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
 TODAY = date(2026, 11, 21)
@@ -62,7 +62,7 @@ def evidence_with(session, folder, notes):
     store.save(
         table.to_calibration(rig="dome", source="simulated", created=TODAY, notes=notes), folder
     )
-    return Evidence.of(session, folder, state="neutral", on_date=TODAY)
+    return Inputs.of(session, folder, state="neutral", on_date=TODAY)
 
 
 def albedo_of(evidence):

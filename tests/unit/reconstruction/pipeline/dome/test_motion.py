@@ -11,7 +11,7 @@ from capture.raw import RawFrame
 from capture.rig import load_rig
 from reconstruction.pipeline.dome.images import DomeImage
 from reconstruction.pipeline.dome.motion import HalfPixels, follow_head
-from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.inputs import InputsError
 
 RADIUS_MM = 70.0
 RIG = load_rig("dome")
@@ -183,7 +183,7 @@ def test_images_outside_the_tracking_frames_are_not_used():
 
 
 def test_tracking_frames_that_cover_no_image_are_an_error():
-    with pytest.raises(EvidenceError, match="no image lies between two tracking frames"):
+    with pytest.raises(InputsError, match="no image lies between two tracking frames"):
         follow(Shots(*FAR, times_s=(30.0, 40.0)))
 
 
@@ -191,5 +191,5 @@ def test_a_frame_without_a_time_is_named():
     session = Shots(times_s=(0.0, 20.0))
     for record in session.frames("tracking"):
         record.line.t_box_s = None
-    with pytest.raises(EvidenceError, match=r"T\d-C\d\d: does not say when it was lit"):
+    with pytest.raises(InputsError, match=r"T\d-C\d\d: does not say when it was lit"):
         follow(session)

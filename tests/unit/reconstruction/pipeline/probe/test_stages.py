@@ -48,7 +48,7 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
 
 
 def documents(profiles):
-    made = probe_stages._subsurface(profiles, PROBE)
+    made = probe_stages._subsurface(PROBE, profiles)
     return made, json.loads(made[probe_stages.SUBSURFACE_FILE])
 
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -14,18 +15,35 @@ from typing import Any
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
+from reconstruction.pipeline.graph import Stage, stage_maker
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 
 PROGRESS_INTERVAL_S = 5.0
 """Seconds between two lines about the same stage."""
 
 
-class EvidenceError(ValueError):
+class InputsError(ValueError):
     """A session that cannot be reconstructed as asked."""
 
 
+@dataclass(frozen=True, slots=True)
+class DomeOptions:
+    """What only sessions of the dome take."""
+
+    scan: str | Path | None = None
+    """PLY of the face in mm that takes the place of the session's own; None: the session's."""
+    basis: str | Path | None = None
+    """Folder of MERL ``.binary`` tables to fit surface lobes with; None: the generated
+    dielectrics."""
+    hold_out: HoldOut | str | None = None
+    """Lights and views whose frames no fit sees, as "lights=L007,L023,views=C03" or as parsed;
+    what `skinrig render --against` compares with."""
+    rank: int | None = None
+    """Lobes that the points share, 1 to 59; None: 4."""
+
+
 @dataclass(slots=True)
-class Evidence:
+class Inputs:
     """A session and a folder of calibrations; keeps account of what was read and what assumed.
 
     Attributes
@@ -36,22 +54,16 @@ class Evidence:
         CALIBRATION/ folder; None: everything is assumed.
     state
         Which state of the subject.
-    repeat
-        Which of its repeats; None: all of them together.
     on_date
         The date that calibrations must be valid on.
-    assumed
-        What was taken for granted for want of a calibration, one line each.
-    scan
-        PLY of the face in mm that takes the place of the session's own; None: the session's.
-    basis
-        Folder of MERL tables to fit surface lobes with; None: the generated dielectrics.
+    scan, basis, hold_out, rank
+        As of `DomeOptions`, the scan as it was read.
     landmarks
         Table of places on the face's texture; None: those that are known.
-    hold_out
-        Lights and views of a dome that no fit may see.
-    rank
-        Common lobes of a dome's points; None: as many as usual.
+    repeat
+        Which of the state's repeats; None: all of them together.
+    assumed
+        What was taken for granted for want of a calibration, one line each.
     hashes
         SHA-256 of everything that was read, by what it is.
     noted
@@ -66,21 +78,21 @@ class Evidence:
     on_date: date
     scan: bytes | None = None
     basis: Path | None = None
-    landmarks: Path | None = None
-    repeat: int | None = None
     hold_out: HoldOut = NO_HOLD_OUT
     rank: int | None = None
+    landmarks: Path | None = None
+    repeat: int | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
     progress: Callable[[str], None] | None = None
-    _told_at: float = 0.0
+    _reported_at: float = 0.0
 
     def tell(self, stage: str, done: float) -> None:
         """Say how far a stage is, 0 to 1, every few seconds at most."""
         now = time.monotonic()
-        if self.progress is not None and now - self._told_at >= PROGRESS_INTERVAL_S:
-            self._told_at = now
+        if self.progress is not None and now - self._reported_at >= PROGRESS_INTERVAL_S:
+            self._reported_at = now
             self.progress(f"{stage}: {100 * done:.0f} %")
 
     @staticmethod
@@ -89,50 +101,58 @@ class Evidence:
         calibration: str | Path | None,
         *,
         state: str,
-        on_date: date | None,
-        scan: str | Path | None = None,
-        basis: str | Path | None = None,
+        on_date: date | None = None,
         landmarks: str | Path | None = None,
-    ) -> Evidence:
+        dome: DomeOptions | None = None,
+    ) -> Inputs:
         """Begin with what the session itself says that it assumed.
 
         Raises
         ------
-        EvidenceError
+        InputsError
             When ``calibration`` or ``basis`` is no folder, the first holds no calibration or
             those of other rigs alone, or ``scan`` is no PLY.
         """
-        if calibration is not None and not Path(calibration).is_dir():
-            raise EvidenceError(
-                f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
-            )
-        if calibration is not None:
-            _require_some(Path(calibration), session.rig.name)
-        hashes = {"session": session.content_hash}
-        mesh = None if scan is None else Path(scan).read_bytes()
-        if mesh is not None and not mesh.startswith(b"ply"):
-            raise EvidenceError(
-                f"scan: got no PLY mesh in {scan}; `skinrig import mesh` takes .obj and .ply"
-            )
-        if mesh is not None:
-            hashes["scan"] = hashlib.sha256(mesh).hexdigest()
-        tables = None if basis is None else Path(basis)
-        if tables is not None:
-            hashes["basis"] = _digest_of(tables)
-        places = None if landmarks is None else Path(landmarks)
-        if places is not None:
-            hashes["landmarks"] = hashlib.sha256(places.read_bytes()).hexdigest()
-        return Evidence(
-            session=session,
-            calibration=None if calibration is None else Path(calibration),
-            state=state,
-            on_date=on_date or session.manifest.created_at.date(),
+        dome = dome or DomeOptions()
+        found = Inputs(
+            session,
+            None if calibration is None else Path(calibration),
+            state,
+            on_date or session.manifest.created_at.date(),
+            rank=dome.rank,
             assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
-            scan=mesh,
-            basis=tables,
-            landmarks=places,
-            hashes=hashes,
+            hashes={"session": session.content_hash},
         )
+        if found.calibration is not None:
+            _require_some(found.calibration, session.rig.name)
+        if dome.scan is not None:
+            found.scan = Path(dome.scan).read_bytes()
+            if not found.scan.startswith(b"ply"):
+                raise InputsError(
+                    f"scan: got no PLY mesh in {dome.scan}; `skinrig import mesh` takes .obj and "
+                    ".ply"
+                )
+            found.hashes["scan"] = hashlib.sha256(found.scan).hexdigest()
+        if dome.basis is not None:
+            found.basis = Path(dome.basis)
+            found.hashes["basis"] = _digest_of(found.basis)
+        if landmarks is not None:
+            found.landmarks = Path(landmarks)
+            found.hashes["landmarks"] = hashlib.sha256(found.landmarks.read_bytes()).hexdigest()
+        if dome.hold_out is not None:
+            text = dome.hold_out
+            found.hold_out = HoldOut.parse(text) if isinstance(text, str) else text
+        return found
+
+    def stage_maker(self, revision: int) -> Callable[..., Stage]:
+        """Return `graph.stage_maker` for stages of a revision of their code and all that was read.
+
+        Parameters
+        ----------
+        revision
+            Grows when the code of a stage changes its result, so that older maps are made again.
+        """
+        return stage_maker({"revision": revision, "inputs": dict(sorted(self.hashes.items()))})
 
     def load(
         self, kind: str, serials: Sequence[str], otherwise: str
@@ -154,11 +174,8 @@ class Evidence:
             When it is damaged, of another rig or device, or out of date.
         """
         if self.calibration is not None:
-            try:
+            with suppress(calibration_store.CalibrationMissing):
                 found = calibration_store.load(self.calibration, kind)
-            except calibration_store.CalibrationMissing:
-                pass
-            else:
                 calibration_store.require(
                     found,
                     rig=self.session.rig.name,
@@ -175,9 +192,11 @@ class Evidence:
 
 def _require_some(folder: Path, rig: str) -> None:
     """Refuse a folder without a calibration of a rig: else everything would be assumed."""
+    if not folder.is_dir():
+        raise InputsError(f"calibration: {folder} is no folder; `skinrig calibrate` makes one")
     files = [path for kind in CALIBRATION_KINDS if (path := folder / f"{kind}.json").is_file()]
     if not files:
-        raise EvidenceError(
+        raise InputsError(
             f"calibration: {folder} holds none, expected {', '.join(CALIBRATION_KINDS)} or some of "
             "them (.json); `skinrig calibrate` makes them"
         )
@@ -188,7 +207,7 @@ def _require_some(folder: Path, rig: str) -> None:
         except (ValueError, KeyError, TypeError):
             return  # what is wrong with it is said where it is needed
     if rig not in rigs:
-        raise EvidenceError(
+        raise InputsError(
             f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, the "
             f"session is of rig {rig}; leave --calibration out, or give that rig's folder"
         )
@@ -197,7 +216,7 @@ def _require_some(folder: Path, rig: str) -> None:
 def _digest_of(folder: Path) -> str:
     """Return the hash of a folder's tables, their names and contents."""
     if not folder.is_dir():
-        raise EvidenceError(f"basis: {folder} is no folder; give one with MERL .binary files")
+        raise InputsError(f"basis: {folder} is no folder; give one with MERL .binary files")
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.binary")):
         digest.update(path.name.encode() + b"\0")

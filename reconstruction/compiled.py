@@ -1,0 +1,27 @@
+"""How kernels over pixels are compiled: ahead of the first call, for read-only arrays as well.
+
+Contraction is the only liberty that they take with arithmetic: NaN and infinity keep their meaning.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from numba import types
+
+CONTRACT: Final = {"contract"}
+"""Fast-math flags."""
+OVER_PIXELS: Final[dict[str, Any]] = {
+    "parallel": True,
+    "fastmath": CONTRACT,
+    "cache": True,
+    "nogil": True,
+    "boundscheck": False,
+    "error_model": "numpy",
+}
+"""Options of a kernel that is called for all pixels."""
+
+
+def given(dtype: types.Type, axes: int) -> types.Array:
+    """Return the type of a contiguous argument that is only read, and may be read-only."""
+    return types.Array(dtype, axes, "C", readonly=True)
