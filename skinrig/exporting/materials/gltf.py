@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
-from skinrig.exporting.images import Image, ImageFolder, coded
+from skinrig.exporting.images import ImageFolder, coded
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import COLOR_NOTE, MAP_NOTES, Material
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import M_PER_MM, Delivery
-from skinrig.exporting.provenance import provenance
-from skinrig.exporting.sealing import write_json
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
@@ -111,34 +109,25 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     script = blender.Import.of_channels(GLB_FILE, material.usual_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
-    if delivery.with_errors:
-        for image in material.error_images():
-            out.exr(image)
-    write_json(
-        folder / DOCUMENT_FILE,
+    out.errors(material.error_images())
+    facts = material.facts(appearance)
+    out.document(
+        DOCUMENT_FILE,
+        appearance,
         {
-            **provenance(appearance),
+            **facts,
             "schema": SCHEMA,
             "scene_unit": "m",
             "frame": "+x right, +y up, +z towards the main camera (the front of glTF)",
-            "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}; 8 bits, sRGB curve",
+            "base_color": f"{facts['base_color']}; 8 bits, sRGB curve",
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports hold 16",
-            "subsurface": {**material.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]},
-            "specular_ior": material.eta,
             "morph_targets": list(material.shapes),
-            "figures": material.figures(),
-            "assumed": material.all_assumed(appearance),
-            "files": dict(sorted(out.records.items())),
         },
     )
-    left_out = [
-        *material.left_out_of_mesh(delivery),
-        (
-            "subsurface light",
-            f"glTF has no place for it: see extras; {blender.SCRIPT_FILE} sets it in Blender",
-        ),
-    ]
+    in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
+    left_out = material.left_out_of_mesh(delivery)
+    left_out.append(("subsurface light", f"glTF has no place for it: {in_blender}"))
     if not material.shapes:
         left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))
     return left_out
@@ -221,19 +210,16 @@ def _material(material: Material) -> pygltflib.Material:
 
 def _pictures(material: Material) -> list[tuple[str, bytes]]:
     """Return the textures' names and PNG files of 8 bits, in the order of their indices."""
-    delivery = Delivery()
 
-    def codes(image: Image) -> NDArray[Any]:
-        return coded(image, depth=8)[0]
+    def codes(name: str) -> NDArray[Any]:
+        return coded(material.image(name, Delivery()), depth=8)[0]
 
-    rough = codes(material.image("specular_roughness", delivery))
-    zero = np.zeros_like(rough)
-    weight = codes(material.image("specular_weight", delivery))
-    white = np.full_like(weight, 255)
+    rough, weight = codes("specular_roughness"), codes("specular_weight")
+    zero, white = np.zeros_like(rough), np.full_like(weight, 255)
     pictures = {
-        "base_color": codes(material.image("base_color", delivery)),
+        "base_color": codes("base_color"),
         "roughness in G, metallic 0 in B": np.stack([zero, rough, zero], axis=-1),
-        "normal": codes(material.image("normal", delivery)),
+        "normal": codes("normal"),
         "specular in A": np.stack([white, white, white, weight], axis=-1),
     }
     return [(name, png.encode(image, quick=True)) for name, image in pictures.items()]

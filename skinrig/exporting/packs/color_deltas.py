@@ -15,7 +15,7 @@ from reconstruction.correspondence import landmark_field, landmark_table
 from reconstruction.surface.texture_fill import push_pull
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder
+from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image, ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
 
@@ -82,34 +82,17 @@ def write(
     states = chosen(have, delivery, "color", left_out)
     colors = _colors(appearance, rig, states, delivery, left_out)
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
-    base = Image(
-        name="base_color",
-        values=_filled(colors.base, colors.valid),
-        unit="1",
-        space=SRGB_SPACE,
-        what=f"neutral base color on {colors.layout}; {colors.space}; holes filled",
-        valid=colors.valid,
-    )
-    out.exr(base)
-    out.png(base)
+    what = f"neutral base color on {colors.layout}; {colors.space}; holes filled"
+    filled = _filled(colors.base, colors.valid)
+    out.both(Image("base_color", filled, space=SRGB_SPACE, what=what, valid=colors.valid))
     largest = {}
     for name, state in names.items():
         delta = colors.deltas[state]
-        image = Image(
-            name=f"{name}_delta",
-            values=delta,
-            unit="1",
-            low=-1.0,
-            high=1.0,
-            valid=colors.valid,
-            what=f"color of {state} at full strength less neutral, linear, on {colors.layout}",
-        )
-        out.exr(image)
-        out.png(image)
+        what = f"color of {state} at full strength less neutral, linear, on {colors.layout}"
+        out.both(Image(f"{name}_delta", delta, "1", DATA_SPACE, what, -1.0, 1.0, colors.valid))
         shown = np.abs(delta[colors.valid])
         largest[name] = float(shown.max()) if shown.size else 0.0
-    if delivery.with_errors:
-        out.exr(Image(name="color_mask", values=colors.valid.astype(float), unit="1"))
+    out.errors([Image("color_mask", colors.valid.astype(float))])
     return {
         "size": COLOR_SIZE,
         "layout": colors.layout,
@@ -144,13 +127,11 @@ def _colors(
     }
     neutral = shown[NEUTRAL]
     if delivery.onto is None:
-        left_out.append(
-            (
-                "colors on the face's texture",
-                "they lie on the flash camera's picture; name the "
-                "dome's maps with --onto, and two tables of landmarks",
-            )
+        why = (
+            "they lie on the flash camera's picture; name the "
+            "dome's maps with --onto, and two tables of landmarks"
         )
+        left_out.append(("colors on the face's texture", why))
         base, valid = sized(neutral, seen, COLOR_SIZE)
         deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
