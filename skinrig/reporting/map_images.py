@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,47 +34,50 @@ def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
     return image[step // 2 :: step, step // 2 :: step]
 
 
-def scalar_image(
-    title: str,
-    values: FloatArray,
-    *,
-    low: float,
-    high: float,
-    scale: str = "viridis",
-    valid: BoolArray | None = None,
-    unit: str = "",
-    width: int = 280,
-    of: str = "",
-) -> page.Image:
-    """Return an image of a map with its color scale.
+@dataclass(frozen=True, slots=True)
+class MapDrawing:
+    """How pictures of values on one map's pixels are drawn.
 
-    Parameters
+    Attributes
     ----------
-    title
-        Stands below the picture.
-    values
-        (H, W).
-    low, high
-        Ends of the color scale, in ``unit``.
-    scale
-        A key of `skinrig.drawing.png.SCALE_CLASSES`.
-    valid
-        (H, W); other pixels are gray.
+    of
+        What they are of, for the alt texts: a title alone rarely says it.
     unit
         Of values.
+    valid
+        (H, W); other pixels are gray.
     width
         Pixels across; larger maps are thinned out.
-    of
-        What the picture is of, for the alt text: the title alone rarely tells.
     """
-    small = shrink(values, width).astype(float)
-    mask = None if valid is None else shrink(valid, width).astype(bool)
-    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
-    named = f"{of}, {title}" if of else title
-    scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
-    alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
-    bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), unit)
-    return _stored(title, data, alt, small.shape, bar)
+
+    of: str = ""
+    unit: str = ""
+    valid: BoolArray | None = None
+    width: int = 280
+
+    def scalar(
+        self, title: str, values: FloatArray, low: float, high: float, scale: str = "viridis"
+    ) -> page.Image:
+        """Return an image of values, (H, W), by a color scale between its ends.
+
+        ``scale`` is a key of `skinrig.drawing.png.SCALE_CLASSES`.
+        """
+        small = shrink(values, self.width).astype(float)
+        mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
+        data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
+        named = f"{self.of}, {title}" if self.of else title
+        scale_words = f"color scale {number(low)} to {written(number(high), self.unit)}"
+        alt = f"{named}: {_told(small, mask, self.unit)}; {scale_words}"
+        bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), self.unit)
+        return _stored(title, data, alt, small.shape, bar)
+
+    def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
+        """Return an image of values from 0 on, such as errors and standard errors."""
+        return self.scalar(title, values, 0.0, reach, "magma")
+
+    def signed(self, title: str, values: FloatArray, reach: float) -> page.Image:
+        """Return an image of values around 0, such as differences."""
+        return self.scalar(title, values, -reach, reach, "RdBu_r")
 
 
 def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
@@ -173,33 +177,14 @@ def map_panel(
         of_scale.append(truth[mask & np.isfinite(truth)])
     joined = np.concatenate(of_scale)
     low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
-    parts = []
-
-    def add(
-        title: str, values: FloatArray, ends: tuple[float, float], scale: str = "viridis"
-    ) -> None:
-        parts.append(
-            scalar_image(
-                title,
-                values,
-                low=ends[0],
-                high=ends[1],
-                scale=scale,
-                valid=mask,
-                unit=unit,
-                width=width,
-                of=name,
-            )
-        )
-
-    if truth is not None:
-        add("truth", truth, (low, high))
-    add("estimate", estimate, (low, high))
+    shown = MapDrawing(name, unit, mask, width)
+    parts = [shown.scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth
-        reach = reach_of(error, mask, 98)
-        add("estimate − truth", error, (-reach, reach), "RdBu_r")
+        parts.insert(0, shown.scalar("truth", truth, low, high))
+        parts.append(shown.signed("estimate − truth", error, reach_of(error, mask, 98)))
     if standard_error is not None:
-        add("standard error", standard_error, (0.0, reach_of(standard_error, mask, 98)), "magma")
+        reach = reach_of(standard_error, mask, 98)
+        parts.append(shown.size("standard error", standard_error, reach))
     yield page.Heading(name)
     yield page.Images(parts)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from model import store
 from skinrig.arrays import Float64Array
 from skinrig.reporting import map_images, page, provenance
+from skinrig.reporting.comparison import conditions
 from skinrig.reporting.comparison.runs import Run
 from skinrig.reporting.sections import images as image_section
 
@@ -138,19 +139,7 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
         yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            yield page.records(
-                order,
-                (
-                    ("picture", lambda one: one.name),
-                    ("values", lambda one: one.kind),
-                    ("RMS of B − A over A, %", lambda one: 100 * one.relative_rms),
-                    ("mean B over A", lambda one: one.mean_ratio),
-                    ("largest |B − A|", lambda one: one.largest),
-                    ("equal", lambda one: "yes" if one.equal else "no"),
-                ),
-                caption="Linear values in the unit of the renderings; codes over 255, which follow "
-                "the brightness that each picture was shown with",
-            )
+            yield page.view("compared_images", pictures=order)
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MAX_DRAWN_IMAGES]:
                 yield page.Heading(one.name)
@@ -186,24 +175,13 @@ def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
             )
     every = np.ones(one.difference.shape, bool)
     reach = map_images.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
-    yield map_images.scalar_image(
-        "B − A, mean of the channels",
-        one.difference,
-        low=-reach,
-        high=reach,
-        scale="RdBu_r",
-        width=200,
-        of=one.name,
-    )
+    drawing = map_images.MapDrawing(one.name, width=200)
+    yield drawing.signed("B − A, mean of the channels", one.difference, reach)
 
 
 def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
-    rows = [
-        (key, sides[0].get(key, "–"), sides[1].get(key, "–"))
-        for key in sorted({*sides[0], *sides[1]})
-        if sides[0].get(key) != sides[1].get(key)
-    ]
+    rows = conditions.unequal(*sides)
     if not rows:
         return page.note("What was asked for, and all that the records say, is the same.")
     return page.table(

@@ -53,37 +53,11 @@ def section(
         f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination."
     )
     yield from _blends(appearance, rig)
-    rows = []
-    for state, maps in rig.states.items():
-        placed = [row for row in part["alignment"] if row["state"] == state]
-        rms, largest = part["storage_error"][state]
-        change = appearance.maps.get(f"change_{state}")
-        rows.append(
-            (
-                state,
-                _mean(change),
-                float(np.median(maps.scale[maps.valid])),
-                100 * rms,
-                100 * largest,
-                placed[0]["median_error_px"] if placed else "",
-                placed[0]["by"] if placed else "",
-            )
-        )
-    yield page.table(
-        (
-            "state",
-            "mean change of blood, points",
-            "median scale",
-            "lost by storing small, rms, points",
-            "largest, points",
-            "error of place, px",
-            "placed by",
-        ),
-        rows,
-        caption="States; points are percent of the dermis' volume, the mean change is over all "
-        "pixels whose change was found",
-    )
-    yield from _repeats(part.get("repeatability"))
+    mean = {state: _mean(appearance.maps.get(f"change_{state}")) for state in rig.states}
+    scales = {state: float(np.median(m.scale[m.valid])) for state, m in rig.states.items()}
+    yield page.view("facial_states", states=rig.states, part=part, changes=mean, scales=scales)
+    if repeats := part.get("repeatability"):
+        yield page.view("facial_repeats", repeats=repeats)
     if truths:
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
         banded = errors_by_band(rig, truths)
@@ -103,45 +77,6 @@ def section(
             truth=None if true is None else true.values,
             valid=seen,
         )
-
-
-def _repeats(told: Mapping[str, Any] | None) -> Iterator[page.Block]:
-    """Yield how far states repeat, and whether melanin drifts."""
-    if not told:
-        return
-    drifts = {row["region"]: row for row in told["melanin_drift"]}
-    rows = []
-    for row in told["hemoglobin"]:
-        drift = drifts.get(row["region"])
-        slope = (
-            ""
-            if drift is None
-            else (f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})")
-        )
-        rows.append(
-            (
-                row["region"],
-                100 * row["within"],
-                100 * row["between"],
-                float("nan") if row["correlation"] is None else row["correlation"],
-                "yes" if row["scatters"] else "no",
-                slope,
-                "" if drift is None else f"{drift['p_value']:.2g}",
-            )
-        )
-    yield page.table(
-        (
-            "region",
-            "between repeats, points",
-            "between states, points",
-            "intraclass correlation",
-            "more than noise",
-            "melanin's drift a minute, points",
-            "p",
-        ),
-        rows,
-        caption="Repeats: standard deviations of blood",
-    )
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Block]:
@@ -175,65 +110,20 @@ def _errors(
         return
     by_rig = [row for row in states if row.way == evaluation.PREDICTION_METHODS[1]]
     for row in by_rig:
-        worst = _worst(row.state, banded)
         checks.append(
-            page.Check(
+            page.Check.of_shares(
                 f"{name}: blood of {row.state} by the rig, median error",
-                100 * row.median_relative,
-                100 * evaluation.MAX_LEVEL_ERROR,
-                "<=",
-                "%",
+                row.median_relative,
+                evaluation.MAX_LEVEL_ERROR,
                 coverage=row.coverage,
-                worst=worst,
+                worst=_worst(row.state, banded),
             )
         )
-    yield page.Heading("Blood of each state: error by way")
-    yield page.records(
-        states,
-        (
-            ("state", lambda row: row.state),
-            ("way", lambda row: row.way),
-            ("median |error|, %", lambda row: 100 * row.median_relative),
-            (
-                "68 % interval",
-                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-            ),
-            ("rms, points", lambda row: 100 * row.rms),
-            ("bias, %", lambda row: 100 * row.bias),
-            ("68 % coverage, %", lambda row: 100 * row.coverage),
-            ("pixels", lambda row: row.pixels),
-        ),
-        caption="Against the true blood of each state, by way of getting it; pixels that every "
-        "way tells",
-    )
-    yield page.records(
-        changes,
-        (
-            ("state", lambda row: row.state),
-            ("true change, points", lambda row: 100 * row.true),
-            ("found, points", lambda row: 100 * row.found),
-            ("rms of the map, points", lambda row: 100 * row.rms),
-            ("68 % coverage, %", lambda row: 100 * row.coverage),
-        ),
-        caption="Change of blood from the neutral state, one melanin for all states; over those of "
-        "these pixels whose change was found",
-    )
-    if banded:
-        yield page.table(
-            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"),
-            banded,
-            caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
-            "the rig tells, also where the state itself was not measured",
-        )
+    yield page.view("facial_errors", states=states, changes=changes, banded=banded)
     labels = list(dict.fromkeys(row.state for row in states))
+    found = {(row.state, row.way): 100 * row.median_relative for row in reversed(states)}
     series = {
-        way: [
-            next(
-                (100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
-                float("nan"),
-            )
-            for label in labels
-        ]
+        way: [found.get((label, way), float("nan")) for label in labels]
         for way in evaluation.PREDICTION_METHODS
     }
     yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
@@ -277,16 +167,9 @@ def errors_by_band(
             found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
             relative = (found - real) / real
             held = np.abs(found - real) <= blend.stderr[inside]
-            rows.append(
-                (
-                    state,
-                    melanin_band(low, high),
-                    int(inside.sum()),
-                    100 * float(np.median(np.abs(relative))),
-                    100 * float(np.median(relative)),
-                    100 * float(np.mean(held)),
-                )
-            )
+            off = np.median(np.abs(relative)), np.median(relative), np.mean(held)
+            percent = (100 * float(one) for one in off)
+            rows.append((state, melanin_band(low, high), int(inside.sum()), *percent))
     return rows
 
 
