@@ -119,7 +119,6 @@ class Boundary:
         """Render it above a medium; None: light leaves where it entered."""
         laid = self.laid if sigma_tr_per_mm is None else self.laid.of_medium(sigma_tr_per_mm)
         return render(
-            laid.model,
             laid,
             self.camera,
             self.light,

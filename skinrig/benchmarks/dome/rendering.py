@@ -63,7 +63,6 @@ def model(*, toy: bool) -> StageBenchmark:
         tolerance: float = 0.01,
     ) -> Rendering:
         return render(
-            on.model,
             on,
             camera,
             light,
@@ -101,7 +100,7 @@ def model(*, toy: bool) -> StageBenchmark:
         dataclasses.replace(light, name=n, intensity=_part(light.intensity, w))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render(skin.model, laid[1], camera, two, subpixels=2, caster=caster).radiance
+    both = render(laid[1], camera, two, subpixels=2, caster=caster).radiance
     bands = {
         name: _on_skin(band.preset, rig, size=128 if toy else 256, fine=fine)
         for name, band in MELANIN_BANDS.items()
@@ -148,7 +147,7 @@ def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
     on = FittedSurface.of(true_model(scene, VIEW_NAME), face.mesh)
     camera = CameraPose.nominal(rig.views[0])
     light = true_light(scene, LIGHT_INDEX, VIEW_NAME)
-    seen = render(on.model, on, camera, light, subpixels=2, caster=Caster(face.mesh))
+    seen = render(on, camera, light, subpixels=2, caster=Caster(face.mesh))
     return BandError(*_relative(seen.radiance, true))
 
 
