@@ -173,6 +173,11 @@ class SceneSource:
     landmarks: Path | None = None
     calibration: Path | None = None
 
+    @property
+    def fitted(self) -> tuple[SkinAppearance, ...]:
+        """Folders of a dome's maps, the better one first: a model with lobes, or the maps alone."""
+        return tuple(self.appearances[k] for k in ("model", "dome") if k in self.appearances)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewerScene:

@@ -18,13 +18,4 @@ def assets(source: SceneSource) -> Assets:
     """Return variances and weights of the Gaussians of the population's mean dipole."""
     depth_mm, told = skin_reflectance.population_mean_mm()
     profile = gaussian_profiles.fit(R_D, 1.0 / depth_mm)
-    return {
-        "facts": {
-            "scattering": {
-                "variances_mm2": profile.variances_mm2.tolist(),
-                "weights": profile.weights.tolist(),
-                "edge_error": profile.edge_error.tolist(),
-                "told": told,
-            }
-        }
-    }
+    return {"facts": {"scattering": profile.facts(told)}}
