@@ -11,6 +11,7 @@ glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_spe
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -142,22 +143,13 @@ def content(material: Material) -> bytes:
         In mm.
     """
     mesh = material.mesh
-    file = pygltflib.GLTF2(
-        asset=pygltflib.Asset(generator=f"skinrig {version('skinrig')}"),
-        scene=0,
-        scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0, name="skin")],
-        materials=[_material(material)],
-        samplers=[
-            pygltflib.Sampler(
-                magFilter=pygltflib.LINEAR,
-                minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
-                wrapS=pygltflib.CLAMP_TO_EDGE,
-                wrapT=pygltflib.CLAMP_TO_EDGE,
-            )
-        ],
-        extensionsUsed=["KHR_materials_ior", "KHR_materials_specular"],
-    )
+    skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
+    file = pygltflib.GLTF2.from_json(skeleton.read_text(encoding="utf-8"))
+    file.asset = pygltflib.Asset(generator=f"skinrig {version('skinrig')}")
+    (surface_material,) = file.materials
+    extensions = surface_material.extensions
+    surface_material.extensions = {"KHR_materials_ior": {"ior": float(material.eta)}, **extensions}
+    surface_material.extras = {"subsurface": material.sigma_tr()}
     binary = _Binary(file)
     attributes = pygltflib.Attributes(
         POSITION=binary.accessor(mesh.vertices_mm * M_PER_MM, bounds=True),
@@ -175,11 +167,8 @@ def content(material: Material) -> bytes:
         attributes=attributes, indices=indices, material=0, targets=targets
     )
     extras = {"targetNames": list(material.shapes)} if targets else {}
-    file.meshes = [
-        pygltflib.Mesh(
-            primitives=[surface], weights=[0.0] * len(targets), name="skin", extras=extras
-        )
-    ]
+    named: dict[str, Any] = {"name": "skin", "extras": extras}
+    file.meshes = [pygltflib.Mesh(primitives=[surface], weights=[0.0] * len(targets), **named)]
     for source, (name, data) in enumerate(_pictures(material)):
         file.images.append(
             pygltflib.Image(mimeType="image/png", bufferView=binary.view(data), name=name)
@@ -189,23 +178,6 @@ def content(material: Material) -> bytes:
     file.buffers = [pygltflib.Buffer(byteLength=len(binary.data))]
     file.set_binary_blob(bytes(binary.data))
     return b"".join(file.save_to_bytes())
-
-
-def _material(material: Material) -> pygltflib.Material:
-    return pygltflib.Material(
-        name="Skin",
-        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-            baseColorTexture=pygltflib.TextureInfo(index=0),
-            metallicFactor=0.0,
-            metallicRoughnessTexture=pygltflib.TextureInfo(index=1),
-        ),
-        normalTexture=pygltflib.NormalMaterialTexture(index=2),
-        extensions={
-            "KHR_materials_ior": {"ior": float(material.eta)},
-            "KHR_materials_specular": {"specularFactor": 1.0, "specularTexture": {"index": 3}},
-        },
-        extras={"subsurface": material.sigma_tr()},
-    )
 
 
 def _pictures(material: Material) -> list[tuple[str, bytes]]:
