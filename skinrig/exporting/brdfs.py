@@ -97,17 +97,16 @@ def write_brdfs(
         Where the appearance has no lobes.
     """
     lobes = skin_reflectance.lobes_of(appearance)
+    suffix, light = BRDF_SUFFIXES[to], lobes.light_radius_rad
     files: dict[str, object] = {}
     for k in range(lobes.size):
-        name = f"lobe_{k}{BRDF_SUFFIXES[to]}"
         told = f"lobe {k}, equal in all channels: highlights have the light's color"
-        _write(to, folder / name, _lobe(lobes, k), told, lobes.light_radius_rad)
-        files[name] = {"what": told, "light_from_inside": False}
+        _write(to, folder / f"lobe_{k}{suffix}", _lobe(lobes, k), told, light)
+        files[f"lobe_{k}{suffix}"] = {"what": told, "light_from_inside": False}
     if place is not None:
         at, entry = _place(appearance, lobes, place)
-        name = f"place{BRDF_SUFFIXES[to]}"
-        _write(to, folder / name, at, str(entry["what"]), lobes.light_radius_rad)
-        files[name] = entry
+        _write(to, folder / f"place{suffix}", at, str(entry["what"]), light)
+        files[f"place{suffix}"] = entry
     document = {
         "schema": "skinrig.brdfs/1",
         "format": to,

@@ -172,7 +172,7 @@ def _tangent_normals(
     except GeometryError as error:
         return None, str(error)
     axes, covered = FramedMesh.of(mesh).texel_frames(height)
-    valid = covered if one.valid is None else covered & one.valid
+    valid = covered & one.mask
     turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
     what = f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules)"
     what = f"{what}, {delivery.green}"

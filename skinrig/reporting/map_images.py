@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.skin import SkinMap
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting import page
@@ -17,12 +16,6 @@ from skinrig.written_units import written
 
 SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
-
-
-def valid_of(skin_map: SkinMap) -> BoolArray:
-    """Return where a map has values, (H, W)."""
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
@@ -79,6 +72,27 @@ class MapDrawing:
         """Return an image of values around 0, such as differences."""
         return self.scalar(title, values, -reach, reach, "RdBu_r")
 
+    def normals(self, title: str, normals: FloatArray) -> page.Image:
+        """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
+        small = shrink(normals, self.width).astype(float)
+        every = np.ones(normals.shape[:2], bool)
+        mask = shrink(every if self.valid is None else self.valid, self.width).astype(bool)
+        codes = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0))
+        image = codes.astype(np.uint8)
+        image[~mask] = png.INVALID_GRAY
+        alt = f"{self.of or 'normals'}, {title}: x, y, z as red, green, blue"
+        if mask.any():
+            length = np.linalg.norm(small[mask], axis=-1)
+            tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
+            alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
+        return _stored(title, png.encode(image), alt + _missing(mask), image.shape[:2])
+
+
+def _missing(mask: BoolArray) -> str:
+    """Return how much of a picture has no value, in words; nothing where that is next to none."""
+    missing = 1.0 - mask.mean()
+    return f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
+
 
 def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     """Return a map's median, its middle 90 %, and how much of it has no value."""
@@ -87,9 +101,7 @@ def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
         return "no pixel has a value"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
     within = f"90 % of pixels within {number(low)} to {number(high)}"
-    text = f"median {written(number(median), unit)}, {within}"
-    missing = 1.0 - shown.mean()
-    return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
+    return f"median {written(number(median), unit)}, {within}{_missing(shown)}"
 
 
 def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
@@ -106,24 +118,6 @@ def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "
 def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
-
-
-def normal_image(
-    title: str, normals: FloatArray, *, valid: BoolArray, width: int = 280, of: str = "normals"
-) -> page.Image:
-    """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
-    small = shrink(normals, width).astype(float)
-    mask = shrink(valid, width).astype(bool)
-    image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
-    image[~mask] = png.INVALID_GRAY
-    alt = f"{of}, {title}: x, y, z as red, green, blue"
-    if mask.any():
-        length = np.linalg.norm(small[mask], axis=-1)
-        tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
-        alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
-    missing = 1.0 - mask.mean()
-    alt += f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
-    return _stored(title, png.encode(image), alt, image.shape[:2])
 
 
 def stored_image(title: str, data: bytes, *, alt: str = "") -> page.Image:

@@ -85,7 +85,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
 def _values(one: SkinMap) -> tuple[Float64Array, BoolArray]:
     values = one.values.astype(np.float64)
     good = np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
-    return values, good if one.valid is None else good & one.valid
+    return values, good & one.mask
 
 
 def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:

@@ -11,7 +11,6 @@ import numpy as np
 from model.skin import SkinAppearance
 from skinrig.drawing import templates
 from skinrig.exporting.images import Image, ImageFolder
-from skinrig.exporting.materials import obj
 from skinrig.exporting.materials.material import MAP_NOTES, Material
 from skinrig.exporting.options import FIRST_TILE, M_PER_MM, TILE_SEPARATORS, UNITS_M, Delivery
 from skinrig.exporting.provenance import IMAGE_ORIENTATION
@@ -51,7 +50,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     per_mm = M_PER_MM / UNITS_M[unit]
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)
-    (folder / "skin.obj").write_text(obj.text(material.mesh, per_mm, unit), encoding="utf-8")
+    (folder / "skin.obj").write_text(material.mesh.obj(per_mm, unit), encoding="utf-8")
     out.document(DOCUMENT_FILE, appearance, facts(material, appearance, delivery, SCHEMA, scale))
     return left_out
 

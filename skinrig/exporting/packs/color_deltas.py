@@ -93,14 +93,8 @@ def write(
         shown = np.abs(delta[colors.valid])
         largest[name] = float(shown.max()) if shown.size else 0.0
     out.errors([Image("color_mask", colors.valid.astype(float))])
-    return {
-        "size": COLOR_SIZE,
-        "layout": colors.layout,
-        "space": colors.space,
-        "maps": names,
-        "largest_delta": largest,
-        "valid_share": float(colors.valid.mean()),
-    }, have
+    told = {"layout": colors.layout, "space": colors.space, "maps": names, "largest_delta": largest}
+    return {"size": COLOR_SIZE, **told, "valid_share": float(colors.valid.mean())}, have
 
 
 def _filled(base: Float64Array, valid: BoolArray) -> Float64Array:
@@ -116,7 +110,7 @@ def _colors(
     left_out: list[tuple[str, str]],
 ) -> Colors:
     melanin = appearance.maps["melanin"]
-    seen = np.ones(melanin.values.shape, bool) if melanin.valid is None else melanin.valid.copy()
+    seen = melanin.mask.copy()
     blends = {}
     for state in (NEUTRAL, *states):
         blends[state] = rig.evaluate({state: 1.0})
@@ -186,9 +180,8 @@ def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
     except landmark_field.LandmarkFieldError as error:
         raise ExportError(f"--landmarks: {error}") from error
     rows, columns = np.mgrid[0:COLOR_SIZE, 0:COLOR_SIZE] + 0.5
-    texel = np.stack(
-        [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5], axis=-1
-    )
+    pixel = [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5]
+    texel = np.stack(pixel, axis=-1)
     # the field is smooth: every eighth pixel, and linearly between
     step = texel[::8, ::8].reshape(-1, 2)
     moved = field.at(step)[0].reshape(*texel[::8, ::8].shape)

@@ -212,8 +212,7 @@ def micro_normals(
     left_out = []
     for site, entry in sorted(part.get("sites", {}).items()):
         relief = appearance.maps[entry["map"]]
-        valid = np.isfinite(relief.values)
-        valid &= True if relief.valid is None else relief.valid
+        valid = np.isfinite(relief.values) & relief.mask
         if not valid.any():
             left_out.append((f"micro normals of {site}", "no height is valid"))
             continue

@@ -18,9 +18,9 @@ from typing import Any, Final
 import numpy as np
 
 from model import color_table, spectra
-from model.skin import SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
-from skinrig.arrays import BoolArray, Float64Array
+from skinrig.arrays import Float64Array
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
@@ -117,7 +117,7 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         raise ExportError(
             f"hemoglobin: got shape {blood.values.shape}, expected {melanin.values.shape}"
         )
-    valid = _valid(melanin, blood)
+    valid = melanin.mask & blood.mask
     # estimates lie in the table by construction; rounding to float32 can leave it
     c_m = np.clip(melanin.values[valid].astype(np.float64), 0.0, C_M_MAX)
     c_hd = np.clip(blood.values[valid].astype(np.float64), 0.0, C_HD_MAX)
@@ -146,7 +146,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
             "wavelength; make them again with `skinrig reconstruct --want diffuse,specular,melanin`"
         )
     means = band_means_nm(str(told["camera"]), str(told["illuminant"]))
-    valid = _valid(diffuse, specular)
+    valid = diffuse.mask & specular.mask
     s0 = np.where(valid[..., None], diffuse.values + specular.values, 0.0)
     s1 = np.where(valid[..., None], specular.values, 0.0)
     channels = {}
@@ -179,11 +179,3 @@ def stokes_header(what: str) -> dict[str, str]:
         "polarisationHandedness": "right",
         "comments": what,
     }
-
-
-def _valid(one: SkinMap, other: SkinMap) -> BoolArray:
-    """Return where two maps have values, also such as are no numbers."""
-    valid = np.ones(one.values.shape[:2], bool)
-    for skin_map in (one, other):
-        valid &= True if skin_map.valid is None else skin_map.valid
-    return valid

@@ -260,8 +260,7 @@ def reflectance_share(eta: float) -> float:
 def _angle(model: SkinReflectance, truth: SkinAppearance | None) -> tuple[float, str]:
     if truth is not None and "reflectance" in truth.maps:
         known = truth.maps["reflectance"]
-        valid = np.ones(known.values.shape[:2], bool) if known.valid is None else known.valid
-        return float(np.median(typology_angle_deg(known.values[valid]))), "truth"
+        return float(np.median(typology_angle_deg(known.values[known.mask]))), "truth"
     skin = model.r_d[model.valid] * reflectance_share(model.eta)
     return float(np.median(typology_angle_deg(skin))), "r_d"
 

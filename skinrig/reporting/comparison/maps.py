@@ -178,7 +178,7 @@ def _difference(
 def _known(one: SkinMap) -> BoolArray:
     finite = np.isfinite(one.values)
     good = finite if finite.ndim == 2 else finite.all(axis=2)
-    return np.asarray(good if one.valid is None else good & one.valid, bool)
+    return np.asarray(good & one.mask, bool)
 
 
 def _beyond(sigmas: Float64Array) -> tuple[float, ...]:

@@ -91,8 +91,7 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     yield from conditions.seconds(a, b)
     yield from conditions.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
-    missing = [*alone(a, b), *image_comparison.alone(a, b)]
-    if missing:
+    if missing := alone(a, b):
         yield page.Heading("Only in one", level=2)
         yield page.table(
             ("folder", "in"),
@@ -145,7 +144,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         """Return values as a picture, from the front where they lie on a mesh."""
         if place is None:
             return np.nan_to_num(values), both
-        rows, columns = np.nonzero(both if place.valid is None else both & place.valid)
+        rows, columns = np.nonzero(both & place.mask)
         points = place.values[rows, columns].astype(np.float64)
         view = FrontView.of(points, (points.min(axis=0), points.max(axis=0)))
         return view.picture(np.nan_to_num(values[rows, columns].astype(np.float64)))
@@ -158,9 +157,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         image, mask = laid(skin_map.values)
         shown = map_images.MapDrawing(one.name, one.unit, mask, IMAGE_WIDTH_PX)
         if one.unit == "°":
-            yield map_images.normal_image(
-                label, image, valid=mask, width=IMAGE_WIDTH_PX, of=one.name
-            )
+            yield shown.normals(label, image)
         elif image.ndim == 3:
             yield map_images.color_image(
                 label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name

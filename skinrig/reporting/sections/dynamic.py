@@ -22,7 +22,6 @@ from skinrig.appearances.dynamic import (
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.sections import facial_color
 
 MAX_SHOWN_EXPRESSIONS = 4
@@ -85,9 +84,8 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
     for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
         shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
-    for title, normals in shown.items():
-        every = np.ones(normals.shape[:2], bool)
-        images.append(map_images.normal_image(title, normals, valid=every, width=WIDTH_PX))
+    drawing = map_images.MapDrawing(width=WIDTH_PX)
+    images += [drawing.normals(title, normals) for title, normals in shown.items()]
     table: Any = layer.table
     together = dict.fromkeys(list(table.rows)[:2], 1.0)
     sums = zone_sums(together, table)
@@ -116,7 +114,7 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         alphas.append(figures.Curve(site, r.tolist(), alpha.tolist(), marks=False))
         sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
-        spread = 2.5 * float(np.std(relief.values[valid_of(relief)]))
+        spread = 2.5 * float(np.std(relief.values[relief.mask]))
         drawing = map_images.MapDrawing("", "um", relief.valid, WIDTH_PX)
         title = f"{site}: neutral relief"
         images.append(drawing.scalar(title, relief.values, -spread, spread, "gray"))

@@ -14,7 +14,6 @@ from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.evaluating.flash import MELANIN_RANGES
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import melanin_band
 
 MAX_SHOWN_STATES = 4
@@ -68,7 +67,7 @@ def section(
         if measured is None:
             continue
         blend = rig.evaluate({state: 1.0})
-        seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
+        seen = blend.valid if true is None else blend.valid & true.mask
         yield from map_images.map_panel(
             f"blood of {state}, by the rig",
             "volume fraction",
@@ -92,7 +91,7 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
     images = []
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
-        seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
+        seen = blend.valid & melanin.mask
         color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
         images.append(map_images.color_image(title, color, width=WIDTH_PX))
     yield page.Images(images)
@@ -157,9 +156,7 @@ def errors_by_band(
         blend = rig.evaluate({state: 1.0})
         if melanin.values.shape != blend.hemoglobin.shape:
             continue
-        good = blend.valid & (true.values > 0)
-        if true.valid is not None:
-            good = good & true.valid
+        good = blend.valid & (true.values > 0) & true.mask
         for low, high in MELANIN_RANGES:
             inside = good & (melanin.values >= low) & (melanin.values < high)
             if np.count_nonzero(inside) < MIN_BAND_PIXELS:
@@ -185,5 +182,5 @@ def _worst(state: str, banded: list[tuple[object, ...]]) -> str:
 def _mean(skin_map: SkinMap | None) -> float:
     if skin_map is None:
         return float("nan")
-    good = valid_of(skin_map)
+    good = skin_map.mask
     return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")

@@ -15,7 +15,6 @@ from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import state_words
 from skinrig.reporting.sections import kernel
 
@@ -85,58 +84,46 @@ def _beside_truth(
     """Yield truth | estimate | error | standard error of one state's normals and height."""
     normals = appearance.maps.get(f"normals_{state}")
     true = None if truth is None else truth.maps.get(f"normals_{state}")
+    words = f"normals, {state_words(state)}"
     if normals is not None:
-        parts = []
+        parts = [_of(words, normals).normals("estimate", normals.values)]
         if true is not None:
-            parts.append(_normal_image("truth", true, state))
-        parts.append(_normal_image("estimate", normals, state))
-        good = valid_of(normals)
-        if true is not None:
-            good = good & valid_of(true)
+            good = normals.mask & true.mask
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
-            parts.append(_angle_image("error", np.nan_to_num(error), good, state))
+            parts.insert(0, _of(words, true).normals("truth", true.values))
+            parts.append(_angle_image("error", np.nan_to_num(error), good, words))
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
-            parts.append(_angle_image("standard error", spread, valid_of(normals), state))
-        yield page.Heading(f"normals, {state_words(state)}")
+            parts.append(_angle_image("standard error", spread, normals.mask, words))
+        yield page.Heading(words)
         yield page.Images(parts)
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
-        relief = None
-        if truth is not None:
-            relief = evaluation.true_relief(appearance, truth, state)
         yield from map_images.map_panel(
             f"height, {state_words(state)}",
             "um",
             estimate=height.values,
             standard_error=height.stderr,
-            truth=relief,
-            valid=valid_of(height),
-            width=280,
+            truth=None if truth is None else evaluation.true_relief(appearance, truth, state),
+            valid=height.mask,
         )
 
 
 def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> page.Image:
     if skin_map.values.ndim == 3:
-        return map_images.normal_image(
-            title, skin_map.values, valid=valid_of(skin_map), width=WIDTH_PX
-        )
-    heights = [
-        m.values[valid_of(m)] for k, m in appearance.maps.items() if k.startswith("height_a")
-    ]
+        return _of("", skin_map, WIDTH_PX).normals(title, skin_map.values)
+    heights = [m.values[m.mask] for k, m in appearance.maps.items() if k.startswith("height_a")]
     reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
-    drawing = map_images.MapDrawing("", "um", valid_of(skin_map), WIDTH_PX)
+    drawing = map_images.MapDrawing("", "um", skin_map.mask, WIDTH_PX)
     return drawing.signed(title, skin_map.values, reach)
 
 
-def _normal_image(title: str, skin_map: SkinMap, state: str) -> page.Image:
-    return map_images.normal_image(
-        title, skin_map.values, valid=valid_of(skin_map), of=f"normals, {state_words(state)}"
-    )
+def _of(words: str, skin_map: SkinMap, width: int = 280) -> map_images.MapDrawing:
+    return map_images.MapDrawing(words, "", skin_map.mask, width)
 
 
-def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, state: str) -> page.Image:
-    drawing = map_images.MapDrawing(f"normals, {state_words(state)}", "°", valid)
+def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, words: str) -> page.Image:
+    drawing = map_images.MapDrawing(words, "°", valid)
     return drawing.size(title, degrees, map_images.reach_of(degrees, valid, 98))
 
 

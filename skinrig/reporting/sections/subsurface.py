@@ -172,7 +172,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     drawing = map_images.MapDrawing("", "mm", found.valid, WIDTH_PX)
     for c, channel in enumerate(CHANNEL_NAMES):
         values = found.values[..., c]
-        inside = values if found.valid is None else values[found.valid]
+        inside = values[found.mask]
         if not inside.size:
             continue
         low, high = float(inside.min()), float(inside.max())

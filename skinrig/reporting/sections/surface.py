@@ -14,7 +14,6 @@ from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.evaluating.surface_bands import Banded, errors_by_band
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign
 
@@ -45,7 +44,7 @@ def section(
         Judgements are added to it.
     """
     place = appearance.maps["position"]
-    rows, columns = np.nonzero(valid_of(place))
+    rows, columns = np.nonzero(place.mask)
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
         yield page.note("No texel of these maps is valid.")
@@ -56,7 +55,7 @@ def section(
     if truth is not None:
         pairs = evaluation.match(appearance, truth)
         true_place = truth.maps["position"]
-        usable = valid_of(true_place)
+        usable = true_place.mask
         if "mask" in truth.maps:
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
@@ -69,7 +68,7 @@ def section(
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
-        good = valid_of(skin_map)[rows, columns]
+        good = skin_map.mask[rows, columns]
         width = FRONT_VIEW_WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
@@ -107,13 +106,13 @@ def _rank(key: str) -> tuple[int, str]:
 def _shown(
     title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int
 ) -> page.Image:
+    drawing = map_images.MapDrawing(key, "", valid, width)
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-        drawing = map_images.MapDrawing(key, "", valid, width)
         return drawing.scalar(_title(title, key), image, low, high)
     if "normals" in key:
-        return map_images.normal_image(title, image, valid=valid, of=key, width=width)
+        return drawing.normals(title, image)
     return map_images.color_image(
         title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
     )
@@ -150,7 +149,7 @@ def _spread(
     width: int,
 ) -> page.Image:
     unit = page.short_unit(skin_map.unit)
-    good = valid_of(skin_map)[at]
+    good = skin_map.mask[at]
     if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
         size = np.abs(skin_map.values[at].astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)

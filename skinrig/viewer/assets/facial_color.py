@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from model.facial_color import HemoglobinRig
 from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances import face_textures
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
@@ -21,10 +22,6 @@ from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, placed
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
-
-if TYPE_CHECKING:
-    from rigsim.subject import SimulatedSubject
-
 
 TABLE_NODES: Final = 128
 """Nodes along each axis of the color table."""

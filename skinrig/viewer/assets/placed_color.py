@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,15 +15,13 @@ from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
 from reconstruction.correspondence import landmark_table
 from rigsim.geometry.atlas import unwrap
+from rigsim.subject import SimulatedSubject
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import placing
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import SceneError, SceneSource
-
-if TYPE_CHECKING:
-    from rigsim.subject import SimulatedSubject
 
 MELANIN_MAP = "melanin"
 RIG_PX: Final = 256

@@ -35,6 +35,8 @@ TRANSLUCENCY_PX: Final = 128
 """Texels a side of the map of widths: a probe measures few places, between them it is smooth."""
 POPULATION_SPACE: Final = "surface"
 """Space of the trait library whose centre is the mean surface of a population."""
+FACIAL_R_D: Final = (0.46, 0.31, 0.23)
+"""R_d of facial skin, Weyrich et al. 2006, figure 11, linear sRGB; it shapes the profile's core."""
 TYPICAL_CHROMOPHORES: Final = (0.03, 0.03)
 """Volume fractions of melanin and hemoglobin, whose color stands in for R_d where there is none:
 the shape of a profile depends little on it."""
@@ -84,6 +86,16 @@ def assemble(source: SceneSource, found: PageLobes) -> Assets:
         "facts": {"reflectance": _facts(found, compact), "profile": profile.facts(told)},
         "left_out": _left_out(found, told),
     }
+
+
+def default_scattering(source: SceneSource) -> Assets:
+    """Return the profile of the population's mean dipole, for skin of which nothing was measured.
+
+    The page switches between it and that of the fitted reflectance.
+    """
+    depth_mm, told = skin_reflectance.population_mean_mm()
+    profile = gaussian_profiles.fit(FACIAL_R_D, 1.0 / depth_mm)
+    return {"facts": {"scattering": profile.facts(told)}}
 
 
 def lobes_of(source: SceneSource) -> PageLobes:

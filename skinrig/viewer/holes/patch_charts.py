@@ -10,22 +10,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from rigsim.geometry.atlas import unwrap
-from rigsim.geometry.mesh import build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.viewer.holes import closing as hole_closing
 from skinrig.viewer.holes.closing import Patch
 from skinrig.viewer.scene import Texture, ViewerScene
-
-if TYPE_CHECKING:
-    from rigsim.geometry.mesh import Mesh
-
 
 GRID_CELLS: Final = 512
 """Side of the grid on which empty places are sought."""
