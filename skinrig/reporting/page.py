@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -62,30 +62,38 @@ class Check:
         return self.got / self.bound
 
 
+class Block:
+    """A piece of a page."""
+
+    __slots__ = ()
+
+    @property
+    def macro(self) -> str:
+        """Macro of ``blocks.html`` that draws it."""
+        return type(self).__name__.lower()
+
+
 @dataclass(frozen=True, slots=True)
-class Heading:
+class Heading(Block):
     """A heading; level 2 begins a section of the page and of its contents."""
 
-    macro: ClassVar = "heading"
     text: str
     level: int = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Paragraph:
+class Paragraph(Block):
     """Plain text."""
 
-    macro: ClassVar = "paragraph"
     text: str
     kind: str = ""
     """Class in the style sheet, such as "note"."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bullets:
+class Bullets(Block):
     """A list of sentences."""
 
-    macro: ClassVar = "bullets"
     items: Sequence[str]
 
 
@@ -100,10 +108,9 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class Table(Block):
     """A table with a caption; a heading without text leaves its cell empty."""
 
-    macro: ClassVar = "table"
     caption: str
     head: Sequence[Cell]
     rows: Sequence[Sequence[Cell]]
@@ -133,36 +140,32 @@ class Image:
 
 
 @dataclass(frozen=True, slots=True)
-class Images:
+class Images(Block):
     """Images side by side."""
 
-    macro: ClassVar = "images"
     images: Sequence[Image]
     small: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Plots:
+class Plots(Block):
     """SVG drawings side by side."""
 
-    macro: ClassVar = "plots"
     drawings: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
-class Folded:
+class Folded(Block):
     """Blocks that open when their title is clicked, and are open when printed."""
 
-    macro: ClassVar = "folded"
     title: str
     blocks: Sequence[Block]
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class View(Block):
     """What a section found, laid out by a template of its own."""
 
-    macro: ClassVar = "view"
     template: str
     """Its name below ``reporting/templates``, without suffix."""
     data: Mapping[str, Any]
@@ -188,9 +191,6 @@ class View:
         }
         name = f"reporting/templates/{self.template}.html"
         return Markup(templates.render(name, **helpers, **self.data))
-
-
-Block: TypeAlias = Heading | Paragraph | Bullets | Table | Images | Plots | Folded | View
 
 
 @dataclass(frozen=True, slots=True)
