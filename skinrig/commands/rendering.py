@@ -136,7 +136,7 @@ def render(
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
     if against is not None and not components:
-        from skinrig.rendering.photographs import evaluation
+        from skinrig.rendering.photographs import comparison, evaluation
 
         found = evaluation.evaluate_folders(
             appearance[0],
@@ -150,7 +150,7 @@ def render(
             seed=seed,
             progress=console.progress,
         )
-        evaluation.print_comparison(console, found)
+        comparison.print_comparison(console, found)
         if not found["passed"]:
             raise typer.Exit(errors.LIMIT_MISSED)
         return
@@ -176,14 +176,12 @@ def render(
         done = figures.draw_photograph(
             subjects[0], against, view, lights[0].name, out, effort, calibration=calibration
         )
-    elif bases is None:
-        done = figures.draw(
-            subjects[0], camera, lights, out, effort, components=components, assumed=stage.assumed
-        )
     else:
-        done = figures.draw_bases(
-            subjects, _ranks(bases), camera, lights, out, effort, assumed=stage.assumed
-        )
+        asked = figures.Asked(camera, lights, out, effort, stage.assumed)
+        if bases is None:
+            done = figures.draw(subjects[0], asked, components=components)
+        else:
+            done = figures.draw_bases(subjects, _ranks(bases), asked)
     _tell(console, done)
 
 

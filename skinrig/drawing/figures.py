@@ -77,33 +77,27 @@ def bars(
     figure, axes = canvas(6.2, 3.0)
     position = np.arange(len(labels))
     width = 0.8 / max(len(series), 1)
+    words = []
     for number, (name, values) in enumerate(series.items()):
-        axes.bar(
-            position + (number - (len(series) - 1) / 2) * width,
-            np.asarray(values, float),
-            width,
-            label=name,
-            color=SERIES_COLORS[number % len(SERIES_COLORS)],
-        )
+        color, shift = SERIES_COLORS[number % len(SERIES_COLORS)], number - (len(series) - 1) / 2
+        heights = np.asarray(values, float)
+        axes.bar(position + shift * width, heights, width, label=name, color=color)
         if limits and name in limits:
-            axes.axhline(
-                limits[name], color=SERIES_COLORS[number % len(SERIES_COLORS)], ls="--", lw=1
-            )
+            axes.axhline(limits[name], color=color, ls="--", lw=1)
+        known = zip(labels, heights, strict=True)
+        told = (f"{' '.join(label.split())} {h:.3g}" for label, h in known if np.isfinite(h))
+        words.append(f"{name}: {', '.join(told)}")
     axes.set_xticks(position, labels, fontsize=8)
-    axes.set_ylabel(unit)
+    _title(axes, title, y_name=unit)
+    held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
+    return finished(figure, f"{title}, {unit}: {'; '.join(words)}{held}")
+
+
+def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
+    axes.set_xlabel(x_name)
+    axes.set_ylabel(y_name)
     axes.set_title(title, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
-    told = "; ".join(
-        f"{name}: "
-        + ", ".join(
-            f"{' '.join(label.split())} {value:.3g}"
-            for label, value in zip(labels, np.asarray(values, float), strict=True)
-            if np.isfinite(value)
-        )
-        for name, values in series.items()
-    )
-    held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
-    return finished(figure, f"{title}, {unit}: {told}{held}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +105,9 @@ class Curve:
     """One series of a plot: points with standard errors, a line, or both."""
 
     name: str
-    x: Sequence[float]
-    y: Sequence[float]
-    stderr: Sequence[float] | None = None
+    x: Sequence[float] | FloatArray
+    y: Sequence[float] | FloatArray
+    stderr: Sequence[float] | FloatArray | None = None
     marks: bool = True
     """Whether points are marked."""
     line: bool = True
@@ -141,24 +135,12 @@ def curves(
             continue
         bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
         down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis has no room for zero
-        axes.errorbar(
-            x,
-            y,
-            yerr=np.stack([down, bars]),
-            fmt=style or "o",
-            color=color,
-            ms=4,
-            lw=1.2,
-            elinewidth=1,
-            label=curve.name,
-        )
+        look = {"fmt": style or "o", "color": color, "ms": 4, "lw": 1.2, "elinewidth": 1}
+        axes.errorbar(x, y, yerr=np.stack([down, bars]), label=curve.name, **look)
     if log_y:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)
-    axes.set_xlabel(x_name)
-    axes.set_ylabel(y_name)
-    axes.set_title(title, fontsize=10)
-    axes.legend(fontsize=7, frameon=False)
+    _title(axes, title, y_name, x_name)
     told = "; ".join(
         f"{curve.name} {span_of(np.asarray(curve.y, float))} over "
         f"{span_of(np.asarray(curve.x, float))}"

@@ -129,10 +129,20 @@ def srgb8(linear: FloatArray) -> UInt8Array:
         The same shape.
     """
     value = np.clip(np.nan_to_num(np.asarray(linear, np.float64)), 0.0, 1.0)
-    curved = np.where(
-        value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
-    )
-    return np.round(255.0 * curved).astype(np.uint8)
+    return np.round(255.0 * srgb_curve(value)).astype(np.uint8)
+
+
+def srgb_curve(linear: FloatArray) -> Float64Array:
+    """Return sRGB's curve of values in [0, 1], IEC 61966-2-1.
+
+    Examples
+    --------
+    >>> srgb_curve(np.array([0.0, 0.0031308, 1.0])).round(4).tolist()
+    [0.0, 0.0404, 1.0]
+    """
+    value = np.asarray(linear, np.float64)
+    power = 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
+    return np.where(value <= 0.0031308, 12.92 * value, power)
 
 
 def colorize(

@@ -10,17 +10,11 @@ import numpy as np
 
 from skinrig.arrays import Float64Array, FloatArray
 
+_ACROSS, _UP = {1: "left", 0: "center", -1: "right"}, {1: "bottom", -1: "top"}
 _LABEL_OFFSETS = tuple(
-    (dx, dy, across, up)
+    (5 * x, y * far, _ACROSS[x], _UP[y])
     for far in (5, 12, 20)
-    for dx, dy, across, up in (
-        (5, far, "left", "bottom"),
-        (-5, far, "right", "bottom"),
-        (5, -far, "left", "top"),
-        (-5, -far, "right", "top"),
-        (0, far, "center", "bottom"),
-        (0, -far, "center", "top"),
-    )
+    for x, y in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1))
 )
 """Where a name is tried: offsets from its point, points, and which of its corners lies there."""
 

@@ -26,6 +26,7 @@ def _environment() -> Environment:
         loader=PackageLoader("skinrig", ""),
         autoescape=True,
         undefined=StrictUndefined,
+        extensions=["jinja2.ext.do"],
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,

@@ -20,6 +20,7 @@ Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
 
 DOCUMENT_FILE = "brdfs.json"
+BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
 _SURFACE_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
@@ -96,17 +97,16 @@ def write_brdfs(
         Where the appearance has no lobes.
     """
     lobes = skin_reflectance.lobes_of(appearance)
+    suffix, light = BRDF_SUFFIXES[to], lobes.light_radius_rad
     files: dict[str, object] = {}
     for k in range(lobes.size):
-        name = f"lobe_{k}{BRDF_SUFFIXES[to]}"
         told = f"lobe {k}, equal in all channels: highlights have the light's color"
-        _write(to, folder / name, _lobe(lobes, k), told, lobes.light_radius_rad)
-        files[name] = {"what": told, "light_from_inside": False}
+        _write(to, folder / f"lobe_{k}{suffix}", _lobe(lobes, k), told, light)
+        files[f"lobe_{k}{suffix}"] = {"what": told, "light_from_inside": False}
     if place is not None:
         at, entry = _place(appearance, lobes, place)
-        name = f"place{BRDF_SUFFIXES[to]}"
-        _write(to, folder / name, at, str(entry["what"]), lobes.light_radius_rad)
-        files[name] = entry
+        _write(to, folder / f"place{suffix}", at, str(entry["what"]), light)
+        files[f"place{suffix}"] = entry
     document = {
         "schema": "skinrig.brdfs/1",
         "format": to,
@@ -196,23 +196,9 @@ def _nearest_valid(valid: BoolArray, place: Place) -> tuple[int, int]:
     return row, column
 
 
-def _write_merl(path: Path, brdf: Brdf, description: str) -> None:
-    del description  # the format has no place for it
-    merl.write(path, merl_table(brdf))
-
-
-def _write_rgl(path: Path, brdf: Brdf, description: str) -> None:
-    rgl.write(path, rgl.of_brdf(brdf, description=description))
-
-
-_BRDF_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {
-    "merl": _write_merl,
-    "rgl": _write_rgl,
-}
-BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
-
-
 def _write(to: str, path: Path, brdf: Brdf, told: str, light_radius_rad: float) -> None:
-    _BRDF_WRITERS[to](
-        path, brdf, f"{told}; measured with a light of radius {light_radius_rad:.6g} rad"
-    )
+    if to == "merl":  # the format has no place for words
+        merl.write(path, merl_table(brdf))
+    else:
+        told = f"{told}; measured with a light of radius {light_radius_rad:.6g} rad"
+        rgl.write(path, rgl.of_brdf(brdf, description=told))

@@ -7,7 +7,7 @@ above 1: its record says how codes become values again, and which share of the p
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,9 +15,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.arrays import BoolArray, Float64Array, FloatArray
+from model.skin import SkinAppearance
+from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
-from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
+from skinrig.exporting.options import FIRST_TILE, Delivery
+from skinrig.exporting.provenance import provenance
+from skinrig.exporting.sealing import write_json
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -36,7 +39,7 @@ PNG_RANGES: Final[Mapping[str, tuple[float, float]]] = {
 """Ranges of PNG codes of maps whose names begin so, equal for all subjects."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Image:
     """One image to write.
 
@@ -62,7 +65,7 @@ class Image:
 
     name: str
     values: FloatArray
-    unit: str
+    unit: str = "1"
     space: str = DATA_SPACE
     what: str = ""
     low: float | None = None
@@ -81,9 +84,8 @@ class Image:
         filler: tuple[float, ...] | None = None,
     ) -> Image:
         """Return a map of normals, +Y up, with the green that is asked for."""
-        flip = np.array([1.0, NORMAL_Y[delivery.normal_y], 1.0], np.float32)
-        ranges: dict[str, Any] = {"low": -1.0, "high": 1.0, "valid": valid, "filler": filler}
-        return Image(name=name, values=normals * flip, unit="1", what=what, **ranges)
+        turned = normals * np.array([1.0, delivery.y, 1.0], np.float32)
+        return Image(name, turned, "1", DATA_SPACE, what, -1.0, 1.0, valid, filler)
 
     def on_empty_tile(self) -> Image:
         """Return the image of a tile where nothing was measured, of one value."""
@@ -94,12 +96,8 @@ class Image:
         value = usual if self.filler is None else np.array(self.filler)
         values = np.empty((EMPTY_TILE_PX, EMPTY_TILE_PX, *self.values.shape[2:]), np.float32)
         values[...] = value if self.values.ndim == 3 else value[0]
-        return replace(
-            self,
-            values=values,
-            valid=np.zeros(values.shape[:2], np.bool_),
-            what=f"nothing was measured on this tile: one value; {self.what}",
-        )
+        what = f"nothing was measured on this tile: one value; {self.what}"
+        return replace(self, values=values, valid=np.zeros(values.shape[:2], np.bool_), what=what)
 
 
 @dataclass(slots=True)
@@ -128,12 +126,9 @@ class ImageFolder:
         names = []
         for tile, one in self._by_tile(image):
             names.append(self._place(folder, image.name, "exr", tile))
-            write_exr(
-                self.root / names[-1],
-                one.values,
-                {"unit": one.unit, "colorSpace": one.space, "comments": one.what},
-                rec709=one.space == SRGB_SPACE,
-            )
+            channels = {"Y" if one.values.ndim == 2 else "RGB": one.values}
+            header = {"unit": one.unit, "colorSpace": one.space, "comments": one.what}
+            write_channels(self.root / names[-1], channels, header, rec709=one.space == SRGB_SPACE)
             self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
         return names[0]
 
@@ -155,6 +150,17 @@ class ImageFolder:
         """Write a float EXR and a 16-bit PNG a tile; return the first PNG's name."""
         self.exr(image)
         return self.png(image)
+
+    def errors(self, images: Iterable[Image], folder: str = "exr") -> None:
+        """Write images of errors, where they are asked for."""
+        if self.delivery.with_errors:
+            for image in images:
+                self.exr(image, folder)
+
+    def document(self, file: str, appearance: SkinAppearance, told: Mapping[str, Any]) -> None:
+        """Write the document that says where an export is from, and what each file holds."""
+        files = dict(sorted(self.records.items()))
+        write_json(self.root / file, {**provenance(appearance), **told, "files": files})
 
     def _by_tile(self, image: Image) -> list[tuple[int, Image]]:
         empty = [(tile, image.on_empty_tile()) for tile in self.tiles[1:]]
@@ -207,7 +213,7 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
     shown = values if image.valid is None else values[image.valid]
     low, high = coded_range(image)
     if image.space == SRGB_SPACE:
-        position = srgb_curve(np.clip(values, 0.0, 1.0))
+        position = png.srgb_curve(np.clip(values, 0.0, 1.0))
         encoding = f"sRGB curve (IEC 61966-2-1): value = inverse curve of code / {top}"
     else:
         position = np.clip((values - low) / (high - low), 0.0, 1.0)
@@ -243,33 +249,12 @@ def coded_range(image: Image) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def srgb_curve(linear: FloatArray) -> Float64Array:
-    """Return sRGB's curve of values in [0, 1], IEC 61966-2-1.
-
-    Examples
-    --------
-    >>> srgb_curve(np.array([0.0, 0.0031308, 1.0])).round(4).tolist()
-    [0.0, 0.0404, 1.0]
-    """
-    value = np.asarray(linear, np.float64)
-    power = 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
-    return np.where(value <= 0.0031308, 12.92 * value, power)
-
-
 def png_range(name: str) -> tuple[float | None, float | None]:
     """Return the fixed range of a map's PNG, None and None where it follows the values."""
     for start, (low, high) in PNG_RANGES.items():
         if name.startswith(start):
             return low, high
     return None, None
-
-
-def write_exr(
-    path: Path, values: FloatArray, attributes: Mapping[str, str], *, rec709: bool = False
-) -> None:
-    """Write (H, W) as channel Y or (H, W, 3) as R, G, B, float32, compressed without loss."""
-    channel = "Y" if values.ndim == 2 else "RGB"
-    write_channels(path, {channel: values}, attributes, rec709=rec709)
 
 
 def write_channels(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,9 +21,9 @@ from skinrig.exporting.images import (
 )
 from skinrig.exporting.materials import materialx, tangents
 from skinrig.exporting.materials.tangents import FramedMesh
-from skinrig.exporting.options import NORMAL_Y, Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
-from skinrig.exporting.sealing import ExportError, write_json
+from skinrig.exporting.options import Delivery
+from skinrig.exporting.provenance import IMAGE_ORIENTATION
+from skinrig.exporting.sealing import ExportError
 from skinrig.rendering.geometry import MESH_FILES, GeometryError, own_mesh
 
 DOCUMENT_FILE: Final = "maps.json"
@@ -73,8 +73,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         out.png(image)
         colored = "color3" if image.space == SRGB_SPACE else "vector3"
         shown[name] = (exr, colored if image.values.ndim == 3 else "float")
-        if delivery.with_errors:
-            _errors(name, appearance.maps[name], out)
+        out.errors(_errors(name, appearance.maps[name]))
     if {"melanin", "hemoglobin"} <= set(names):
         packed = _packed(appearance)
         if packed is None:
@@ -92,26 +91,19 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     for name, data in sorted(appearance.files.items()):
         (folder / "files").mkdir(exist_ok=True)
         (folder / "files" / name).write_bytes(data)
-    write_json(folder / DOCUMENT_FILE, _document(appearance, delivery, out.records, left_out))
+    out.document(
+        DOCUMENT_FILE,
+        appearance,
+        {
+            "schema": SCHEMA,
+            "orientation": IMAGE_ORIENTATION,
+            "normal_y": delivery.green,
+            "udim": "none" if delivery.udim == "none" else "tile 1001",
+            "rig_frame": "mm, +x right, +y up, +z towards the main camera",
+            "left_out": [list(row) for row in left_out],
+        },
+    )
     return left_out
-
-
-def _document(
-    appearance: SkinAppearance,
-    delivery: Delivery,
-    files: Mapping[str, Any],
-    left_out: list[tuple[str, str]],
-) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "orientation": IMAGE_ORIENTATION,
-        "normal_y": delivery.green,
-        "udim": "none" if delivery.udim == "none" else "tile 1001",
-        "rig_frame": "mm, +x right, +y up, +z towards the main camera",
-        "files": dict(sorted(files.items())),
-        "left_out": [list(row) for row in left_out],
-        **provenance(appearance),
-    }
 
 
 def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Image:
@@ -121,43 +113,30 @@ def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Ima
     if _is_normals(name, one):
         low, high = -1.0, 1.0
         if not on_mesh:
-            y = NORMAL_Y[delivery.normal_y]
-            values = values * np.array([1.0, y, 1.0], np.float32)
-            what = f"{what}; picture's frame: x right, y {'up' if y > 0 else 'down'}".strip("; ")
-        else:
-            what = f"{what}; rig frame, green is not flipped".strip("; ")
+            values = values * np.array([1.0, delivery.y, 1.0], np.float32)
+        frame = f"picture's frame: x right, y {'up' if delivery.y > 0 else 'down'}"
+        frame = "rig frame, green is not flipped" if on_mesh else frame
+        what = f"{what}; {frame}".strip("; ")
     space = DATA_SPACE
     if values.ndim == 3 and name.startswith(SRGB_MAPS):
         space = SRGB_SPACE
     elif values.ndim == 3 and name.startswith(CAMERA_RGB_MAPS):
         space = CAMERA_SPACE
         low, high = (0.0, 1.0) if low is None else (low, high)
-    return Image(
-        name=name,
-        values=values,
-        unit=one.unit,
-        space=space,
-        what=what,
-        low=low,
-        high=high,
-        valid=one.valid,
-    )
+    return Image(name, values, one.unit, space, what, low, high, one.valid)
 
 
 def _is_normals(name: str, one: SkinMap) -> bool:
     return "normals" in name and one.values.ndim == 3
 
 
-def _errors(name: str, one: SkinMap, out: ImageFolder) -> None:
+def _errors(name: str, one: SkinMap) -> Iterator[Image]:
     if one.stderr is not None:
         unit = "rad" if _is_normals(name, one) else one.unit
         what = f"standard error of {name}, 68 %"
-        out.exr(
-            Image(name=f"{name}.stderr", values=one.stderr, unit=unit, what=what, valid=one.valid)
-        )
-    mask = jointly_valid(one).astype(np.float32)
+        yield Image(f"{name}.stderr", one.stderr, unit, what=what, valid=one.valid)
     what = f"1 where {name} means something, else 0"
-    out.exr(Image(name=f"{name}.valid", values=mask, unit="1", what=what))
+    yield Image(f"{name}.valid", jointly_valid(one).astype(np.float32), what=what)
 
 
 def _packed(appearance: SkinAppearance) -> Image | None:
@@ -167,9 +146,7 @@ def _packed(appearance: SkinAppearance) -> Image | None:
     valid = jointly_valid(melanin, blood)
     layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
     what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
-    return Image(
-        name=CHROMOPHORE_PACK, values=np.stack(layers, axis=-1), unit="1", what=what, valid=valid
-    )
+    return Image(CHROMOPHORE_PACK, np.stack(layers, axis=-1), what=what, valid=valid)
 
 
 def _packed_png(packed: Image, out: ImageFolder) -> None:
@@ -195,7 +172,7 @@ def _tangent_normals(
     except GeometryError as error:
         return None, str(error)
     axes, covered = FramedMesh.of(mesh).texel_frames(height)
-    valid = covered if one.valid is None else covered & one.valid
+    valid = covered & one.mask
     turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
     what = f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules)"
     what = f"{what}, {delivery.green}"

@@ -73,9 +73,14 @@ class Delivery:
                 raise UsageError(f"--only: got {name!r}, expected names joined by commas")
 
     @property
+    def y(self) -> float:
+        """Sign of the green of normal maps: 1 for +Y up."""
+        return NORMAL_Y[self.normal_y]
+
+    @property
     def green(self) -> str:
         """What growing green of a normal map means, for people."""
-        return "+Y (OpenGL)" if NORMAL_Y[self.normal_y] > 0 else "-Y (DirectX)"
+        return "+Y (OpenGL)" if self.y > 0 else "-Y (DirectX)"
 
     def unit_or(self, default: str) -> str:
         """Return the scene unit, or a format's own where none is asked for."""

@@ -37,15 +37,12 @@ def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
     polar = 0.5 * (edges[1:] + edges[:-1])
     turn = 2.0 * math.pi * ((np.arange(width) + 0.5) / width - 0.5)
     sine = np.sin(polar)[:, None]
-    towards = np.stack(
-        np.broadcast_arrays(
-            -np.sin(turn) * sine, np.cos(polar)[:, None] + 0.0 * turn, np.cos(turn) * sine
-        ),
-        axis=-1,
+    x, y, z = np.broadcast_arrays(
+        -np.sin(turn) * sine, np.cos(polar)[:, None] + 0.0 * turn, np.cos(turn) * sine
     )
-    solid = (np.cos(edges[:-1]) - np.cos(edges[1:]))[:, None] * np.full(
-        width, 2.0 * math.pi / width
-    )
+    towards = np.stack([x, y, z], axis=-1)
+    step = np.full(width, 2.0 * math.pi / width)
+    solid = (np.cos(edges[:-1]) - np.cos(edges[1:]))[:, None] * step
     return towards, solid
 
 

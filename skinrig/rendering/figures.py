@@ -12,7 +12,6 @@ import numpy as np
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
-from rigsim.render import Caster
 from skinrig import consent
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.drawing import png
@@ -68,12 +67,10 @@ class RenderModel:
     def of(path: Path, *, mesh: Path | None = None, translucency: str | None = None) -> RenderModel:
         """Read an appearance and lay its maps on its own mesh, or on another of the same layout."""
         appearance, model = read_model(path, translucency=translucency)
+        own = own_mesh(appearance)
         if mesh is None:
-            return RenderModel(
-                path, appearance, FittedSurface.of(model, own_mesh(appearance)), "own"
-            )
-        other = read_mesh(mesh)
-        laid = FittedSurface.of(model, other, rest=own_mesh(appearance))
+            return RenderModel(path, appearance, FittedSurface.of(model, own), "own")
+        laid = FittedSurface.of(model, read_mesh(mesh), rest=own)
         return RenderModel(path, appearance, laid, str(mesh))
 
     def record(self) -> dict[str, Any]:
@@ -91,54 +88,85 @@ class RenderModel:
         }
 
 
-def draw(
-    subject: RenderModel,
-    camera: Camera,
-    lights: Sequence[Light],
-    out: Path,
-    effort: Effort,
-    *,
-    components: bool = False,
-    assumed: Sequence[str] = (),
-) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a picture is to be of, where it is written, and how it is rendered."""
+
+    camera: Camera
+    lights: Sequence[Light]
+    out: Path
+    effort: Effort
+    assumed: Sequence[str] = ()
+    """What else was taken for granted."""
+
+    def rendered(self, laid: FittedSurface, interior: Interior | None = None) -> Rendering:
+        """Render a model, with the light inside it where that is known already."""
+        return render(
+            laid,
+            self.camera,
+            self.lights,
+            subsurface=self.effort.subsurface,
+            subpixels=self.effort.subpixels,
+            shadow_samples=self.effort.shadow_samples,
+            interior=None if interior is None else interior.of_surface(laid),
+            progress=self.effort.progress,
+        )
+
+    def exposure(self, seen: Rendering) -> float:
+        """Return the factor of the PNGs."""
+        return self.effort.exposure or exposure_of(seen.radiance, seen.coverage)
+
+    def record(self, subjects: Sequence[RenderModel], seen: Rendering) -> dict[str, Any]:
+        """Return what the record of a rendering says of it."""
+        own: Mapping[str, Any] = subjects[0].record()
+        names = [light.name for light in self.lights]
+        columns, rows = self.camera.image_size
+        view = {"name": self.camera.serial, "place_mm": self.camera.center_mm}
+        agreed = consent.merge_consent(*(subject.appearance for subject in subjects))
+        return {
+            **own,
+            "appearances": [subject.path for subject in subjects],
+            "assumed": list(dict.fromkeys([*own["assumed"], *self.assumed])),
+            consent.CONSENT_KEY: agreed,
+            "unit": RADIANCE_UNIT,
+            "view": {**view, "columns": columns, "rows": rows},
+            "lights": {name: names.count(name) for name in names},
+            "subsurface": self.effort.subsurface,
+            "samples": self.effort.subpixels**2,
+            "shadow_samples": self.effort.shadow_samples,
+            "seed": self.effort.seed,
+            "skin_pixels": int(np.count_nonzero(seen.coverage > 0.5)),
+            "measured_pixels": int(np.count_nonzero(seen.covered)),
+            "lit_pixels": int(np.count_nonzero(seen.lit)),
+        }
+
+
+def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dict[str, Any]:
     """Render one picture into a folder; see `skinrig.rendering.folder.write`.
 
     Parameters
     ----------
-    subject, camera, lights
-        What is seen.
-    out
-        Folder to write.
-    effort
-        How.
+    subject, asked
+        What is seen, and how.
     components
         Write light from inside and from the surface, too, and a sheet of the paper's figure 12.
-    assumed
-        What else was taken for granted.
     """
-    folder.check(out)
+    folder.check(asked.out)
     start = time.perf_counter()
-    seen = _rendered(subject.laid, camera, lights, effort)
+    seen = asked.rendered(subject.laid)
     seconds = time.perf_counter() - start
-    exposure = effort.exposure or exposure_of(seen.radiance, seen.coverage)
+    exposure = asked.exposure(seen)
     images: dict[str, Float32Array] = {"radiance": seen.radiance}
-    pictures = {"radiance": _png(seen.radiance, exposure)}
+    shown = {"radiance": seen.radiance}
     if components:
-        images |= {"diffuse": seen.diffuse, "surface": seen.surface, "coverage": seen.coverage}
-        for name in ("diffuse", "surface"):
-            pictures[name] = _png(images[name], exposure)
+        shown |= {"diffuse": seen.diffuse, "surface": seen.surface}
+        images |= {**shown, "coverage": seen.coverage}
+    pictures = {name: png.encode(tone(image, exposure)) for name, image in shown.items()}
+    if components:
         pictures["components"] = sheet([component_panels(seen, exposure)])
-    return folder.write(
-        out,
-        images=images,
-        pictures=pictures,
-        document={
-            **_record([subject], camera, lights, effort, seen, assumed),
-            "kind": "picture",
-            "exposure": exposure,
-            "seconds": seconds,
-        },
-    )
+    told = {"kind": "picture", "exposure": exposure, "seconds": seconds}
+    record = {**asked.record([subject], seen), **told}
+    return folder.write(asked.out, images=images, pictures=pictures, document=record)
 
 
 def draw_photograph(
@@ -162,7 +190,7 @@ def draw_photograph(
     view, light
         Names of its camera and light.
     out, effort
-        As for `draw`.
+        As of `Asked`.
     calibration
         CALIBRATION/ folder.
 
@@ -182,30 +210,29 @@ def draw_photograph(
         )
     start = time.perf_counter()
     camera, lamp = photographs.camera(shot), photographs.light(shot)
+    asked = Asked(camera, [lamp], out, effort, photographs.assumed)
     photo = photographs.photograph(shot).rgb.astype(np.float32)
-    seen = _rendered(subject.laid, camera, [lamp], effort)
-    exposure = effort.exposure or exposure_of(seen.radiance, seen.coverage)
+    seen = asked.rendered(subject.laid)
+    exposure = asked.exposure(seen)
     left = np.where(seen.coverage[..., None] > 0.5, photo - seen.diffuse, 0.0).astype(np.float32)
-    return folder.write(
-        out,
-        images={
-            "photograph": photo,
-            "diffuse": seen.diffuse,
-            "photograph_less_diffuse": left,
-            "radiance": seen.radiance,
-            "surface": seen.surface,
-            "coverage": seen.coverage,
-        },
-        pictures={"components": sheet([component_panels(seen, exposure, photo)])},
-        document={
-            **_record([subject], camera, [lamp], effort, seen, photographs.assumed),
-            "kind": "components",
-            "exposure": exposure,
-            "session": session,
-            "held_out": shot.held_out,
-            "seconds": time.perf_counter() - start,
-        },
-    )
+    images = {
+        "photograph": photo,
+        "diffuse": seen.diffuse,
+        "photograph_less_diffuse": left,
+        "radiance": seen.radiance,
+        "surface": seen.surface,
+        "coverage": seen.coverage,
+    }
+    told = {
+        "kind": "components",
+        "exposure": exposure,
+        "session": session,
+        "held_out": shot.held_out,
+        "seconds": time.perf_counter() - start,
+    }
+    pictures = {"components": sheet([component_panels(seen, exposure, photo)])}
+    record = {**asked.record([subject], seen), **told}
+    return folder.write(out, images=images, pictures=pictures, document=record)
 
 
 def component_panels(
@@ -237,14 +264,7 @@ def component_panels(
 
 
 def draw_bases(
-    subjects: Sequence[RenderModel],
-    ranks: Sequence[int],
-    camera: Camera,
-    lights: Sequence[Light],
-    out: Path,
-    effort: Effort,
-    *,
-    assumed: Sequence[str] = (),
+    subjects: Sequence[RenderModel], ranks: Sequence[int], asked: Asked
 ) -> dict[str, Any]:
     """Render one view with models of several ranks, complete and the surface alone: figure 7.
 
@@ -255,60 +275,52 @@ def draw_bases(
         has the fewest lobes above it.
     ranks
         Numbers of lobes.
-    camera, lights, out, effort, assumed
-        As for `draw`.
+    asked
+        What is seen, and how.
 
     Raises
     ------
     skinrig.rendering.bases.RankError
         No model has as many lobes as a rank.
     """
-    folder.check(out)
+    folder.check(asked.out)
+    effort = asked.effort
     models = {rank: _of_rank(subjects, rank, effort) for rank in ranks}
+    if not models:
+        raise UsageError("--bases: got none, expected numbers of lobes, as 1,2,4")
     interiors: dict[int, Interior] = {}
     rows: tuple[list[Panel], list[Panel]] = ([], [])
     images: dict[str, Float32Array] = {}
-    exposure, seen = effort.exposure, None
     start = time.perf_counter()
     against = max(ranks)
+    exposure = 0.0
     pictures: dict[int, Rendering] = {}
     for rank, (subject, laid) in models.items():
         effort.progress(f"render with {rank} lobes")
         if effort.subsurface == "dipole" and id(subject) not in interiors:
             interiors[id(subject)] = Interior.of(laid)
-        seen = _rendered(laid, camera, lights, effort, interiors.get(id(subject)))
-        pictures[rank] = seen
-        exposure = exposure or exposure_of(seen.radiance, seen.coverage)
+        seen = pictures[rank] = asked.rendered(laid, interiors.get(id(subject)))
+        exposure = exposure or asked.exposure(seen)
         how = "fitted" if laid is subject.laid else f"reduced from {subject.model.lobes.size}"
         rows[0].append(Panel(f"{rank} lobes, {how}", tone(seen.radiance, exposure)))
         rows[1].append(Panel("surface reflection", tone(seen.surface, exposure)))
         images |= {f"radiance_{rank}": seen.radiance, f"surface_{rank}": seen.surface}
-    if seen is None or exposure is None:
-        raise UsageError("--bases: got none, expected numbers of lobes, as 1,2,4")
-    differences = {
-        rank: _difference(shown.surface, pictures[against].surface, shown.lit)
-        for rank, shown in pictures.items()
-    }
-    return folder.write(
-        out,
-        images=images,
-        pictures={"bases": sheet(rows)},
-        document={
-            **_record(list(subjects), camera, lights, effort, seen, assumed),
-            "kind": "bases",
-            "exposure": exposure,
-            "seconds": time.perf_counter() - start,
-            "bases": [
-                {
-                    "lobes": rank,
-                    "appearance": models[rank][0].path,
-                    "refitted": models[rank][1] is models[rank][0].laid,
-                    f"surface_difference_from_{against}": differences[rank],
-                }
-                for rank in ranks
-            ],
-        },
-    )
+    best = pictures[against].surface
+    bases = [
+        {
+            "lobes": rank,
+            "appearance": subject.path,
+            "refitted": laid is subject.laid,
+            f"surface_difference_from_{against}": _difference(
+                pictures[rank].surface, best, pictures[rank].lit
+            ),
+        }
+        for rank, (subject, laid) in models.items()
+    ]
+    seconds = time.perf_counter() - start
+    told = {"kind": "bases", "exposure": exposure, "seconds": seconds, "bases": bases}
+    record = {**asked.record(subjects, seen), **told}
+    return folder.write(asked.out, images=images, pictures={"bases": sheet(rows)}, document=record)
 
 
 def draw_shadow_boundary(
@@ -342,62 +354,31 @@ def draw_shadow_boundary(
             effort.progress(f"render {boundary.name}, {name.replace('_', ' ')}")
             seen = boundary.shown(sigma, subpixels=effort.subpixels)
             exposure = exposure or exposure_of(seen.radiance, seen.coverage)
-            words = "without spreading" if sigma is None else _words(sigma)
+            words = "without spreading"
+            if sigma is not None:
+                words = "sigma_tr " + ", ".join(f"{value:.4g}" for value in sigma)
             row.append(Panel(f"{boundary.name}, {words}", tone(seen.radiance, exposure)))
             images[f"{boundary.name.replace(' ', '_')}_{name}"] = seen.radiance
             rise = shadow.rise_mm(*shadow.profile(seen))
-            entry = {"skin": boundary.name, "sigma_tr_per_mm": sigma, "rise_mm": rise}
-            widths.append({**entry, "name": name})
+            skin = {"skin": boundary.name, "name": name}
+            widths.append({**skin, "sigma_tr_per_mm": sigma, "rise_mm": rise})
         rows.append(row)
     title = (
         "Shadow boundary by sigma_tr of red, green, blue in 1/mm; the least sigma_tr is the most "
         f"translucent skin; {shadow.BOUNDARY_WIDTH_MM:g} mm across"
     )
-    return folder.write(
-        out,
-        images=images,
-        pictures={"shadow_boundary": sheet(rows, title=title)},
-        document={
-            **subject.record(),
-            "kind": "shadow boundary",
-            "unit": RADIANCE_UNIT,
-            "boundaries": widths,
-            "seconds": time.perf_counter() - start,
-            "samples": effort.subpixels**2,
-            "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
-            "sigma_tr: here everything is labelled by sigma_tr",
-        },
-    )
-
-
-def _words(sigma: Sequence[float]) -> str:
-    return "sigma_tr " + ", ".join(f"{value:.4g}" for value in sigma)
-
-
-def _png(image: FloatArray, exposure: float) -> bytes:
-
-    return png.encode(tone(image, exposure))
-
-
-def _rendered(
-    laid: FittedSurface,
-    camera: Camera,
-    lights: Sequence[Light],
-    effort: Effort,
-    interior: Interior | None = None,
-) -> Rendering:
-    return render(
-        laid.model,
-        laid,
-        camera,
-        lights,
-        subsurface=effort.subsurface,
-        subpixels=effort.subpixels,
-        shadow_samples=effort.shadow_samples,
-        interior=None if interior is None else interior.of_surface(laid),
-        caster=Caster(laid.mesh),
-        progress=effort.progress,
-    )
+    record = {
+        **subject.record(),
+        "kind": "shadow boundary",
+        "unit": RADIANCE_UNIT,
+        "boundaries": widths,
+        "seconds": time.perf_counter() - start,
+        "samples": effort.subpixels**2,
+        "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
+        "sigma_tr: here everything is labelled by sigma_tr",
+    }
+    pictures = {"shadow_boundary": sheet(rows, title=title)}
+    return folder.write(out, images=images, pictures=pictures, document=record)
 
 
 def _of_rank(
@@ -419,37 +400,3 @@ def _difference(one: Float32Array, other: Float32Array, lit: BoolArray) -> float
     if not lit.any() or not other[lit].mean() > 0.0:
         return float("nan")
     return float(np.abs(one[lit] - other[lit]).mean() / other[lit].mean())
-
-
-def _record(
-    subjects: Sequence[RenderModel],
-    camera: Camera,
-    lights: Sequence[Light],
-    effort: Effort,
-    seen: Rendering,
-    assumed: Sequence[str],
-) -> dict[str, Any]:
-    own: Mapping[str, Any] = subjects[0].record()
-    told = dict.fromkeys([*own["assumed"], *assumed])
-    names = [light.name for light in lights]
-    return {
-        **own,
-        "appearances": [subject.path for subject in subjects],
-        "assumed": list(told),
-        consent.CONSENT_KEY: consent.merge_consent(*(subject.appearance for subject in subjects)),
-        "unit": RADIANCE_UNIT,
-        "view": {
-            "name": camera.serial,
-            "place_mm": camera.center_mm,
-            "columns": camera.image_size[0],
-            "rows": camera.image_size[1],
-        },
-        "lights": {name: names.count(name) for name in names},
-        "subsurface": effort.subsurface,
-        "samples": effort.subpixels**2,
-        "shadow_samples": effort.shadow_samples,
-        "seed": effort.seed,
-        "skin_pixels": int(np.count_nonzero(seen.coverage > 0.5)),
-        "measured_pixels": int(np.count_nonzero(seen.covered)),
-        "lit_pixels": int(np.count_nonzero(seen.lit)),
-    }

@@ -136,9 +136,8 @@ class FittedSurface:
         if moved and rest is not None:
             normals = carried_normals(normals, unwrap(rest, width), atlas)
         depth = np.asarray(model.translucency_mm, np.float32)
-        usual = np.median(
-            depth[model.valid], axis=0
-        )  # where nothing is known light must spread, too
+        # where nothing is known light must spread, too
+        usual = np.median(depth[model.valid], axis=0)
         layers = [model.r_d, model.weights, normals, np.where(depth > 0.0, depth, usual)]
         values = np.concatenate([np.asarray(layer, np.float32) for layer in layers], axis=-1)
         width = np.maximum(*atlas.texel_mm())
@@ -157,9 +156,8 @@ class FittedSurface:
 
     def with_lobes(self, model: SkinReflectance) -> FittedSurface:
         """Return the same surface with the lobes and shares of another model of the same maps."""
-        values = np.concatenate(
-            [self._values[..., :3], model.weights, self._values[..., -6:]], axis=-1
-        )
+        layers = [self._values[..., :3], model.weights, self._values[..., -6:]]
+        values = np.concatenate(layers, axis=-1)
         own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
         return dataclasses.replace(self, model=own, _values=values.astype(np.float32))
 
@@ -179,19 +177,11 @@ class FittedSurface:
         normal
             The mesh's shading normals there, shape (n, 3).
         """
-        point = np.ascontiguousarray(position_mm, np.float32)
+        point, place = (np.ascontiguousarray(one, np.float32) for one in (position_mm, uv))
         rows = np.zeros((len(uv), self._values.shape[-1]), np.float32)
         share = np.zeros(len(uv), np.float32)
-        look_up(
-            self._values,
-            self._known,
-            self.atlas.position_mm,
-            self._width_mm,
-            np.ascontiguousarray(uv, np.float32),
-            point,
-            rows,
-            share,
-        )
+        texels = self._values, self._known, self.atlas.position_mm, self._width_mm
+        look_up(*texels, place, point, rows, share)
         lobes = self.model.weights.shape[-1]
         measured = share > MIN_BLEND_WEIGHT
         lost = np.flatnonzero(~measured)

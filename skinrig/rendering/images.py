@@ -100,21 +100,17 @@ def sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
     dpi = 100
     figure = _figure(total_width / dpi, total_height / dpi, dpi)
     canvas = np.full((total_height, total_width, 3), 255, np.uint8)
-    small = {"fontsize": 9, "color": "black", "family": "DejaVu Sans"}
+    small: dict[str, Any] = {"fontsize": 9, "color": "black", "family": "DejaVu Sans"}
+    small |= {"ha": "center", "va": "center"}
     for i, row in enumerate(rows):
         for k, panel in enumerate(row):
             y, x = top + i * (height + LABEL_PX + MARGIN_PX), MARGIN_PX + k * (width + MARGIN_PX)
             canvas[y : y + height, x : x + width] = panel.image
-            figure.text(
-                (x + 0.5 * width) / total_width,
-                1.0 - (y + height + 0.5 * LABEL_PX) / total_height,
-                panel.label,
-                ha="center",
-                va="center",
-                **small,
-            )
+            middle = (x + 0.5 * width) / total_width
+            below = 1.0 - (y + height + 0.5 * LABEL_PX) / total_height
+            figure.text(middle, below, panel.label, **small)
     if title:
-        figure.text(0.5, 1.0 - 0.5 * top / total_height, title, ha="center", va="center", **small)
+        figure.text(0.5, 1.0 - 0.5 * top / total_height, title, **small)
     figure.figimage(canvas, zorder=-1)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})

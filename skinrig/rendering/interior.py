@@ -25,6 +25,57 @@ MIN_LIGHTS_FOR_ONE_POINT: Final = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Lighting:
+    """Lights, and what casts shadows in them."""
+
+    lamps: Sequence[Light]
+    shadows: Caster
+    samples: int
+    """Points on the disc of a light that has a radius."""
+
+    def entering(
+        self,
+        lamp: Light,
+        position_mm: Float32Array,
+        face_normal: Float32Array,
+        normals: Float32Array,
+        eta: float,
+    ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
+        """Return what a light brings to points.
+
+        Parameters
+        ----------
+        lamp
+            The light.
+        position_mm, face_normal, normals
+            Points, normals of their triangles and of the maps, shape (n, 3).
+        eta
+            Refractive index of the skin.
+
+        Returns
+        -------
+        entered, arriving : ndarray of float64, shape (n, 3)
+            Through the boundary, and before it: over what a white patch that faces the light shows.
+        towards : ndarray of float64, shape (n, 3)
+            Unit vectors to the light.
+        seen : ndarray of float64, shape (n,)
+            Share of the light that is seen; 0 where the point does not face it.
+        """
+        towards, white = lamp.reach(position_mm)
+        cosine = np.einsum("nk,nk->n", normals.astype(np.float64), towards)
+        faced = np.flatnonzero((cosine > 0.0) & (white > 0.0).any(axis=-1))
+        seen = np.zeros(len(cosine))
+        center, radius = lamp.disc()
+        place, normal = (np.ascontiguousarray(one[faced]) for one in (position_mm, face_normal))
+        samples = self.samples if radius > 0.0 else 1
+        seen[faced] = visibility(
+            self.shadows, place, normal, center, radius_mm=radius, samples=samples
+        )
+        arriving = white * (np.maximum(cosine, 0.0) * seen)[:, None]
+        return arriving * transmitted(cosine, eta)[:, None], arriving, towards, seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Interior:
     """The skin below a surface, ready for any light: S pieces of it that light enters by.
 
@@ -76,34 +127,26 @@ class Interior:
         across, along = across / np.float32(atlas.size), along / np.float32(atlas.size)
         area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
         held = laid.at(uv.astype(np.float32), position, atlas.normal[chosen])
-        return Interior(
-            laid,
-            position,
-            across,
-            along,
-            held.normals,
-            atlas.prim[chosen],
-            SourceTree.of(position, area),
-        )
+        tree = SourceTree.of(position, area)
+        return Interior(laid, position, across, along, held.normals, atlas.prim[chosen], tree)
 
     def of_surface(self, laid: FittedSurface) -> Interior:
         """Return the same pieces below other maps on the same mesh with the same normals."""
         return replace(self, laid=laid)
 
-    def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> Float64Array:
+    def entered(self, lighting: Lighting) -> Float64Array:
         """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
-        faces = shadows.face_normals[self.prim]
+        faces = lighting.shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
         # several points of each piece, or shadows would end in steps
-        points = POINTS_PER_SIDE if len(lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
+        points = POINTS_PER_SIDE if len(lighting.lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
         offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
+        eta = self.laid.model.eta
         for u in offsets:
             for v in offsets:
                 place = self.position_mm + u * self.across_mm + v * self.along_mm
-                for lamp in lamps:
-                    light = entering(
-                        lamp, place, faces, self.normals, shadows, samples, self.laid.model.eta
-                    )[0]
+                for lamp in lighting.lamps:
+                    light = lighting.entering(lamp, place, faces, self.normals, eta)[0]
                     total += light / points**2
         return total
 
@@ -140,53 +183,3 @@ class Interior:
             entered_at=entered_at,
             workers=min(thread_count(), 4),
         ).exitance
-
-
-def entering(
-    lamp: Light,
-    position_mm: Float32Array,
-    face_normal: Float32Array,
-    normals: Float32Array,
-    shadows: Caster,
-    samples: int,
-    eta: float,
-) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-    """Return what a light brings to points.
-
-    Parameters
-    ----------
-    lamp
-        The light.
-    position_mm, face_normal, normals
-        Points, normals of their triangles and of the maps, shape (n, 3).
-    shadows
-        What casts shadows.
-    samples
-        Points on the light's disc; one where it has no radius.
-    eta
-        Refractive index of the skin.
-
-    Returns
-    -------
-    entered, arriving : ndarray of float64, shape (n, 3)
-        Through the boundary, and before it: over what a white patch that faces the light shows.
-    towards : ndarray of float64, shape (n, 3)
-        Unit vectors to the light.
-    seen : ndarray of float64, shape (n,)
-        Share of the light that is seen; 0 where the point does not face it.
-    """
-    towards, white = lamp.reach(position_mm)
-    cosine = np.einsum("nk,nk->n", normals.astype(np.float64), towards)
-    faced = np.flatnonzero((cosine > 0.0) & (white > 0.0).any(axis=-1))
-    seen = np.zeros(len(cosine))
-    center, radius = lamp.disc()
-    seen[faced] = visibility(
-        shadows,
-        np.ascontiguousarray(position_mm[faced]),
-        np.ascontiguousarray(face_normal[faced]),
-        center,
-        radius_mm=radius,
-        samples=samples if radius > 0.0 else 1,
-    )
-    arriving = white * (np.maximum(cosine, 0.0) * seen)[:, None]
-    return arriving * transmitted(cosine, eta)[:, None], arriving, towards, seen

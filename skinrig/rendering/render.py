@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.dipole.gather import GATHER_TOL
-from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
+from model.skin_reflectance import lobe_brdf, transmitted
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
 from skinrig.rendering.geometry import FittedSurface, Rows
-from skinrig.rendering.interior import Interior, entering
+from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 
 __all__ = ["Camera", "Light", "Rendering", "RenderingError", "Subsurface", "render"]
@@ -93,15 +93,13 @@ class Rendering:
 
 
 def render(
-    model: SkinReflectance,
-    mesh: Mesh | FittedSurface,
+    laid: FittedSurface,
     camera: Camera,
     lights: Light | Sequence[Light],
     *,
     subsurface: Subsurface = "local",
     subpixels: int = SUBPIXELS_PER_SIDE,
     shadow_samples: int = SHADOW_SAMPLES,
-    rest: Mesh | None = None,
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
@@ -112,11 +110,8 @@ def render(
 
     Parameters
     ----------
-    model
-        The fitted maps.
-    mesh
-        The mesh with the maps' texture coordinates, mm, rig frame; or the model laid on it
-        already, for several pictures of it (`FittedSurface.of`).
+    laid
+        The model laid on a mesh, mm, rig frame.
     camera
         See `skinrig.rendering.camera`.
     lights
@@ -128,8 +123,6 @@ def render(
     shadow_samples
         Points on the disc of each light that a ray's end is tested against; lights without a
         radius need one.
-    rest
-        The mesh that the maps were made on, where `mesh` has moved, see `FittedSurface.of`.
     blockers
         What else casts shadows but is not seen.
     caster
@@ -149,8 +142,6 @@ def render(
     ------
     RenderingError
         No light, the camera sees nothing of the mesh, or its back.
-    skinrig.rendering.geometry.GeometryError
-        The maps cannot be laid on the mesh.
     """
     lamps = _lamps(lights)
     if subsurface not in get_args(Subsurface):
@@ -159,11 +150,11 @@ def render(
         )
     if shadow_samples < 1:
         raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
-    laid = mesh if isinstance(mesh, FittedSurface) else FittedSurface.of(model, mesh, rest=rest)
     rays = Caster(laid.mesh) if caster is None else caster
     shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
     columns, height = camera.image_size
-    inside = _inside(laid, subsurface, lamps, shadows, shadow_samples, interior, tolerance)
+    lighting = Lighting(lamps, shadows, shadow_samples)
+    inside = _inside(laid, subsurface, lighting, interior, tolerance)
     film = _Film(height, columns)
     seen = _Sighting()
     band = max(1, BAND_RAYS // (columns * subpixels**2))
@@ -172,23 +163,16 @@ def render(
         buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
         index = seen.outside(buffers)
         points = _Points.of(laid, buffers, index)
-        shaded = _shade(points, lamps, shadows, shadow_samples, laid, inside)
+        shaded = _shade(points, lighting, laid, inside)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
     seen.require(camera)
-    return Rendering(
-        film.diffuse + film.surface,
-        film.diffuse,
-        film.surface,
-        film.coverage,
-        film.measured & (film.coverage > 1.0 - 1e-6),
-        film.lit & (film.coverage > 1.0 - 1e-6),
-        film.uv,
-        camera,
-        tuple(dict.fromkeys(lamp.name for lamp in lamps)),
-        subsurface,
-    )
+    whole = film.coverage > 1.0 - 1e-6
+    names = tuple(dict.fromkeys(lamp.name for lamp in lamps))
+    light = film.diffuse + film.surface, film.diffuse, film.surface
+    masks = film.measured & whole, film.lit & whole
+    return Rendering(*light, film.coverage, *masks, film.uv, camera, names, subsurface)
 
 
 def joined(*meshes: Mesh) -> Mesh:
@@ -307,9 +291,7 @@ class _Film:
 def _inside(
     laid: FittedSurface,
     subsurface: Subsurface,
-    lamps: Sequence[Light],
-    shadows: Caster,
-    shadow_samples: int,
+    lighting: Lighting,
     interior: Interior | None,
     tolerance: float,
 ) -> Callable[[_Points, Float64Array], Float64Array]:
@@ -319,7 +301,7 @@ def _inside(
     if subsurface == "local":
         return lambda points, entered: entered * points.rows.r_d
     below = Interior.of(laid) if interior is None else interior
-    light = below.entered(lamps, shadows, shadow_samples)
+    light = below.entered(lighting)
     return lambda points, entered: below.leaving(
         light, points.position_mm, points.rows, entered, tolerance=tolerance
     )
@@ -334,9 +316,7 @@ def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
 
 def _shade(
     points: _Points,
-    lamps: Sequence[Light],
-    shadows: Caster,
-    shadow_samples: int,
+    lighting: Lighting,
     laid: FittedSurface,
     inside: Callable[[_Points, Float64Array], Float64Array],
 ) -> _Shaded:
@@ -346,26 +326,16 @@ def _shade(
     lit = np.zeros(count, np.bool_)
     rows = points.rows
     cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
-    for lamp in lamps:
-        through, arriving, towards, seen = entering(
-            lamp,
-            points.position_mm,
-            points.face_normal,
-            rows.normals,
-            shadows,
-            shadow_samples,
-            laid.model.eta,
+    position, faces, normals = points.position_mm, points.face_normal, rows.normals
+    for lamp in lighting.lamps:
+        through, arriving, towards, seen = lighting.entering(
+            lamp, position, faces, normals, laid.model.eta
         )
         entered += through
         lit |= seen >= MIN_LIT_FRACTION
         shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
-        lobe = lobe_brdf(
-            laid.model.lobes,
-            rows.weights[shown],
-            towards[shown],
-            points.view[shown],
-            rows.normals[shown],
-        )
+        at = rows.weights[shown], towards[shown], points.view[shown], normals[shown]
+        lobe = lobe_brdf(laid.model.lobes, *at)
         surface[shown] += np.pi * lobe[:, None] * arriving[shown]
     leaving = transmitted(cos_view, laid.model.eta)[:, None]
     return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

@@ -101,16 +101,10 @@ class Boundary:
             median = np.median(getattr(model, name)[model.valid], axis=0).astype(np.float32)
             return np.broadcast_to(median, (*shape, len(median))).copy()
 
-        skin = SkinReflectance(
-            even("r_d"),
-            even("weights"),
-            model.lobes,
-            even("translucency_mm"),
-            np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)).copy(),
-            np.stack([x, y, np.zeros(shape)], axis=-1).astype(np.float32),
-            np.ones(shape, np.bool_),
-            model.eta,
-        )
+        normals = np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)).copy()
+        places = np.stack([x, y, np.zeros(shape)], axis=-1).astype(np.float32)
+        light = even("r_d"), even("weights"), model.lobes, even("translucency_mm")
+        skin = SkinReflectance(*light, normals, places, np.ones(shape, np.bool_), model.eta)
         laid = FittedSurface.of(skin, mesh)
         up = np.array([0.0, 0.0, 1.0])
         return _boundary("flat patch", laid, Caster(mesh), np.zeros(3), up, size_px)
@@ -119,7 +113,6 @@ class Boundary:
         """Render it above a medium; None: light leaves where it entered."""
         laid = self.laid if sigma_tr_per_mm is None else self.laid.of_medium(sigma_tr_per_mm)
         return render(
-            laid.model,
             laid,
             self.camera,
             self.light,
@@ -145,13 +138,11 @@ def _boundary(
     up = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     up /= np.linalg.norm(up)
     right = np.cross(up, normal)
+    span = 2.0 * math.atan(0.5 * BOUNDARY_WIDTH_MM / CAMERA_DISTANCE_MM)
+    size, fov = (size_px, size_px // 2), math.degrees(span)
+    eye = target + CAMERA_DISTANCE_MM * normal
     camera = rendering_camera.looking_at(
-        target + CAMERA_DISTANCE_MM * normal,
-        target_mm=target,
-        up=up,
-        size_px=(size_px, size_px // 2),
-        fov_deg=math.degrees(2.0 * math.atan(0.5 * BOUNDARY_WIDTH_MM / CAMERA_DISTANCE_MM)),
-        name=name,
+        eye, target_mm=target, up=up, fov_deg=fov, size_px=size, name=name
     )
     towards = math.cos(LIGHT_SLANT_RAD) * normal - math.sin(LIGHT_SLANT_RAD) * right
     edge = target + CARD_HEIGHT_MM * towards

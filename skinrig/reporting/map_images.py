@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.skin import SkinMap
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting import page
@@ -16,12 +16,6 @@ from skinrig.written_units import written
 
 SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
-
-
-def valid_of(skin_map: SkinMap) -> BoolArray:
-    """Return where a map has values, (H, W)."""
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
@@ -33,47 +27,71 @@ def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
     return image[step // 2 :: step, step // 2 :: step]
 
 
-def scalar_image(
-    title: str,
-    values: FloatArray,
-    *,
-    low: float,
-    high: float,
-    scale: str = "viridis",
-    valid: BoolArray | None = None,
-    unit: str = "",
-    width: int = 280,
-    of: str = "",
-) -> page.Image:
-    """Return an image of a map with its color scale.
+@dataclass(frozen=True, slots=True)
+class MapDrawing:
+    """How pictures of values on one map's pixels are drawn.
 
-    Parameters
+    Attributes
     ----------
-    title
-        Stands below the picture.
-    values
-        (H, W).
-    low, high
-        Ends of the color scale, in ``unit``.
-    scale
-        A key of `skinrig.drawing.png.SCALE_CLASSES`.
-    valid
-        (H, W); other pixels are gray.
+    of
+        What they are of, for the alt texts: a title alone rarely says it.
     unit
         Of values.
+    valid
+        (H, W); other pixels are gray.
     width
         Pixels across; larger maps are thinned out.
-    of
-        What the picture is of, for the alt text: the title alone rarely tells.
     """
-    small = shrink(values, width).astype(float)
-    mask = None if valid is None else shrink(valid, width).astype(bool)
-    data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
-    named = f"{of}, {title}" if of else title
-    scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
-    alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
-    bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), unit)
-    return _stored(title, data, alt, small.shape, bar)
+
+    of: str = ""
+    unit: str = ""
+    valid: BoolArray | None = None
+    width: int = 280
+
+    def scalar(
+        self, title: str, values: FloatArray, low: float, high: float, scale: str = "viridis"
+    ) -> page.Image:
+        """Return an image of values, (H, W), by a color scale between its ends.
+
+        ``scale`` is a key of `skinrig.drawing.png.SCALE_CLASSES`.
+        """
+        small = shrink(values, self.width).astype(float)
+        mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
+        data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
+        named = f"{self.of}, {title}" if self.of else title
+        scale_words = f"color scale {number(low)} to {written(number(high), self.unit)}"
+        alt = f"{named}: {_told(small, mask, self.unit)}; {scale_words}"
+        bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), self.unit)
+        return _stored(title, data, alt, small.shape, bar)
+
+    def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
+        """Return an image of values from 0 on, such as errors and standard errors."""
+        return self.scalar(title, values, 0.0, reach, "magma")
+
+    def signed(self, title: str, values: FloatArray, reach: float) -> page.Image:
+        """Return an image of values around 0, such as differences."""
+        return self.scalar(title, values, -reach, reach, "RdBu_r")
+
+    def normals(self, title: str, normals: FloatArray) -> page.Image:
+        """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
+        small = shrink(normals, self.width).astype(float)
+        every = np.ones(normals.shape[:2], bool)
+        mask = shrink(every if self.valid is None else self.valid, self.width).astype(bool)
+        codes = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0))
+        image = codes.astype(np.uint8)
+        image[~mask] = png.INVALID_GRAY
+        alt = f"{self.of or 'normals'}, {title}: x, y, z as red, green, blue"
+        if mask.any():
+            length = np.linalg.norm(small[mask], axis=-1)
+            tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
+            alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
+        return _stored(title, png.encode(image), alt + _missing(mask), image.shape[:2])
+
+
+def _missing(mask: BoolArray) -> str:
+    """Return how much of a picture has no value, in words; nothing where that is next to none."""
+    missing = 1.0 - mask.mean()
+    return f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
 
 
 def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
@@ -83,9 +101,7 @@ def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
         return "no pixel has a value"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
     within = f"90 % of pixels within {number(low)} to {number(high)}"
-    text = f"median {written(number(median), unit)}, {within}"
-    missing = 1.0 - shown.mean()
-    return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
+    return f"median {written(number(median), unit)}, {within}{_missing(shown)}"
 
 
 def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
@@ -102,24 +118,6 @@ def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "
 def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
-
-
-def normal_image(
-    title: str, normals: FloatArray, *, valid: BoolArray, width: int = 280, of: str = "normals"
-) -> page.Image:
-    """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
-    small = shrink(normals, width).astype(float)
-    mask = shrink(valid, width).astype(bool)
-    image = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0)).astype(np.uint8)
-    image[~mask] = png.INVALID_GRAY
-    alt = f"{of}, {title}: x, y, z as red, green, blue"
-    if mask.any():
-        length = np.linalg.norm(small[mask], axis=-1)
-        tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
-        alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
-    missing = 1.0 - mask.mean()
-    alt += f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
-    return _stored(title, png.encode(image), alt, image.shape[:2])
 
 
 def stored_image(title: str, data: bytes, *, alt: str = "") -> page.Image:
@@ -173,33 +171,14 @@ def map_panel(
         of_scale.append(truth[mask & np.isfinite(truth)])
     joined = np.concatenate(of_scale)
     low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
-    parts = []
-
-    def add(
-        title: str, values: FloatArray, ends: tuple[float, float], scale: str = "viridis"
-    ) -> None:
-        parts.append(
-            scalar_image(
-                title,
-                values,
-                low=ends[0],
-                high=ends[1],
-                scale=scale,
-                valid=mask,
-                unit=unit,
-                width=width,
-                of=name,
-            )
-        )
-
-    if truth is not None:
-        add("truth", truth, (low, high))
-    add("estimate", estimate, (low, high))
+    shown = MapDrawing(name, unit, mask, width)
+    parts = [shown.scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth
-        reach = reach_of(error, mask, 98)
-        add("estimate − truth", error, (-reach, reach), "RdBu_r")
+        parts.insert(0, shown.scalar("truth", truth, low, high))
+        parts.append(shown.signed("estimate − truth", error, reach_of(error, mask, 98)))
     if standard_error is not None:
-        add("standard error", standard_error, (0.0, reach_of(standard_error, mask, 98)), "magma")
+        reach = reach_of(standard_error, mask, 98)
+        parts.append(shown.size("standard error", standard_error, reach))
     yield page.Heading(name)
     yield page.Images(parts)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import ClassVar, Literal, TypeAlias, TypeVar
+from typing import Any, Literal
 
 import numpy as np
+from markupsafe import Markup
 
 from skinrig.drawing import png, templates
-from skinrig.written_units import written
+from skinrig.reporting import map_names
+from skinrig.written_units import unit_sign, written
 
-T = TypeVar("T")
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
 """Characters up to which a cell's text is not broken over lines."""
@@ -42,6 +44,11 @@ class Check:
     worst_got: float = float("nan")
     """As large as it surely is there, in ``unit``; NaN where that is no number like ``got``."""
 
+    @staticmethod
+    def of_shares(name: str, got: float, bound: float, note: str = "", **more: Any) -> Check:
+        """Return a check that a share stays within its limit, both told in percent."""
+        return Check(name, 100 * got, 100 * bound, "<=", "%", note, **more)
+
     @property
     def passed(self) -> bool:
         """Whether ``got`` keeps to ``bound``; NaN does not."""
@@ -55,30 +62,38 @@ class Check:
         return self.got / self.bound
 
 
+class Block:
+    """A piece of a page."""
+
+    __slots__ = ()
+
+    @property
+    def macro(self) -> str:
+        """Macro of ``blocks.html`` that draws it."""
+        return type(self).__name__.lower()
+
+
 @dataclass(frozen=True, slots=True)
-class Heading:
+class Heading(Block):
     """A heading; level 2 begins a section of the page and of its contents."""
 
-    macro: ClassVar = "heading"
     text: str
     level: int = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Paragraph:
+class Paragraph(Block):
     """Plain text."""
 
-    macro: ClassVar = "paragraph"
     text: str
     kind: str = ""
     """Class in the style sheet, such as "note"."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bullets:
+class Bullets(Block):
     """A list of sentences."""
 
-    macro: ClassVar = "bullets"
     items: Sequence[str]
 
 
@@ -93,10 +108,9 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class Table(Block):
     """A table with a caption; a heading without text leaves its cell empty."""
 
-    macro: ClassVar = "table"
     caption: str
     head: Sequence[Cell]
     rows: Sequence[Sequence[Cell]]
@@ -126,40 +140,57 @@ class Image:
 
 
 @dataclass(frozen=True, slots=True)
-class Images:
+class Images(Block):
     """Images side by side."""
 
-    macro: ClassVar = "images"
     images: Sequence[Image]
     small: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Plots:
+class Plots(Block):
     """SVG drawings side by side."""
 
-    macro: ClassVar = "plots"
     drawings: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
-class Folded:
+class Folded(Block):
     """Blocks that open when their title is clicked, and are open when printed."""
 
-    macro: ClassVar = "folded"
     title: str
     blocks: Sequence[Block]
 
 
 @dataclass(frozen=True, slots=True)
-class Fixed:
-    """Text that is always the same, marked up in a template of its own."""
+class View(Block):
+    """What a section found, laid out by a template of its own."""
 
-    macro: ClassVar = "fixed"
     template: str
+    """Its name below ``reporting/templates``, without suffix."""
+    data: Mapping[str, Any]
 
-
-Block: TypeAlias = Heading | Paragraph | Bullets | Table | Images | Plots | Folded | Fixed
+    @property
+    def html(self) -> Markup:
+        """The filled template, which writes tables by `table` and names by `map_names`."""
+        helpers: dict[str, Any] = {
+            "as_table": table,
+            "cell": Cell,
+            # numbers keep their percent signs when a narrow cell breaks a text
+            "unbroken": lambda text: text.replace(" %", "\N{NO-BREAK SPACE}%"),
+            "number": number,
+            "abs": np.abs,
+            "median": np.median,
+            "finite": lambda values: bool(np.isfinite(values).all()),
+            "or_nan": lambda value: math.nan if value is None else float(value),
+            "or_empty": lambda value: "" if value is None else float(value),
+            "words": map_names.words,
+            "state_words": map_names.state_words,
+            "unit_sign": unit_sign,
+            "written": written,
+        }
+        name = f"reporting/templates/{self.template}.html"
+        return Markup(templates.render(name, **helpers, **self.data))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,43 +218,9 @@ def short_unit(unit: str) -> str:
     return "" if unit == "1" else unit.split(" of ")[0]
 
 
-def checks_table(checks: Sequence[Check]) -> Table:
+def checks_table(checks: Sequence[Check]) -> View:
     """Return the table of checks, the missed ones first."""
-    rows = []
-    for check in sorted(checks, key=lambda c: c.passed):
-        sign = "≤" if check.sense == "<=" else "≥"
-        rows.append(
-            (
-                Cell("kept", "good") if check.passed else Cell("missed", "bad"),
-                Cell(check.name, names_row=True),
-                Cell(written(number(check.got), check.unit), "n"),
-                Cell(f"{sign} {written(number(check.bound), check.unit)}", "n"),
-                *(Cell(_percent(one), "n") for one in (check.used, check.coverage, check.masked)),
-                Cell(_joined(check.worst)),
-                Cell(_joined(check.note)),
-            )
-        )
-    numbers = ("measured", "limit", "of the limit", "truths in 68 % intervals", "masked")
-    return Table(
-        "What was promised and what was measured; missed checks stand first",
-        (
-            Cell("verdict"),
-            Cell("check"),
-            *(Cell(title, "n") for title in numbers),
-            Cell("worst"),
-            Cell("remark"),
-        ),
-        rows,
-    )
-
-
-def _joined(text: str) -> str:
-    """Return text whose numbers keep their percent signs when a narrow cell breaks it."""
-    return text.replace(" %", "\N{NO-BREAK SPACE}%")
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if np.isfinite(share) else ""
+    return view("checks", checks=sorted(checks, key=lambda check: check.passed))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> Table:
@@ -258,17 +255,20 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
     )
 
 
-def records(
-    entries: Iterable[T], columns: Sequence[tuple[str, Callable[[T], object]]], *, caption: str
-) -> Table:
-    """Return a table with one row an entry; a column has a title and takes a cell from an entry."""
-    rows = [[cell_of(entry) for _, cell_of in columns] for entry in entries]
-    return table([title for title, _ in columns], rows, caption=caption)
-
-
 def facts(values: Mapping[str, object], *, caption: str) -> Table:
     """Return a two-column table of names and values."""
     return table(("what", "value"), list(values.items()), caption=caption)
+
+
+def assumptions(texts: Iterable[str]) -> Table:
+    """Return the table of what was taken for granted."""
+    rows = [[text] for text in texts]
+    return table(("assumption",), rows, caption="Taken for granted, not measured")
+
+
+def view(template: str, **data: Any) -> View:
+    """Return what a section found, to be laid out by a template."""
+    return View(template, data)
 
 
 def note(text: str) -> Paragraph:

@@ -38,9 +38,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     assumed = appearance.parameters.get("assumed")
     if isinstance(assumed, (list, tuple)) and assumed:
         yield page.Heading("Assumed")
-        yield page.table(
-            ("assumption",), [[text] for text in assumed], caption="Taken for granted, not measured"
-        )
+        yield page.assumptions(assumed)
     if appearance.left_out:
         yield page.Heading("Left out")
         yield page.table(("what", "why"), appearance.left_out, caption="Stages that were not run")

@@ -15,6 +15,8 @@ from skinrig.reporting.map_names import melanin_band, words
 RESIDUAL_WORDS = ("residual", "misfit", "gamut_distance")
 """Words in the names of maps that tell how badly a model fits."""
 BANDED_MAPS = ("melanin", "hemoglobin")
+MIN_BAND_PIXELS = 20
+"""Of a melanin band that is told."""
 
 
 MAX_NAMED_MAPS = 3
@@ -76,39 +78,14 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
         if any(word in name for word in RESIDUAL_WORDS)
         and (row := _residual(name, one)) is not None
     ]
-    yield page.Heading("Without a truth")
-    yield page.note(
-        "No truth lies beside these maps: standard errors and residuals are all there is to judge "
-        "them by. Whether 68 % intervals hold 68 % of truths is not claimed here; a simulated "
-        "session of the same rig and plan shows how well they do."
-    )
-    if spreads:
-        yield page.table(
-            (
-                "map",
-                "unit",
-                "with a value, %",
-                "median",
-                "median standard error",
-                "of the value, %",
-                "95th percentile of standard errors",
-            ),
-            spreads,
-            caption="Standard errors, of all pixels that have a value",
-        )
-    if residuals:
-        yield page.table(
-            ("map", "unit", "median", "68th percentile", "95th percentile"),
-            residuals,
-            caption="Residuals: what models leave of the images",
-        )
-    yield from _by_band(appearance)
+    bands = list(_by_band(appearance))
+    yield page.view("unjudged", spreads=spreads, residuals=residuals, bands=bands)
 
 
 def _values(one: SkinMap) -> tuple[Float64Array, BoolArray]:
     values = one.values.astype(np.float64)
     good = np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
-    return values, good if one.valid is None else good & one.valid
+    return values, good & one.mask
 
 
 def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
@@ -118,27 +95,15 @@ def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
     stderr = one.stderr[good].astype(np.float64)
     share = 100.0 * float(good.mean())
     if "normals" in name:
-        degrees = np.degrees(stderr)
-        return (
-            words(name),
-            "°",
-            share,
-            "",
-            float(np.median(degrees)),
-            "",
-            float(np.percentile(degrees, 95)),
-        )
+        stderr = np.degrees(stderr)
+        high = float(np.percentile(stderr, 95))
+        return words(name), "°", share, "", float(np.median(stderr)), "", high
     size = np.abs(values[good])
     relative = stderr[size > 0] / size[size > 0]
-    return (
-        words(name),
-        page.short_unit(one.unit),
-        share,
-        float(np.median(values[good])),
-        float(np.median(stderr)),
-        100.0 * float(np.median(relative)) if relative.size else float("nan"),
-        float(np.percentile(stderr, 95)),
-    )
+    percent = 100.0 * float(np.median(relative)) if relative.size else float("nan")
+    middle, high = np.percentile(stderr, [50, 95]).tolist()
+    median = float(np.median(values[good]))
+    return words(name), page.short_unit(one.unit), share, median, middle, percent, high
 
 
 def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
@@ -149,12 +114,12 @@ def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
     return (words(name), page.short_unit(one.unit), float(low), float(middle), float(high))
 
 
-def _by_band(appearance: SkinAppearance) -> Iterator[page.Block]:
+def _by_band(appearance: SkinAppearance) -> Iterator[tuple[object, ...]]:
+    """Yield relative standard errors, %, by band of the melanin where that is among the maps."""
     melanin = appearance.maps.get("melanin")
     if melanin is None:
         return
     levels, known = _values(melanin)
-    rows: list[tuple[object, ...]] = []
     for name in BANDED_MAPS:
         one = appearance.maps.get(name)
         if one is None or one.stderr is None or one.values.shape != levels.shape:
@@ -163,22 +128,7 @@ def _by_band(appearance: SkinAppearance) -> Iterator[page.Block]:
         for low, high in flash.MELANIN_RANGES:
             inside = known & (levels >= low) & (levels < high)
             chosen = inside & good & (np.abs(values) > 0)
-            if np.count_nonzero(chosen) < 20:
-                continue
-            relative = 100.0 * one.stderr[chosen] / np.abs(values[chosen])
-            rows.append(
-                (
-                    words(name),
-                    melanin_band(low, high),
-                    int(np.count_nonzero(chosen)),
-                    float(np.median(relative)),
-                    float(np.percentile(relative, 95)),
-                )
-            )
-    if not rows:
-        return
-    yield page.table(
-        ("map", "band", "pixels", "median standard error, %", "95th percentile"),
-        rows,
-        caption="Relative standard errors by band of the estimated melanin fraction C_m",
-    )
+            if (count := int(np.count_nonzero(chosen))) >= MIN_BAND_PIXELS:
+                relative = 100.0 * one.stderr[chosen] / np.abs(values[chosen])
+                middle, most = np.percentile(relative, [50, 95]).tolist()
+                yield words(name), melanin_band(low, high), count, middle, most

@@ -8,7 +8,7 @@ from typing import Any, Final
 from skinrig.viewer import presets
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
-from skinrig.viewer.assets import scattering as scattering_assets
+from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as surface_assets
 from skinrig.viewer.assets import wrinkles as wrinkle_assets
 from skinrig.viewer.microstructure import assets as microstructure_assets
@@ -16,7 +16,7 @@ from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
 
 ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
     facial_color_assets.assets,
-    scattering_assets.assets,
+    reflectance_assets.default_scattering,
     surface_assets.assets,
     fitted_assets.assets,
     wrinkle_assets.assets,

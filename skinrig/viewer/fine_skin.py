@@ -6,19 +6,15 @@ state are drawn from a coarser one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from rigsim.geometry.atlas import unwrap
-from rigsim.subject import face_regions, pigment, relief
+from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
 from rigsim.subject.perfusion import perfuse
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.map_filling import filled
-
-if TYPE_CHECKING:
-    from rigsim.subject import SimulatedSubject
-
 
 PERSON_PX: Final = 512
 """Most texels a side of the person that everything else comes from: half a millimeter of a face."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
@@ -85,28 +85,23 @@ def scene(
         landmarks=landmarks,
         calibration=calibration,
     )
-    left_out = [
-        (
-            "expressions of this face",
-            "its movement was not captured: the blend shapes are those of the file, or simulated "
-            "action units",
-        )
-    ]
-    if whole is not None:
-        left_out = [*whole.summary(), *left_out]
+    movement = (
+        "its movement was not captured: the blend shapes are those of the file, or simulated "
+        "action units"
+    )
+    closed = () if whole is None else whole.summary()
+    left_out = [*closed, ("expressions of this face", movement)]
     if surface is None:
         left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
-    found = assemble(
-        source,
-        provenance={
-            "source": " and ".join(sorted({one.source for one in appearances.values()})),
-            "kind": source.kind,
-            "appearances": [path.name for path in paths],
-            "mesh": told,
-            **({"closed_holes": len(whole.charts)} if whole is not None and whole.charts else {}),
-        },
-    )
-    found = found.with_assets({"left_out": tuple(left_out)})
+    provenance: dict[str, Any] = {
+        "source": " and ".join(sorted({one.source for one in appearances.values()})),
+        "kind": source.kind,
+        "appearances": [path.name for path in paths],
+        "mesh": told,
+    }
+    if whole is not None and whole.charts:
+        provenance["closed_holes"] = len(whole.charts)
+    found = assemble(source, provenance=provenance).with_assets({"left_out": tuple(left_out)})
     return found if whole is None else whole.painted(found)
 
 

@@ -15,32 +15,10 @@ from skinrig.viewer.packing.arrays import Packed, pack
 from skinrig.viewer.packing.page_text import as_text
 from skinrig.viewer.scene import ViewerScene
 
-SCRIPT_FILES: Final = (
-    "graph.js",
-    "gl.js",
-    "load.js",
-    "mesh.js",
-    "camera.js",
-    "color.js",
-    "shading.js",
-    "shadow.js",
-    "crowd.js",
-    "strain.js",
-    "wrinkles.js",
-    "detail.js",
-    "microstructure.js",
-    "tiles.js",
-    "scattering.js",
-    "reflectance.js",
-    "display.js",
-    "costs.js",
-    "probes.js",
-    "drag.js",
-    "address.js",
-    "panel.js",
-    "controls.js",
-    "main.js",
-)
+SCRIPT_NAMES: Final = (
+    "graph gl load mesh camera color shading shadow crowd strain wrinkles detail microstructure "
+    "tiles scattering reflectance display costs probes drag address panel controls main"
+).split()
 """Scripts in the order in which they run, all in one function; `main.js` comes last."""
 
 _CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
@@ -72,7 +50,7 @@ def script() -> str:
     """Return all scripts as one strict function that shares an object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
     body = "\n".join(
-        _bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPT_FILES
+        _bare(here.joinpath(f"{name}.js").read_text(encoding="utf-8")) for name in SCRIPT_NAMES
     )
     glsl = json.dumps(chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
@@ -101,16 +79,10 @@ def render(packed: Packed, *, connect: bool = False) -> str:
     here = resources.files("skinrig.viewer")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
     code = script().replace("</", "<\\/")
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            f"script-src '{_hash(code)}'",
-            f"style-src '{_hash(style)}'",
-            "img-src data: blob:",
-            f"connect-src {chr(39)}{'self' if connect else 'none'}{chr(39)}",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+    source = "'self'" if connect else "'none'"
+    policy = (
+        f"default-src 'none'; script-src '{_hash(code)}'; style-src '{_hash(style)}'; "
+        f"img-src data: blob:; connect-src {source}; base-uri 'none'; form-action 'none'"
     )
     return templates.render(
         "viewer/page.html",

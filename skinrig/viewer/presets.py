@@ -11,7 +11,9 @@ Ekman and Friesen 1978, Facial Action Coding System; Friesen and Ekman 1983, EMF
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping
+from importlib import resources
 from types import MappingProxyType
 from typing import Final
 
@@ -34,34 +36,8 @@ COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 GLOBAL_STATES: Final = ("exercise", "alcohol")
 """States of the whole face that no muscle makes."""
 
-ACTION_UNITS: Final[Mapping[str, tuple[tuple[str, float], ...]]] = MappingProxyType(
-    {
-        # 6 + 12
-        "happiness": (("mouthSmile", 1.0), ("cheekSquint", 0.8)),
-        # 1 + 4 + 15
-        "sadness": (("browInnerUp", 1.0), ("browDown", 0.3), ("mouthFrown", 0.9)),
-        # 1 + 2 + 5 + 26
-        "surprise": (
-            ("browInnerUp", 1.0),
-            ("browOuterUp", 1.0),
-            ("eyeWide", 0.9),
-            ("jawOpen", 0.5),
-        ),
-        # 1 + 2 + 4 + 5 + 20
-        "fear": (
-            ("browInnerUp", 1.0),
-            ("browOuterUp", 0.4),
-            ("browDown", 0.4),
-            ("eyeWide", 1.0),
-            ("mouthStretch", 0.7),
-        ),
-        # 4 + 5 + 23
-        "anger": (("browDown", 1.0), ("eyeWide", 0.4), ("mouthPucker", 0.2), ("noseSneer", 0.3)),
-        # 9 + 15
-        "disgust": (("noseSneer", 1.0), ("mouthFrown", 0.6), ("cheekSquint", 0.3)),
-        # 12
-        "smile": (("mouthSmile", 1.0),),
-    }
+ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
+    resources.files("skinrig").joinpath("data/action_units.toml").read_text(encoding="utf-8")
 )
 """Shapes of ARKit, without left and right, and their weights."""
 
@@ -88,19 +64,16 @@ def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     {'mouthSmile_L': 1.0, 'mouthSmile_R': 1.0}
     """
     known = tuple(dict.fromkeys(names))
-    found: dict[str, dict[str, float]] = {"neutral": {}}
     basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
-    for name in (*EMOTION_STATES, "smile"):
-        if basic[name]:
-            found[name] = basic[name]
-    for name, parts in COMBINED_STATES.items():
-        # a combination of which a part is missing would be another one's
-        if all(basic[part] for part in parts):
-            found[name] = _joined(basic[part] for part in parts)
-    for name in GLOBAL_STATES:
-        if basic[name]:
-            found[name] = basic[name]
-    return found
+    # a combination of which a part is missing would be another one's
+    combined = {
+        name: _joined(basic[part] for part in parts)
+        for name, parts in COMBINED_STATES.items()
+        if all(basic[part] for part in parts)
+    }
+    first = {name: basic[name] for name in (*EMOTION_STATES, "smile") if basic[name]}
+    last = {name: basic[name] for name in GLOBAL_STATES if basic[name]}
+    return {"neutral": {}, **first, **combined, **last}
 
 
 def _weights(name: str, known: tuple[str, ...]) -> dict[str, float]:
@@ -108,7 +81,7 @@ def _weights(name: str, known: tuple[str, ...]) -> dict[str, float]:
     found = {name: 1.0} if name in known else {}
     units = {
         shape: weight
-        for unit, weight in ACTION_UNITS.get(name, ())
+        for unit, weight in ACTION_UNITS.get(name, {}).items()
         for shape in known
         if shape in (unit, f"{unit}_L", f"{unit}_R", f"{unit}Left", f"{unit}Right")
     }

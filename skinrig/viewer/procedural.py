@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigsim.geometry.mesh import build_mesh, centered
-from rigsim.subject import make_subject
+from rigsim.geometry.mesh import Mesh, build_mesh, centered
+from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.viewer.assembling import assemble
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
 from skinrig.viewer.scene import MAX_TEXTURE_PX, SceneError, SceneSource, ViewerMesh, ViewerScene
-
-if TYPE_CHECKING:
-    from rigsim.geometry.mesh import Mesh
-    from rigsim.subject import SimulatedSubject
 
 DEFAULT_PRESET = "III"
 """Skin type of faces of whom nothing else is known."""

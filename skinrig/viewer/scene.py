@@ -11,16 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, get_args
+from typing import Any, Final, Literal, TypedDict, get_args
 
 import numpy as np
 
+from model.skin import SkinAppearance
+from rigsim.subject import SimulatedSubject
 from skinrig.arrays import Float32Array, Int32Array
-
-if TYPE_CHECKING:
-    from model.skin import SkinAppearance
-    from rigsim.subject import SimulatedSubject
-    from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.fine_skin import FineSkin
 
 Storage = Literal["u8", "u16", "f16", "f32"]
 Filter = Literal["linear", "mipmap", "nearest"]
@@ -172,6 +170,11 @@ class SceneSource:
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None
     calibration: Path | None = None
+
+    @property
+    def fitted(self) -> tuple[SkinAppearance, ...]:
+        """Folders of a dome's maps, the better one first: a model with lobes, or the maps alone."""
+        return tuple(self.appearances[k] for k in ("model", "dome") if k in self.appearances)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

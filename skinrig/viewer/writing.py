@@ -6,18 +6,16 @@ import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from model import store
 from skinrig import consent
+from skinrig.console import Console
 from skinrig.viewer import from_appearance, page, procedural, server
 from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.microstructure import tiles
 from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import SceneError, ViewerScene
-
-if TYPE_CHECKING:
-    from skinrig.console import Console
 
 
 def compose(

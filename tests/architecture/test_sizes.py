@@ -22,7 +22,6 @@ LONG_MODULES = {
     "rigsim/shading.py": 500,
     "rigsim/skin_patch/stretch.py": 458,
     "skinrig/editing/edit.py": 475,
-    "skinrig/rendering/figures.py": 456,
 }
 LONG_FUNCTIONS = {
     "capture/calibration/fiber/discs.py:fit_disc": 81,
@@ -42,7 +41,6 @@ LONG_FUNCTIONS = {
     "skinrig/commands/export.py:export": 134,
     "skinrig/commands/rendering.py:render": 157,
     "skinrig/commands/showing.py:view": 81,
-    "skinrig/exporting/sessions/stokes.py:_write": 92,
 }
 MANY_PARAMETERS = {
     "model/displacement_synthesis/growth.py:lay_out": 13,
@@ -60,7 +58,6 @@ MANY_PARAMETERS = {
     "skinrig/commands/editing.py:edit": 13,
     "skinrig/commands/export.py:export": 18,
     "skinrig/commands/rendering.py:render": 26,
-    "skinrig/rendering/render.py:render": 13,
 }
 """What a bound does not fit yet, with its present size, which may only fall."""
 

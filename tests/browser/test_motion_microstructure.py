@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.packed_scenes import as_packed
 from numpy.typing import NDArray
 
 from model.microstructure import FOREHEAD
@@ -20,7 +21,6 @@ from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import TextureStrain, line_kernels, rasterize
 from skinrig.viewer.microstructure.relief_growth import GrownRelief
-from skinrig.viewer.packing.arrays import as_packed
 
 Float32 = NDArray[np.float32]
 

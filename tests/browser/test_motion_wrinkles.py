@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.packed_scenes import as_packed
 from scipy import ndimage
 
 from model import wrinkles
@@ -15,7 +16,6 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.viewer import page
 from skinrig.viewer.assets import wrinkles as wrinkle_assets
-from skinrig.viewer.packing.arrays import as_packed
 
 ZONES = tuple("abcdefgh")
 TABLES = (

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.packed_scenes import as_packed
 from numpy.typing import NDArray
 
 from model import skin_reflectance
@@ -21,7 +22,6 @@ from skinrig.viewer.assets import traits as trait_assets
 from skinrig.viewer.assets.albedo_traits import AlbedoTraits
 from skinrig.viewer.assets.reflectance import PageLobes
 from skinrig.viewer.assets.traits import LobeTraits
-from skinrig.viewer.packing.arrays import as_packed
 from skinrig.viewer.scene import SceneSource, Texture
 
 pytestmark = pytest.mark.long

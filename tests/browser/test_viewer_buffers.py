@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fixtures.packed_scenes import as_packed
 
 from model import color_table, spectra
 from model.facial_color import HemoglobinRig, StateMaps
@@ -13,7 +14,6 @@ from model.facial_color.rig import GLOBAL_GAINS
 from model.real_time import facial_specular, screen_scattering, tone_mapping
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.viewer import page
-from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import Texture
 
 pytestmark = pytest.mark.long
@@ -30,7 +30,7 @@ def scene(procedural_scene):
     step = states.shape[1] // RIG_CELLS
     few = Texture(np.ascontiguousarray(states[:, ::step, ::step]))
     kept = {name: whole.textures[name] for name in ("chromophores", "surface_maps")}
-    return packing.as_packed(
+    return as_packed(
         replace(
             whole,
             textures={**kept, "facial_states": few},

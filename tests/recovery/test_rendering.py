@@ -33,7 +33,7 @@ def error(scene, model, view, light, *, shown=None, **options):
     """Return the median relative error of luminance on lit pixels, and how many there are."""
     laid = FittedSurface.of(model, scene.subject.mesh)
     camera = CameraPose.nominal(scene.rig.view(view))
-    seen = render(model, laid, camera, true_light(scene, light, view), **options)
+    seen = render(laid, camera, true_light(scene, light, view), **options)
     true = scene.radiance(view, [light if shown is None else shown])[0]
     good = seen.lit & seen.covered & (true.mean(axis=-1) > 0)
     gap = np.abs(seen.radiance - true).mean(axis=-1) / np.maximum(true.mean(axis=-1), 1e-9)
@@ -83,7 +83,7 @@ def test_a_face_that_smiles_is_rendered_with_its_neutral_normals_carried_along(s
     left = FittedSurface.of(dataclasses.replace(model, position_mm=place), smiling.mesh)
     far = []
     for laid in (carried, left):
-        seen = render(model, laid, camera, true_light(scene, light, view))
+        seen = render(laid, camera, true_light(scene, light, view))
         good = seen.lit & seen.covered & (true.mean(axis=-1) > 0)
         assert good.sum() > 1000
         gap = np.abs(seen.radiance - true).mean(axis=-1)[good] / true.mean(axis=-1)[good]

@@ -16,7 +16,6 @@ from reconstruction.pipeline.dome.lobes import _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.cli import app, main
-from skinrig.exporting.materials import obj
 from skinrig.exporting.materials.tangents import FramedMesh
 
 SIDE = 32
@@ -49,7 +48,7 @@ def dome(tmp_path):
             {"consent": [agreed]},
             files={
                 BASIS_FILE: _basis_bytes(lobes, 1, {1: (np.eye(1), 0.0)}),
-                "mesh.obj": obj.text(FramedMesh.of(mesh), 1.0, "mm").encode(),
+                "mesh.obj": FramedMesh.of(mesh).obj(1.0, "mm").encode(),
             },
         ),
     )

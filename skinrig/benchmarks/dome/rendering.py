@@ -73,7 +73,7 @@ def model(*, toy: bool) -> StageBenchmark:
         dataclasses.replace(seen.light, name=n, intensity=tuple((w * color).tolist()))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render(skin.model, laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
+    both = render(laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
     bands = {}
     for name, band in MELANIN_BANDS.items():
         other = _Seen.of(band.preset, rig, size=128 if toy else 256, fine=fine)
@@ -121,7 +121,7 @@ class _Seen:
     def shown(self, on: FittedSurface, **settings: Any) -> Rendering:
         """Render with 4 rays a pixel where nothing else is set."""
         return render(
-            on.model, on, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
+            on, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
         )
 
 

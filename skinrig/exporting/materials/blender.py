@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
 from typing import Final
 
 from skinrig.exporting.options import M_PER_MM
@@ -22,65 +23,6 @@ from skinrig.exporting.options import M_PER_MM
 SCRIPT_FILE: Final = "skin_in_blender.py"
 RADIUS_FACTOR: Final = 4.0 * math.pi
 """Blender's radius over the mean free path, for the method Random Walk."""
-
-_SCRIPT: Final = '''"""Import {file} into Blender 4 or later, with what its importer leaves out.
-
-Run `blender --python {script}`, or open this text in the Scripting workspace and press Run.
-"""
-
-from pathlib import Path
-
-import bpy
-
-RADIUS_M = {radius}
-"""Subsurface radius at a texture of 1, metres: 4 pi times the mean free path, as Cycles takes it
-for the method Random Walk."""
-CHANNELS = {channels}
-"""Of it, in red, green, blue; None: the texture says it."""
-TEXTURES = {textures}
-"""Input of the Principled BSDF to its texture, and the factor of its values."""
-
-text = getattr(bpy.context.space_data, "text", None)
-here = Path(bpy.path.abspath(text.filepath) if text else __file__).resolve().parent
-before = set(bpy.data.materials)
-bpy.ops.{operator}(filepath=str(here / "{file}"))
-
-
-def texture(tree, name, factor):
-    node = tree.nodes.new("ShaderNodeTexImage")
-    first = here / name.replace("<UDIM>", "1001")
-    node.image = bpy.data.images.load(str(first))
-    if "<UDIM>" in name:
-        node.image.source = "TILED"
-        node.image.filepath = str(here / name)
-        beside = first.parent.glob(Path(name).name.replace("<UDIM>", "[0-9][0-9][0-9][0-9]"))
-        head = len(Path(name).name.split("<UDIM>")[0])
-        for number in sorted(int(file.name[head : head + 4]) for file in beside):
-            if number not in [tile.number for tile in node.image.tiles]:
-                node.image.tiles.new(number)
-    node.image.colorspace_settings.name = "Non-Color"
-    node.extension = "EXTEND"
-    if factor == 1.0:
-        return node.outputs["Color"]
-    scaled = tree.nodes.new("ShaderNodeMath")
-    scaled.operation = "MULTIPLY"
-    scaled.inputs[1].default_value = factor
-    tree.links.new(node.outputs["Color"], scaled.inputs[0])
-    return scaled.outputs["Value"]
-
-
-for material in set(bpy.data.materials) - before:
-    tree = material.node_tree
-    for node in [one for one in tree.nodes if one.bl_idname == "ShaderNodeBsdfPrincipled"]:
-        node.subsurface_method = "RANDOM_WALK"
-        node.inputs["Subsurface Weight"].default_value = 1.0
-        node.inputs["Subsurface Scale"].default_value = RADIUS_M
-        node.inputs["Subsurface Anisotropy"].default_value = 0.0
-        if CHANNELS is not None:
-            node.inputs["Subsurface Radius"].default_value = CHANNELS
-        for socket, (name, factor) in TEXTURES.items():
-            tree.links.new(texture(tree, name, factor), node.inputs[socket])
-'''
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +64,8 @@ class Import:
         """Return the script that Blender runs."""
         operator = "import_scene.gltf" if self.file.endswith(".glb") else "wm.usd_import"
         channels = None if self.channels is None else tuple(round(c, 9) for c in self.channels)
-        return _SCRIPT.format(
+        script = resources.files("skinrig.exporting").joinpath("templates/skin_in_blender.py.txt")
+        return script.read_text(encoding="utf-8").format(
             file=self.file,
             script=SCRIPT_FILE,
             operator=operator,

@@ -11,6 +11,7 @@ glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_spe
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -22,12 +23,10 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
-from skinrig.exporting.images import Image, ImageFolder, coded
+from skinrig.exporting.images import ImageFolder, coded
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import COLOR_NOTE, MAP_NOTES, Material
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import M_PER_MM, Delivery
-from skinrig.exporting.provenance import provenance
-from skinrig.exporting.sealing import write_json
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
@@ -111,34 +110,25 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     script = blender.Import.of_channels(GLB_FILE, material.usual_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
-    if delivery.with_errors:
-        for image in material.error_images():
-            out.exr(image)
-    write_json(
-        folder / DOCUMENT_FILE,
+    out.errors(material.error_images())
+    facts = material.facts(appearance)
+    out.document(
+        DOCUMENT_FILE,
+        appearance,
         {
-            **provenance(appearance),
+            **facts,
             "schema": SCHEMA,
             "scene_unit": "m",
             "frame": "+x right, +y up, +z towards the main camera (the front of glTF)",
-            "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}; 8 bits, sRGB curve",
+            "base_color": f"{facts['base_color']}; 8 bits, sRGB curve",
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports hold 16",
-            "subsurface": {**material.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]},
-            "specular_ior": material.eta,
             "morph_targets": list(material.shapes),
-            "figures": material.figures(),
-            "assumed": material.all_assumed(appearance),
-            "files": dict(sorted(out.records.items())),
         },
     )
-    left_out = [
-        *material.left_out_of_mesh(delivery),
-        (
-            "subsurface light",
-            f"glTF has no place for it: see extras; {blender.SCRIPT_FILE} sets it in Blender",
-        ),
-    ]
+    in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
+    left_out = material.left_out_of_mesh(delivery)
+    left_out.append(("subsurface light", f"glTF has no place for it: {in_blender}"))
     if not material.shapes:
         left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))
     return left_out
@@ -153,22 +143,13 @@ def content(material: Material) -> bytes:
         In mm.
     """
     mesh = material.mesh
-    file = pygltflib.GLTF2(
-        asset=pygltflib.Asset(generator=f"skinrig {version('skinrig')}"),
-        scene=0,
-        scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0, name="skin")],
-        materials=[_material(material)],
-        samplers=[
-            pygltflib.Sampler(
-                magFilter=pygltflib.LINEAR,
-                minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
-                wrapS=pygltflib.CLAMP_TO_EDGE,
-                wrapT=pygltflib.CLAMP_TO_EDGE,
-            )
-        ],
-        extensionsUsed=["KHR_materials_ior", "KHR_materials_specular"],
-    )
+    skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
+    file = pygltflib.GLTF2.from_json(skeleton.read_text(encoding="utf-8"))
+    file.asset = pygltflib.Asset(generator=f"skinrig {version('skinrig')}")
+    (surface_material,) = file.materials
+    extensions = surface_material.extensions
+    surface_material.extensions = {"KHR_materials_ior": {"ior": float(material.eta)}, **extensions}
+    surface_material.extras = {"subsurface": material.sigma_tr()}
     binary = _Binary(file)
     attributes = pygltflib.Attributes(
         POSITION=binary.accessor(mesh.vertices_mm * M_PER_MM, bounds=True),
@@ -186,11 +167,8 @@ def content(material: Material) -> bytes:
         attributes=attributes, indices=indices, material=0, targets=targets
     )
     extras = {"targetNames": list(material.shapes)} if targets else {}
-    file.meshes = [
-        pygltflib.Mesh(
-            primitives=[surface], weights=[0.0] * len(targets), name="skin", extras=extras
-        )
-    ]
+    named: dict[str, Any] = {"name": "skin", "extras": extras}
+    file.meshes = [pygltflib.Mesh(primitives=[surface], weights=[0.0] * len(targets), **named)]
     for source, (name, data) in enumerate(_pictures(material)):
         file.images.append(
             pygltflib.Image(mimeType="image/png", bufferView=binary.view(data), name=name)
@@ -202,38 +180,18 @@ def content(material: Material) -> bytes:
     return b"".join(file.save_to_bytes())
 
 
-def _material(material: Material) -> pygltflib.Material:
-    return pygltflib.Material(
-        name="Skin",
-        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-            baseColorTexture=pygltflib.TextureInfo(index=0),
-            metallicFactor=0.0,
-            metallicRoughnessTexture=pygltflib.TextureInfo(index=1),
-        ),
-        normalTexture=pygltflib.NormalMaterialTexture(index=2),
-        extensions={
-            "KHR_materials_ior": {"ior": float(material.eta)},
-            "KHR_materials_specular": {"specularFactor": 1.0, "specularTexture": {"index": 3}},
-        },
-        extras={"subsurface": material.sigma_tr()},
-    )
-
-
 def _pictures(material: Material) -> list[tuple[str, bytes]]:
     """Return the textures' names and PNG files of 8 bits, in the order of their indices."""
-    delivery = Delivery()
 
-    def codes(image: Image) -> NDArray[Any]:
-        return coded(image, depth=8)[0]
+    def codes(name: str) -> NDArray[Any]:
+        return coded(material.image(name, Delivery()), depth=8)[0]
 
-    rough = codes(material.image("specular_roughness", delivery))
-    zero = np.zeros_like(rough)
-    weight = codes(material.image("specular_weight", delivery))
-    white = np.full_like(weight, 255)
+    rough, weight = codes("specular_roughness"), codes("specular_weight")
+    zero, white = np.zeros_like(rough), np.full_like(weight, 255)
     pictures = {
-        "base_color": codes(material.image("base_color", delivery)),
+        "base_color": codes("base_color"),
         "roughness in G, metallic 0 in B": np.stack([zero, rough, zero], axis=-1),
-        "normal": codes(material.image("normal", delivery)),
+        "normal": codes("normal"),
         "specular in A": np.stack([white, white, white, weight], axis=-1),
     }
     return [(name, png.encode(image, quick=True)) for name, image in pictures.items()]

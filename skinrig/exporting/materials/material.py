@@ -13,7 +13,7 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import assumed_by
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError
-from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image
+from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
@@ -195,9 +195,16 @@ class Material:
             "assumed": list(self.assumed),
         }
 
-    def all_assumed(self, appearance: SkinAppearance) -> list[str]:
-        """Return what was assumed by the maps and by the model, each once."""
-        return list(dict.fromkeys([*assumed_by(appearance), *self.assumed]))
+    def facts(self, appearance: SkinAppearance) -> dict[str, Any]:
+        """Return what every document beside an exported material says of it, as JSON values."""
+        subsurface = {**self.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]}
+        return {
+            "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}",
+            "subsurface": subsurface,
+            "specular_ior": self.eta,
+            "figures": self.figures(),
+            "assumed": list(dict.fromkeys([*assumed_by(appearance), *self.assumed])),
+        }
 
     def figures(self) -> dict[str, Any]:
         """Return how well the material stands for the model, as JSON values."""
@@ -227,32 +234,24 @@ class Material:
             what = f"{what}, x and y and z in -1 to 1"
             up = (0.0, 0.0, 1.0)
             return Image.of_normals(name, self.normals, delivery, what, valid=self.valid, filler=up)
-        simple: dict[str, tuple[Float32Array, str, str, float, float]] = {
-            "base_color": (self.base_color, "1", SRGB_SPACE, 0.0, 1.0),
-            "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),
-            "specular_weight": (self.specular_weight, "1", "data", 0.0, 1.0),
-            "specular_misfit": (self.surface.misfit, "1", "data", 0.0, 1.0),
-            "subsurface_radius": (self.radius_mm, "mm", "data", 0.0, 4.0),
-            "translucency": (self.translucency_mm, "mm", "data", 0.0, 16.0),
-            "mask": (self.valid.astype(np.float32), "1", "data", 0.0, 1.0),
+        # values, unit, color space, and the value of the PNG code 65535
+        simple: dict[str, tuple[Float32Array, str, str, float]] = {
+            "base_color": (self.base_color, "1", SRGB_SPACE, 1.0),
+            "specular_roughness": (self.surface.roughness, "1", DATA_SPACE, 1.0),
+            "specular_weight": (self.specular_weight, "1", DATA_SPACE, 1.0),
+            "specular_misfit": (self.surface.misfit, "1", DATA_SPACE, 1.0),
+            "subsurface_radius": (self.radius_mm, "mm", DATA_SPACE, 4.0),
+            "translucency": (self.translucency_mm, "mm", DATA_SPACE, 16.0),
+            "mask": (self.valid.astype(np.float32), "1", DATA_SPACE, 1.0),
         }
         if name not in simple:
             raise ExportError(f"texture: got {name!r}, expected one of {', '.join(simple)}")
-        values, unit, space, low, high = simple[name]
+        values, unit, space, high = simple[name]
         what = MAP_NOTES.get(name, "1 where all was measured")
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"
-        return Image(
-            name=name,
-            values=values,
-            unit=unit,
-            space=space,
-            what=what,
-            low=low,
-            high=high,
-            valid=None if name == "mask" else self.valid,
-            filler=(0.0,) if name == "mask" else None,
-        )
+        valid, filler = (None, (0.0,)) if name == "mask" else (self.valid, None)
+        return Image(name, values, unit, space, what, 0.0, high, valid, filler)
 
     def error_images(self) -> list[Image]:
         """Return standard errors of what has them, and the mask."""
@@ -263,16 +262,9 @@ class Material:
         ):
             if values is not None:
                 what = f"standard error of {name}, 68 %"
-                out.append(
-                    Image(
-                        name=f"{name}_stderr",
-                        values=np.nan_to_num(values),
-                        unit=unit,
-                        space=CAMERA_SPACE if name == "base_color" else "data",
-                        what=what,
-                        valid=self.valid,
-                    )
-                )
+                space = CAMERA_SPACE if name == "base_color" else DATA_SPACE
+                known = np.nan_to_num(values)
+                out.append(Image(f"{name}_stderr", known, unit, space, what, valid=self.valid))
         return out
 
 

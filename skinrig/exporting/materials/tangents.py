@@ -88,18 +88,31 @@ class FramedMesh:
         tangent = _unit(total)
         lost = np.linalg.norm(tangent, axis=1) < 0.5
         tangent[lost] = _any_across(normals[lost])
-        return FramedMesh(
-            mesh.vertices_mm[source],
-            normals.astype(np.float32),
-            mesh.uv[source],
-            np.column_stack([tangent, signs]).astype(np.float32),
-            faces.astype(np.int32),
-            source,
-        )
+        frames = np.column_stack([tangent, signs]).astype(np.float32)
+        own = mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source]
+        return FramedMesh(*own, frames, faces.astype(np.int32), source)
 
     def only(self, faces: BoolArray) -> FramedMesh:
         """Return the mesh with some of its faces, (F,), all vertices and their frames."""
         return replace(self, faces=self.faces[faces])
+
+    def obj(self, per_mm: float, unit: str) -> str:
+        """Return the mesh as Wavefront OBJ text with texture coordinates and normals.
+
+        Parameters
+        ----------
+        per_mm
+            Scene units in one mm.
+        unit
+            Name of the scene unit, for the comment.
+        """
+        lines = [f"# skin, scene unit {unit}, +y up; texture coordinate (0, 0) is bottom left"]
+        points = (self.vertices_mm * per_mm).tolist()
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*row) for row in points]
+        lines += ["vt {:.9g} {:.9g}".format(*row) for row in self.uv.tolist()]
+        lines += ["vn {:.6g} {:.6g} {:.6g}".format(*row) for row in self.normals.tolist()]
+        lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (self.faces + 1).tolist()]
+        return "\n".join(lines) + "\n"
 
     def holes(self) -> int:
         """Return how many rims connected surfaces have beside one each, seams of charts apart.

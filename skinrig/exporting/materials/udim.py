@@ -142,14 +142,10 @@ def read(path: Path) -> TiledMesh:
     # of a scaled copy of the texture: all else is checked as of any mesh
     lowest, span = float(uv.min()), max(float(np.ptp(uv)), 1.0)
     checked = build_mesh(vertices, faces, (uv - lowest) / (2.0 * span), shapes=shapes)
-    return TiledMesh(
-        checked.vertices_mm,
-        checked.faces,
-        np.asarray(uv, np.float32),
-        vertex_normals(checked.vertices_mm, checked.faces),
-        tiles_of(uv, checked.faces),
-        dict(checked.shapes),
-    )
+    points, corners = checked.vertices_mm, checked.faces
+    normals, tiles = vertex_normals(points, corners), tiles_of(uv, corners)
+    wide = np.asarray(uv, np.float32)
+    return TiledMesh(points, corners, wide, normals, tiles, dict(checked.shapes))
 
 
 Contents = tuple[FloatArray, NDArray[np.integer], FloatArray, dict[str, FloatArray]]

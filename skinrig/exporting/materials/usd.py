@@ -22,8 +22,7 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import M_PER_MM, NORMAL_Y, UNITS_M, Delivery
-from skinrig.exporting.sealing import write_json
+from skinrig.exporting.options import M_PER_MM, UNITS_M, Delivery
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
@@ -60,23 +59,17 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     except ImportError as error:
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
-    unit = delivery.unit_or("m")
-    per_mm = M_PER_MM / UNITS_M[unit]
+    unit_m = UNITS_M[delivery.unit_or("m")]
+    per_mm = M_PER_MM / unit_m
     tiles = material.left_out_of_mesh(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
-    if delivery.with_errors:
-        for image in material.error_images():
-            out.exr(image, materialx.TEXTURE_FOLDER)
     stage = Usd.Stage.CreateNew(str(folder / USD_FILE))
-    names = _geometry(stage, material, per_mm, UNITS_M[unit])
+    names = _geometry(stage, material, per_mm, unit_m)
     _materials(stage, material, scale * per_mm, delivery)
     stage.GetRootLayer().Save()
     del stage
-    (folder / materialx.MATERIALX_FILE).write_text(
-        materialx.openpbr_document(material, scale, delivery), encoding="utf-8"
-    )
     textures = (
         ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
         # Blender's level of 0.5 is the reflection of a dielectric
@@ -84,24 +77,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     )
     script = blender.Import(USD_FILE, scale, None, textures).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
-    write_json(
-        folder / DOCUMENT_FILE,
-        {
-            **materialx.facts(
-                material, appearance, schema=SCHEMA, unit=unit, per_mm=per_mm, scale=scale
-            ),
-            "blend_shapes": names,
-            "files": dict(sorted(out.records.items())),
-        },
-    )
-    left_out = [
-        *tiles,
-        (
-            "subsurface light and specular weight of UsdPreviewSurface",
-            "it has no place for them: the mtlx network holds both; "
-            f"{blender.SCRIPT_FILE} sets them",
-        ),
-    ]
+    facts = materialx.facts(material, appearance, delivery, SCHEMA, scale)
+    out.document(DOCUMENT_FILE, appearance, {**facts, "blend_shapes": names})
+    what = "subsurface light and specular weight of UsdPreviewSurface"
+    in_blender = f"the mtlx network holds both; {blender.SCRIPT_FILE} sets them"
+    left_out = [*tiles, (what, f"it has no place for them: {in_blender}")]
     if not material.shapes:
         left_out.append(("blend shapes", "the mesh has none; name one with --mesh"))
     return left_out
@@ -205,7 +185,7 @@ def _preview(stage: Any, place: str, material: Material, delivery: Delivery) -> 
     shader.CreateOutput("surface", types.Token)
     shader.CreateInput("metallic", types.Float).Set(0.0)
     shader.CreateInput("ior", types.Float).Set(float(material.eta))
-    y = NORMAL_Y[delivery.normal_y]
+    y = delivery.y
     rows = (
         ("diffuseColor", types.Color3f, "base_color", "rgb", types.Float3, "sRGB"),
         ("roughness", types.Float, "specular_roughness", "r", types.Float, "raw"),
@@ -264,8 +244,7 @@ def _openpbr(stage: Any, place: str, material: Material, radius: float, delivery
     bump = UsdShade.Shader.Define(stage, f"{place}/mtlx_normalmap")
     bump.CreateIdAttr("ND_normalmap_vector2")
     bump.CreateInput("in", types.Float3).ConnectToSource(codes, "out")
-    green = NORMAL_Y[delivery.normal_y]
-    bump.CreateInput("scale", types.Float2).Set(Gf.Vec2f(1.0, green))
+    bump.CreateInput("scale", types.Float2).Set(Gf.Vec2f(1.0, delivery.y))
     bump.CreateOutput("out", types.Float3)
     shader.CreateInput("geometry_normal", types.Float3).ConnectToSource(
         bump.ConnectableAPI(), "out"

@@ -15,7 +15,7 @@ from reconstruction.correspondence import landmark_field, landmark_table
 from reconstruction.surface.texture_fill import push_pull
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder
+from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image, ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
 
@@ -82,42 +82,19 @@ def write(
     states = chosen(have, delivery, "color", left_out)
     colors = _colors(appearance, rig, states, delivery, left_out)
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
-    base = Image(
-        name="base_color",
-        values=_filled(colors.base, colors.valid),
-        unit="1",
-        space=SRGB_SPACE,
-        what=f"neutral base color on {colors.layout}; {colors.space}; holes filled",
-        valid=colors.valid,
-    )
-    out.exr(base)
-    out.png(base)
+    what = f"neutral base color on {colors.layout}; {colors.space}; holes filled"
+    filled = _filled(colors.base, colors.valid)
+    out.both(Image("base_color", filled, space=SRGB_SPACE, what=what, valid=colors.valid))
     largest = {}
     for name, state in names.items():
         delta = colors.deltas[state]
-        image = Image(
-            name=f"{name}_delta",
-            values=delta,
-            unit="1",
-            low=-1.0,
-            high=1.0,
-            valid=colors.valid,
-            what=f"color of {state} at full strength less neutral, linear, on {colors.layout}",
-        )
-        out.exr(image)
-        out.png(image)
+        what = f"color of {state} at full strength less neutral, linear, on {colors.layout}"
+        out.both(Image(f"{name}_delta", delta, "1", DATA_SPACE, what, -1.0, 1.0, colors.valid))
         shown = np.abs(delta[colors.valid])
         largest[name] = float(shown.max()) if shown.size else 0.0
-    if delivery.with_errors:
-        out.exr(Image(name="color_mask", values=colors.valid.astype(float), unit="1"))
-    return {
-        "size": COLOR_SIZE,
-        "layout": colors.layout,
-        "space": colors.space,
-        "maps": names,
-        "largest_delta": largest,
-        "valid_share": float(colors.valid.mean()),
-    }, have
+    out.errors([Image("color_mask", colors.valid.astype(float))])
+    told = {"layout": colors.layout, "space": colors.space, "maps": names, "largest_delta": largest}
+    return {"size": COLOR_SIZE, **told, "valid_share": float(colors.valid.mean())}, have
 
 
 def _filled(base: Float64Array, valid: BoolArray) -> Float64Array:
@@ -133,7 +110,7 @@ def _colors(
     left_out: list[tuple[str, str]],
 ) -> Colors:
     melanin = appearance.maps["melanin"]
-    seen = np.ones(melanin.values.shape, bool) if melanin.valid is None else melanin.valid.copy()
+    seen = melanin.mask.copy()
     blends = {}
     for state in (NEUTRAL, *states):
         blends[state] = rig.evaluate({state: 1.0})
@@ -144,13 +121,11 @@ def _colors(
     }
     neutral = shown[NEUTRAL]
     if delivery.onto is None:
-        left_out.append(
-            (
-                "colors on the face's texture",
-                "they lie on the flash camera's picture; name the "
-                "dome's maps with --onto, and two tables of landmarks",
-            )
+        why = (
+            "they lie on the flash camera's picture; name the "
+            "dome's maps with --onto, and two tables of landmarks"
         )
+        left_out.append(("colors on the face's texture", why))
         base, valid = sized(neutral, seen, COLOR_SIZE)
         deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
@@ -205,9 +180,8 @@ def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
     except landmark_field.LandmarkFieldError as error:
         raise ExportError(f"--landmarks: {error}") from error
     rows, columns = np.mgrid[0:COLOR_SIZE, 0:COLOR_SIZE] + 0.5
-    texel = np.stack(
-        [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5], axis=-1
-    )
+    pixel = [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5]
+    texel = np.stack(pixel, axis=-1)
     # the field is smooth: every eighth pixel, and linearly between
     step = texel[::8, ::8].reshape(-1, 2)
     moved = field.at(step)[0].reshape(*texel[::8, ::8].shape)

@@ -26,15 +26,21 @@ from model.wrinkles.evaluation import WrinkleModel
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import Image, ImageFolder
-from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
+from skinrig.exporting.options import Delivery
 from skinrig.exporting.packs import color_deltas, detail_maps
-from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
-from skinrig.exporting.sealing import ExportError, write_json
+from skinrig.exporting.provenance import IMAGE_ORIENTATION
+from skinrig.exporting.sealing import ExportError
 
 DOCUMENT_FILE: Final = "delta_maps.json"
 SCHEMA: Final = "skinrig.export.delta-maps/1"
 NORMAL_SIZE: Final = 1024
+PART_MAPS: Final = {
+    FACIAL_COLOR: "base color, cm1 to cm3",
+    WRINKLES: "normal, wm1 to wm3, masks, cavity",
+    MICROSTRUCTURE: "micro normals",
+}
+"""Maps of the pack by the part that they are made of."""
 COLOR_CODING: Final = "linear: shown = base + weight * delta; PNG: delta = 2 code / 65535 - 1"
 NORMAL_CODING: Final = (
     "slopes n_x/n_z and n_y/n_z, green with the sign of normal_y: shown = slopes of normal + "
@@ -79,34 +85,17 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     if FACIAL_COLOR in parts:
         told["color"], states = color_deltas.write(appearance, out, delivery, left_out)
         known |= set(states)
-    else:
-        left_out.append(
-            (
-                "base color, cm1 to cm3",
-                "the folder holds no facial_color: run `skinrig fit facial-color`",
-            )
-        )
     if WRINKLES in parts:
         told["wrinkles"], rows = _write_wrinkles(appearance, parts, out, delivery, left_out)
         known |= set(rows)
-    else:
-        left_out.append(
-            (
-                "normal, wm1 to wm3, masks, cavity",
-                "the folder holds no wrinkles: run `skinrig fit wrinkles`",
-            )
-        )
     if MICROSTRUCTURE in parts:
         details, rest = detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out, delivery)
         told |= details
         left_out += rest
-    else:
-        left_out.append(
-            (
-                "micro normals",
-                "the folder holds no microstructure: run `skinrig fit microstructure`",
-            )
-        )
+    for part, what in PART_MAPS.items():
+        if part not in parts:
+            fit = f"skinrig fit {part.replace('_', '-')}"
+            left_out.append((what, f"the folder holds no {part}: run `{fit}`"))
     details, rest = detail_maps.scatter(delivery, out)
     told |= details
     left_out += rest
@@ -115,25 +104,20 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         raise ExportError(
             f"--only: got {unknown[0]!r}, expected of {', '.join(sorted(known)) or 'no state'}"
         )
-    green = "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)"
-    write_json(
-        folder / DOCUMENT_FILE,
+    out.document(
+        DOCUMENT_FILE,
+        appearance,
         {
-            **provenance(appearance),
             "schema": SCHEMA,
             "orientation": IMAGE_ORIENTATION,
-            "normal_y": green,
+            "normal_y": delivery.green,
             "color_coding": COLOR_CODING,
             "normal_coding": NORMAL_CODING,
             **told,
-            "files": dict(sorted(out.records.items())),
             "left_out": [list(row) for row in left_out],
         },
     )
     return left_out
-
-
-# wrinkles -------------------------------------------------------------------------------------
 
 
 def _write_wrinkles(
@@ -149,30 +133,20 @@ def _write_wrinkles(
     have = [name for name in fitted if name in rows] + [n for n in rows if n not in fitted]
     chosen = color_deltas.chosen(have, delivery, "wrinkles", left_out)
     names = {f"wm{k}": row for k, row in enumerate(chosen, start=1)}
-    y = NORMAL_Y[delivery.normal_y]
     known = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
     slopes, valid = color_deltas.sized(np.asarray(model.base, np.float64), known, NORMAL_SIZE)
-    sign = np.array([1.0, y])
-    _write_normal("normal", slopes, y, valid, out, "neutral normals")
+    sign = np.array([1.0, delivery.y])
+    _write_normal("normal", slopes, valid, out, "neutral normals")
     clipped = {}
     for name, row in names.items():
         shown = model.evaluate({row: 1.0})
         moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
         delta, _ = color_deltas.sized(moved, shown.valid, NORMAL_SIZE)
         layers = np.concatenate([delta * sign, np.zeros((*delta.shape[:2], 1))], axis=-1)
-        image = Image(
-            name=f"{name}_delta",
-            values=layers,
-            unit="1",
-            low=-1.0,
-            high=1.0,
-            valid=valid,
-            what=f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0",
-        )
-        out.exr(image)
-        out.png(image)
+        what = f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0"
+        out.both(Image(f"{name}_delta", layers, "1", DATA_SPACE, what, -1.0, 1.0, valid))
         clipped[name] = float(np.mean(np.abs(delta[valid]) > 1.0)) if valid.any() else 0.0
-        _write_normal(f"{name}_normal", slopes + delta, y, valid, out, f"normals of {row}")
+        _write_normal(f"{name}_normal", slopes + delta, valid, out, f"normals of {row}")
     masks = {}
     for number, layer in enumerate(model.layers):
         zones = list(getattr(layer.table, "zones", ()))
@@ -180,14 +154,11 @@ def _write_wrinkles(
             name = f"wrinkle_mask_{number}_{zone}"
             sized = resampled(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
             told = zones[zone] if zone < len(zones) else str(zone)
-            out.png(
-                Image(name=name, values=sized, unit="1", low=0.0, high=1.0, what=f"zone {told}")
-            )
+            out.png(Image(name, sized, low=0.0, high=1.0, what=f"zone {told}"))
             masks[name] = told
     hollows, rest = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
     left_out += rest
-    if delivery.with_errors:
-        out.exr(Image(name="normal_mask", values=valid.astype(float), unit="1"))
+    out.errors([Image("normal_mask", valid.astype(float))])
     return {
         "size": NORMAL_SIZE,
         "layout": "the dome's texture",
@@ -201,18 +172,7 @@ def _write_wrinkles(
 
 
 def _write_normal(
-    name: str, slopes: Float64Array, y: float, valid: BoolArray, out: ImageFolder, what: str
+    name: str, slopes: Float64Array, valid: BoolArray, out: ImageFolder, what: str
 ) -> None:
-    normals = wrinkles.decode(slopes) * np.array([1.0, y, 1.0])
-    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
-    out.png(
-        Image(
-            name=name,
-            values=normals,
-            unit="1",
-            low=-1.0,
-            high=1.0,
-            valid=valid,
-            what=f"{what}, tangent space over the smooth shape, {green}",
-        )
-    )
+    what = f"{what}, tangent space over the smooth shape, {out.delivery.green}"
+    out.png(Image.of_normals(name, wrinkles.decode(slopes), out.delivery, what, valid=valid))

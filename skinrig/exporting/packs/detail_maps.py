@@ -21,8 +21,8 @@ from model.skin import SkinAppearance
 from reconstruction.normal_integration import integrate_map
 from reconstruction.surface.texture_fill import push_pull
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import Image, ImageFolder
-from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
+from skinrig.exporting.options import Delivery
 from skinrig.exporting.packs import color_deltas
 from skinrig.exporting.packs.seamless import FADE_DIVISOR, periodic, periodic_normals
 
@@ -65,19 +65,12 @@ def cavity(
     seen = visible_share(found.height, found.part)
     shown, known = color_deltas.sized(seen[..., None], found.valid, size)
     values = np.where(known, shown[..., 0], 1.0)
-    image = Image(
-        name="cavity",
-        values=values,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        valid=known,
-        what="share of light from all around that relief leaves at a place: 1 on ridges and flat "
+    what = (
+        "share of light from all around that relief leaves at a place: 1 on ridges and flat "
         f"skin; horizons of {HORIZON_REACH_PX} measured texels in {HORIZON_DIRECTIONS} "
-        "directions; 1 where nothing was measured",
+        "directions; 1 where nothing was measured"
     )
-    out.exr(image)
-    out.png(image)
+    out.both(Image("cavity", values, "1", DATA_SPACE, what, 0.0, 1.0, known))
     return {
         "cavity": {
             "of": "heights integrated from the neutral wrinkle normals",
@@ -158,38 +151,28 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
         JSON values.
     left_out : list of (str, str)
     """
+
+    def without(why: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+        return {}, [("scatter", why)]
+
     if delivery.onto is None:
-        return {}, [
-            ("scatter", "it is of a model: name one of `skinrig fit reflectance` by --onto")
-        ]
+        return without("it is of a model: name one of `skinrig fit reflectance` by --onto")
     other = store.read(delivery.onto)
     depth = other.maps.get("translucency")
     if depth is None:
-        return {}, [
-            (
-                "scatter",
-                f"{delivery.onto.name} holds no translucency: `skinrig fit reflectance` makes it",
-            )
-        ]
+        makes = "`skinrig fit reflectance` makes it"
+        return without(f"{delivery.onto.name} holds no translucency: {makes}")
     values = np.asarray(depth.values, np.float64)
     known: BoolArray = np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
     if depth.valid is not None:
         known &= depth.valid
     if not known.any():
-        return {}, [("scatter", f"no translucency of {delivery.onto.name} is known")]
+        return without(f"no translucency of {delivery.onto.name} is known")
     shown, valid = color_deltas.sized(values, known, SCATTER_SIZE)
     usual = np.median(values[known], axis=0)
-    image = Image(
-        name="scatter",
-        values=np.where(valid[..., None], shown, usual),
-        unit="mm",
-        low=0.0,
-        high=MAX_SCATTER_MM,
-        valid=valid,
-        what="1/sigma_tr in red, green and blue; the median where it is not known",
-    )
-    out.exr(image)
-    out.png(image)
+    what = "1/sigma_tr in red, green and blue; the median where it is not known"
+    shown = np.where(valid[..., None], shown, usual)
+    out.both(Image("scatter", shown, "mm", DATA_SPACE, what, 0.0, MAX_SCATTER_MM, valid))
     assumed = other.parameters.get("assumed", [])
     texts = [str(text) for text in assumed] if isinstance(assumed, list | tuple) else []
     return {
@@ -225,14 +208,11 @@ def micro_normals(
     left_out : list of (str, str)
         Sites whose relief is not known.
     """
-    y = NORMAL_Y[delivery.normal_y]
-    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     told: dict[str, Any] = {}
     left_out = []
     for site, entry in sorted(part.get("sites", {}).items()):
         relief = appearance.maps[entry["map"]]
-        valid = np.isfinite(relief.values)
-        valid &= True if relief.valid is None else relief.valid
+        valid = np.isfinite(relief.values) & relief.mask
         if not valid.any():
             left_out.append((f"micro normals of {site}", "no height is valid"))
             continue
@@ -242,16 +222,8 @@ def micro_normals(
         tile = periodic(height - height.mean())
         normals = periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
-        image = Image(
-            name=name,
-            values=normals * [1.0, y, 1.0],
-            unit="1",
-            low=-1.0,
-            high=1.0,
-            what=f"relief of {site} at rest, tangent space, {green}, repeats without a seam",
-        )
-        out.exr(image)
-        out.png(image)
+        what = f"relief of {site} at rest, tangent space, {delivery.green}, repeats without a seam"
+        out.both(Image.of_normals(name, normals, delivery, what))
         slope = normals[..., :2] / normals[..., 2:]
         told[name] = {
             "site": site,

@@ -41,18 +41,9 @@ def documents(session: Session) -> Iterator[Document]:
     begin = session.manifest.created_at.timestamp()
     start, resource = uid("start"), uid("resource")
     yield "start", _start(session, start, begin)
-    yield (
-        "resource",
-        {
-            "uid": resource,
-            "run_start": start,
-            "spec": HANDLER_SPEC,
-            "root": ".",
-            "resource_path": "frames",
-            "path_semantics": "posix",
-            "resource_kwargs": {},
-        },
-    )
+    files = {"spec": HANDLER_SPEC, "root": ".", "resource_path": "frames"}
+    how = {"path_semantics": "posix", "resource_kwargs": {}}
+    yield "resource", {"uid": resource, "run_start": start, **files, **how}
     described: dict[str, str] = {}
     counts: dict[str, int] = {}
     for record in records:
@@ -61,40 +52,25 @@ def documents(session: Session) -> Iterator[Document]:
         signature = "/".join([stream, *(f"{k}:{_dtype(v)}" for k, v in sorted(data.items()))])
         time_s = record.line.t_host_s
         if signature not in described:
-            described[signature] = uid("descriptor", signature)
-            yield (
-                "descriptor",
-                _descriptor(session, record, described[signature], start, stream, data),
-            )
-        datum = f"{resource}/{record.file.removeprefix('frames/')}"
+            name = described[signature] = uid("descriptor", signature)
+            yield "descriptor", _descriptor(session, record, name, start, stream, data)
         name = record.file.removeprefix("frames/")
+        datum = f"{resource}/{name}"
         yield "datum", {"datum_id": datum, "resource": resource, "datum_kwargs": {"file": name}}
         counts[stream] = counts.get(stream, 0) + 1
         image = f"{record.camera}_image"
-        yield (
-            "event",
-            {
-                "uid": uid("event", record.file),
-                "descriptor": described[signature],
-                "seq_num": counts[stream],
-                "time": time_s,
-                "data": {**data, image: datum},
-                "timestamps": dict.fromkeys([*data, image], time_s),
-                "filled": {image: False},
-            },
-        )
+        event = {"uid": uid("event", record.file), "descriptor": described[signature]}
+        times = dict.fromkeys([*data, image], time_s)
+        values = {"data": {**data, image: datum}, "timestamps": times, "filled": {image: False}}
+        yield "event", {**event, "seq_num": counts[stream], "time": time_s, **values}
     missing = len(session.todo())
-    yield (
-        "stop",
-        {
-            "uid": uid("stop"),
-            "run_start": start,
-            "time": max([begin, *(record.line.t_host_s for record in records)]),
-            "exit_status": "success" if session.closed and not missing else "abort",
-            "reason": f"{missing} frames of the plan are missing" if missing else "",
-            "num_events": counts,
-        },
-    )
+    end = {
+        "time": max([begin, *(record.line.t_host_s for record in records)]),
+        "exit_status": "success" if session.closed and not missing else "abort",
+        "reason": f"{missing} frames of the plan are missing" if missing else "",
+        "num_events": counts,
+    }
+    yield "stop", {"uid": uid("stop"), "run_start": start, **end}
 
 
 def _start(session: Session, uid: str, time_s: float) -> dict[str, Any]:

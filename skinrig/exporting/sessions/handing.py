@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date, datetime
 from pathlib import Path
+from typing import Any
 
 from capture.session import Session, verify
 from capture.session.contents import undamaged_contents
 from capture.session.frames import check_file
+from reconstruction.pipeline.inputs import Inputs
 from skinrig.errors import UsageError
-from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
+from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
 from skinrig.exporting.sessions.event_model import documents
 
 FRAMES_FOLDER, DOCUMENTS_FILE = "frames", "documents.jsonl"
@@ -67,6 +69,20 @@ def allowed(path: str | Path, use: str, *, today: date | None = None) -> Session
     if not found.ok:
         raise ExportError(f"{path}: is damaged, nothing was copied: {found.problems[0]}")
     return session
+
+
+def write_session_document(
+    path: Path, inputs: Inputs, told: Mapping[str, Any], left_out: Sequence[tuple[str, str]]
+) -> None:
+    """Write what a document beside a session's images says, and of whom and what they are."""
+    session = inputs.session
+    origin = {
+        "source": session.source,
+        "inputs": inputs.hashes,
+        "assumed": list(inputs.assumed),
+        "consent": [session.manifest.to_json()["subject"]],
+    }
+    write_json(path, {**told, **origin, "left_out": [list(row) for row in left_out]})
 
 
 def require_use(use: str | None) -> str:

@@ -18,8 +18,8 @@ from reconstruction.pipeline.dome.calibrated import calibrated
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
-from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
-from skinrig.exporting.sessions.handing import allowed
+from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
+from skinrig.exporting.sessions.handing import allowed, write_session_document
 
 LIGHT_LIST_FORMAT: Final = "lp"
 LIST_FILE, POSITIONS_FILE, DOCUMENT_FILE = "lights.lp", "positions_mm.txt", "lights.json"
@@ -117,38 +117,26 @@ def _write(
     clipped: dict[str, float] = {}
     for k, name in zip(good, names, strict=True):
         codes, clipped[name] = _coded(*picture(k), scale)
-        tifffile.imwrite(
-            folder / name,
-            codes,
-            photometric="minisblack" if codes.ndim == 2 else "rgb",
-            compression=None,
-            metadata=None,
-            software=False,
-        )
+        photometric = "minisblack" if codes.ndim == 2 else "rgb"
+        plain = {"compression": None, "metadata": None, "software": False}
+        tifffile.imwrite(folder / name, codes, photometric=photometric, **plain)
     rows = [f"{n} {x:.9f} {y:.9f} {z:.9f}" for n, (x, y, z) in zip(names, toward, strict=True)]
     (folder / LIST_FILE).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
     near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
     (folder / POSITIONS_FILE).write_text(near, encoding="ascii")
-    write_json(
-        folder / DOCUMENT_FILE,
-        {
-            "schema": SCHEMA,
-            "frame": "x right, y up, z towards the camera; directions from the rig's origin",
-            "encoding": f"linear camera values: fraction of full scale, per second of light where "
-            f"the exposure is known, = code / {scale:.9g}; {SATURATED_CODE} is saturated",
-            "code_per_rate": scale,
-            "clipped_share": clipped,
-            "camera": images.views[view],
-            "mm_per_px": dome.pixel_mm,
-            "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
-            f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
-            "source": session.source,
-            "inputs": inputs.hashes,
-            "assumed": list(inputs.assumed),
-            "consent": [session.manifest.to_json()["subject"]],
-            "left_out": [list(row) for row in left_out],
-        },
-    )
+    told = {
+        "schema": SCHEMA,
+        "frame": "x right, y up, z towards the camera; directions from the rig's origin",
+        "encoding": f"linear camera values: fraction of full scale, per second of light where "
+        f"the exposure is known, = code / {scale:.9g}; {SATURATED_CODE} is saturated",
+        "code_per_rate": scale,
+        "clipped_share": clipped,
+        "camera": images.views[view],
+        "mm_per_px": dome.pixel_mm,
+        "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
+        f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
+    }
+    write_session_document(folder / DOCUMENT_FILE, inputs, told, left_out)
     return left_out
 
 

@@ -75,16 +75,9 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             if name in maps and maps[name].valid is not None:
                 mask = np.asarray(maps[name].valid, np.float32)
                 write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
-    write_json(
-        folder / DOCUMENT_FILE,
-        {
-            **provenance(appearance),
-            "schema": SCHEMA,
-            "orientation": IMAGE_ORIENTATION,
-            "files": files,
-            "left_out": [list(row) for row in left_out],
-        },
-    )
+    told: dict[str, Any] = {"schema": SCHEMA, "orientation": IMAGE_ORIENTATION, "files": files}
+    told["left_out"] = [list(row) for row in left_out]
+    write_json(folder / DOCUMENT_FILE, {**provenance(appearance), **told})
     return left_out
 
 
@@ -119,15 +112,12 @@ def band_means_nm(camera: str, illuminant: str) -> Float64Array:
 
 
 def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
-
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:
         raise ExportError(
             f"hemoglobin: got shape {blood.values.shape}, expected {melanin.values.shape}"
         )
-    valid = np.ones(melanin.values.shape, bool)
-    for one in (melanin, blood):
-        valid &= True if one.valid is None else one.valid
+    valid = melanin.mask & blood.mask
     # estimates lie in the table by construction; rounding to float32 can leave it
     c_m = np.clip(melanin.values[valid].astype(np.float64), 0.0, C_M_MAX)
     c_hd = np.clip(blood.values[valid].astype(np.float64), 0.0, C_HD_MAX)
@@ -141,18 +131,10 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "modelled, not measured: diffuse reflectance at normal incidence without the surface's, of "
         "the two-layer skin with the estimated melanin and hemoglobin; 0 where they are not known"
     )
-    write_channels(
-        folder / REFLECTANCE_FILE,
-        channels,
-        {"spectralLayoutVersion": LAYOUT_VERSION, "comments": what},
-    )
-    return {
-        "what": what,
-        "origin": "modelled",
-        "unit": "1",
-        "channels": list(channels),
-        "valid_share": float(valid.mean()),
-    }
+    header = {"spectralLayoutVersion": LAYOUT_VERSION, "comments": what}
+    write_channels(folder / REFLECTANCE_FILE, channels, header)
+    origin = {"what": what, "origin": "modelled", "unit": "1", "channels": list(channels)}
+    return {**origin, "valid_share": float(valid.mean())}
 
 
 def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
@@ -164,12 +146,9 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
             "wavelength; make them again with `skinrig reconstruct --want diffuse,specular,melanin`"
         )
     means = band_means_nm(str(told["camera"]), str(told["illuminant"]))
-    valid = np.ones(diffuse.values.shape[:2], bool)
-    for one in (diffuse, specular):
-        valid &= True if one.valid is None else one.valid
-    on = valid[..., None]
-    s0 = np.where(on, diffuse.values + specular.values, 0.0)
-    s1 = np.where(on, specular.values, 0.0)
+    valid = diffuse.mask & specular.mask
+    s0 = np.where(valid[..., None], diffuse.values + specular.values, 0.0)
+    s1 = np.where(valid[..., None], specular.values, 0.0)
     channels = {}
     for band, wavelength in enumerate(means):
         channels[channel("S0", float(wavelength))] = s0[..., band]
@@ -180,13 +159,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "Bands of the camera at their mean wavelengths, not narrow lines; a white tile in the "
         "same place = 1"
     )
-    attributes = {
-        "spectralLayoutVersion": LAYOUT_VERSION,
-        "emissiveUnits": "1",
-        "polarisationHandedness": "right",
-        "comments": what,
-    }
-    write_channels(folder / STOKES_FILE, channels, attributes)
+    write_channels(folder / STOKES_FILE, channels, stokes_header(what))
     return {
         "what": what,
         "origin": "measured",
@@ -195,4 +168,14 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "camera": told["camera"],
         "illuminant": told["illuminant"],
         "valid_share": float(valid.mean()),
+    }
+
+
+def stokes_header(what: str) -> dict[str, str]:
+    """Return the attributes of a Stokes image in the published layout."""
+    return {
+        "spectralLayoutVersion": LAYOUT_VERSION,
+        "emissiveUnits": "1",
+        "polarisationHandedness": "right",
+        "comments": what,
     }

@@ -23,21 +23,22 @@ import numpy as np
 
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
-from reconstruction.pipeline.gradient.images import GradientImages
+from reconstruction.pipeline.gradient.images import GradientImages, Patterns
 from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
-from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed, write_json
-from skinrig.exporting.sessions.handing import allowed
-from skinrig.exporting.sessions.spectral import LAYOUT_VERSION, channel
+from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
+from skinrig.exporting.sessions.handing import allowed, write_session_document
+from skinrig.exporting.sessions.spectral import channel, stokes_header
 
 STOKES_FORMAT: Final = "stokes"
 DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
 S0, S1 = "S0", "S1"
+CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
 
 
 def export_stokes(
@@ -121,88 +122,77 @@ def _write(
     with_errors: bool,
     calibration: str | Path | None,
 ) -> list[tuple[str, str]]:
-
     inputs = Inputs.of(session, calibration, state="neutral", on_date=None)
-    shots = session.frames("gradient")
-    images = GradientImages(session, noise=_noise(inputs, shots[0].camera))
+    camera = session.frames("gradient")[0].camera
+    images = GradientImages(session, noise=_noise(inputs, camera))
     names = [state.name for state in images.states]
     unknown = [name for name in only if name not in names]
     if unknown:
         raise ExportError(f"--only: got {unknown[0]!r}, expected of {', '.join(names)}")
-    axis = session.rig.view(shots[0].camera).analyser_axis_deg
+    axis = session.rig.view(camera).analyser_axis_deg
     if axis is None:
         raise ExportError(
             f"{session.path}: the rig does not say how its analyser lies; give the view "
             "analyser_axis_deg"
         )
-    band = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
     what = (
         "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
         f"the axis less across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
         "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
     )
-    header = {
-        "spectralLayoutVersion": LAYOUT_VERSION,
-        "emissiveUnits": "1",
-        "polarisationHandedness": "right",
-        "comments": what,
-    }
     files: dict[str, Any] = {}
     left_out: list[tuple[str, str]] = []
     for state in images.states:
-        if only and state.name not in only:
-            continue
-        patterns = images.of(state)
-        for pattern in sorted({pattern for pattern, _ in patterns.values}):
-            pair = {(pattern, turned) for turned in (PARALLEL, CROSSED)}
-            if not pair <= set(patterns.values):
-                left_out.append((f"{state.name} {pattern}", "was taken with one polarization only"))
-                continue
-            stem = file_stem(state.name, pattern)
-            found = components(
-                patterns.values[pattern, PARALLEL], patterns.values[pattern, CROSSED]
-            )
-            write_channels(
-                folder / f"{stem}.exr", dict(zip(band, found.values(), strict=True)), header
-            )
-            variance = patterns.variance[pattern, PARALLEL] + patterns.variance[pattern, CROSSED]
-            files[f"{stem}.exr"] = {
-                "state": state.name,
-                "pattern": pattern,
-                **_figures(found, np.sqrt(variance), patterns.valid),
-            }
-            if with_errors:
-                told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
-                write_channels(folder / f"{stem}.stderr.exr", {"Y": np.sqrt(variance)}, told)
-        if with_errors:
-            mask = patterns.valid.astype(np.float32)
-            write_channels(folder / f"stokes_{state.name}.valid.exr", {"Y": mask}, {"unit": "1"})
+        if not only or state.name in only:
+            entries, missing = _write_state(state.name, images.of(state), folder, what, with_errors)
+            files |= entries
+            left_out += missing
     if not files:
         raise ExportError(
             f"{session.path}: no pattern was taken both along and across the analyser's axis, "
             "expected `skinrig plan gradient` with both polarizations"
         )
-    write_json(
-        folder / DOCUMENT_FILE,
-        {
-            "schema": SCHEMA,
-            "what": what,
-            "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
-            "channels": band,
-            "reference_axis_deg": axis,
-            "image_frame": "against the picture's x axis S1 is "
-            f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
-            "orientation": "as the camera sees it, row 0 is the top",
-            "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
-            "source": session.source,
-            "inputs": inputs.hashes,
-            "assumed": list(inputs.assumed),
-            "consent": [session.manifest.to_json()["subject"]],
-            "files": files,
-            "left_out": [list(row) for row in left_out],
-        },
-    )
+    told = {
+        "schema": SCHEMA,
+        "what": what,
+        "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
+        "channels": CHANNELS,
+        "reference_axis_deg": axis,
+        "image_frame": "against the picture's x axis S1 is "
+        f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
+        "orientation": "as the camera sees it, row 0 is the top",
+        "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
+        "files": files,
+    }
+    write_session_document(folder / DOCUMENT_FILE, inputs, told, left_out)
     return left_out
+
+
+def _write_state(
+    state: str, patterns: Patterns, folder: Path, what: str, with_errors: bool
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Write the images of one state; return what is in each file, and patterns left out."""
+    files: dict[str, Any] = {}
+    left_out = []
+    for pattern in sorted({pattern for pattern, _ in patterns.values}):
+        along, across = (pattern, PARALLEL), (pattern, CROSSED)
+        if not {along, across} <= set(patterns.values):
+            left_out.append((f"{state} {pattern}", "was taken with one polarization only"))
+            continue
+        stem = file_stem(state, pattern)
+        found = components(patterns.values[along], patterns.values[across])
+        channels = dict(zip(CHANNELS, found.values(), strict=True))
+        write_channels(folder / f"{stem}.exr", channels, stokes_header(what))
+        stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
+        figures = _figures(found, stderr, patterns.valid)
+        files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
+        if with_errors:
+            told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
+            write_channels(folder / f"{stem}.stderr.exr", {"Y": stderr}, told)
+    if with_errors:
+        mask = patterns.valid.astype(np.float32)
+        write_channels(folder / f"stokes_{state}.valid.exr", {"Y": mask}, {"unit": "1"})
+    return files, left_out
 
 
 def _noise(inputs: Any, camera: str) -> Any:

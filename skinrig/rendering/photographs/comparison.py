@@ -64,28 +64,21 @@ class Comparison:
 
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
+        told = dataclasses.asdict(self)
+        told[FULL_MODEL], told["photographs"] = told.pop("full"), told.pop("shots")
+        told["by_band"] = {
+            band: {"pixels": pixels, "median": median}
+            for band, (pixels, median) in self.by_band.items()
+        }
         return {
-            "subject": self.subject,
+            **told,
             "band": str(bands_of(self.typology_angle_deg)),
-            "typology_angle_deg": self.typology_angle_deg,
-            "typology_of": self.typology_of,
             "lit_pixels": (
                 "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
                 f"saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"
             ),
             "limit": MAX_MEDIAN_ERROR,
             "passed": self.passed,
-            "subsurface": self.subsurface,
-            FULL_MODEL: dataclasses.asdict(self.full),
-            "by_kind": {k: dataclasses.asdict(v) for k, v in self.by_kind.items()},
-            "ablation": {k: dataclasses.asdict(v) for k, v in self.ablation.items()},
-            "by_band": {
-                k: {"pixels": pixels, "median": median}
-                for k, (pixels, median) in self.by_band.items()
-            },
-            "photographs": list(self.shots),
-            "assumed": list(self.assumed),
-            "seconds": self.seconds,
         }
 
 
@@ -94,20 +87,14 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     for assumption in record["assumed"]:
         console.say(f"assumed: {assumption}")
     full = record[FULL_MODEL]
-    rows = [(FULL_MODEL, full), *record["by_kind"].items(), *record["ablation"].items()]
+    held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
+    rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
+    shares = ("median", "p68", "p95", "bias", "total_error")
     console.rows(
         ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
         [
-            (
-                name if name not in record["by_kind"] else f"{name} held out",
-                row["pairs"],
-                *(
-                    round(100 * row[key], 2)
-                    for key in ("median", "p68", "p95", "bias", "total_error")
-                ),
-                round(row["ssim"], 4),
-            )
-            for name, row in rows
+            (name, row["pairs"], *(round(100 * row[k], 2) for k in shares), round(row["ssim"], 4))
+            for name, row in rows.items()
         ],
     )
     for band, row in record["by_band"].items():

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.drawing import png
 
 LUMINANCE_WEIGHTS: Final = (0.2126, 0.7152, 0.0722)
 MIN_SIGNAL_SIGMAS: Final = 10.0
@@ -161,14 +162,10 @@ def compare(
     signed = np.full(real.shape, np.nan)
     signed[chosen] = made[chosen] / real[chosen] - 1.0
     noise = (_sigma(photograph)[chosen] / real[chosen]) * 0.6745  # median of a normal deviate
-    return PairError(
-        np.abs(signed),
-        signed,
-        chosen,
-        float(np.median(noise)) if chosen.any() else float("nan"),
-        float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30)),
-        similarity(photograph.rgb, image, skin),
-    )
+    middle = float(np.median(noise)) if chosen.any() else float("nan")
+    total = float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30))
+    alike = similarity(photograph.rgb, image, skin)
+    return PairError(np.abs(signed), signed, chosen, middle, total, alike)
 
 
 def tone_mapped(rgb: ArrayLike, white: float) -> Float64Array:
@@ -179,9 +176,7 @@ def tone_mapped(rgb: ArrayLike, white: float) -> Float64Array:
     >>> tone_mapped([0.0, 0.5, 2.0], 1.0).round(4).tolist()
     [0.0, 0.7354, 1.0]
     """
-    value = np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0)
-    curve = 1.055 * np.maximum(value, 0.0031308) ** (1.0 / 2.4) - 0.055
-    return np.where(value <= 0.0031308, 12.92 * value, curve)
+    return png.srgb_curve(np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0))
 
 
 def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
@@ -197,15 +192,8 @@ def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> 
     pair = [tone_mapped(image, white) * skin[..., None] for image in (photograph, rendering)]
     if min(skin.shape) < 11:
         raise PhotographError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
-    _, full = structural_similarity(
-        *pair,
-        data_range=1.0,
-        channel_axis=-1,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
+    windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, full = structural_similarity(*pair, data_range=1.0, channel_axis=-1, full=True, **windows)
     return float(np.mean(np.asarray(full)[skin]))
 
 
@@ -251,11 +239,9 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
         When they have no lit pixel.
     """
     values = [pair.relative[pair.lit] for pair in pairs]
-    signed = [pair.signed[pair.lit] for pair in pairs]
-    if not values or not sum(len(v) for v in values):
+    if not sum(len(v) for v in values):
         raise PhotographError("photographs: got no lit pixel; are they underexposed?")
     every = np.concatenate(values)
-    p50, p68, p90, p95 = (float(p) for p in np.percentile(every, ERROR_PERCENTILES))
     again = [
         float(np.median(np.concatenate(drawn)))
         for drawn in (
@@ -263,18 +249,18 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
         )
         if sum(len(v) for v in drawn)
     ]
-    low, high = np.quantile(again, [0.16, 0.84])
-    some = [pair for pair in pairs if pair.lit.any()]
+    low, high = np.quantile(again, [0.16, 0.84]).tolist()
+    p50, p68, p90, p95 = np.percentile(every, ERROR_PERCENTILES).tolist()
     return Summary(
-        pairs=len(pairs),
-        pixels=len(every),
-        median=p50,
-        p68=p68,
-        p90=p90,
-        p95=p95,
-        interval=(float(low), float(high)),
-        bias=float(np.median(np.concatenate(signed))),
-        noise=float(np.mean([pair.noise for pair in some])),
+        len(pairs),
+        len(every),
+        p50,
+        p68,
+        p90,
+        p95,
+        (low, high),
+        bias=float(np.median(np.concatenate([pair.signed[pair.lit] for pair in pairs]))),
+        noise=float(np.mean([pair.noise for pair in pairs if pair.lit.any()])),
         total_error=float(np.mean([pair.total_error for pair in pairs])),
         ssim=float(np.mean([pair.ssim for pair in pairs])),
     )

@@ -26,20 +26,11 @@ from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.photographs import errors as photograph_errors
 from skinrig.rendering.photographs.ablation import without_parts
-from skinrig.rendering.photographs.comparison import FULL_MODEL, Comparison, print_comparison
+from skinrig.rendering.photographs.comparison import Comparison
 from skinrig.rendering.photographs.errors import PairError, Photograph, Summary
 from skinrig.rendering.photographs.held_out import Photographs, Shot
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
-
-__all__ = [
-    "FULL_MODEL",
-    "Comparison",
-    "evaluate",
-    "evaluate_folders",
-    "print_comparison",
-    "reflectance_share",
-]
 
 N_PICTURES: Final = 6
 """Photographs that are drawn beside their renderings, even over all."""
@@ -58,15 +49,9 @@ class _Surface:
     interior: Interior | None
 
     def render(self, photographs: Photographs, shot: Shot, subsurface: Subsurface) -> Rendering:
-        return render(
-            self.laid.model,
-            self.laid,
-            photographs.camera(shot),
-            photographs.light(shot),
-            subsurface=subsurface,
-            caster=self.caster,
-            interior=self.interior,
-        )
+        shown = photographs.camera(shot), photographs.light(shot)
+        below = self.interior
+        return render(self.laid, *shown, subsurface=subsurface, caster=self.caster, interior=below)
 
 
 def evaluate(
@@ -141,16 +126,9 @@ def evaluate(
         pair = _compare(photo, made, made.radiance)
         pairs.append(pair)
         bands.append(_bands(whole, made))
-        rows.append(
-            {
-                **dataclasses.asdict(shot),
-                "median": pair.median,
-                "noise": pair.noise,
-                "lit_pixels": int(np.count_nonzero(pair.lit)),
-                "ssim": pair.ssim,
-                "total_error": pair.total_error,
-            }
-        )
+        told = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
+        lit = int(np.count_nonzero(pair.lit))
+        rows.append({**dataclasses.asdict(shot), **told, "lit_pixels": lit})
         for name, image in _without(surface, fewer, photographs, shot, subsurface, made, ablation):
             parts.setdefault(name, []).append(_compare(photo, made, image))
         if shot in drawn:
@@ -282,8 +260,7 @@ def reflectance_share(eta: float) -> float:
 def _angle(model: SkinReflectance, truth: SkinAppearance | None) -> tuple[float, str]:
     if truth is not None and "reflectance" in truth.maps:
         known = truth.maps["reflectance"]
-        valid = np.ones(known.values.shape[:2], bool) if known.valid is None else known.valid
-        return float(np.median(typology_angle_deg(known.values[valid]))), "truth"
+        return float(np.median(typology_angle_deg(known.values[known.mask]))), "truth"
     skin = model.r_d[model.valid] * reflectance_share(model.eta)
     return float(np.median(typology_angle_deg(skin))), "r_d"
 
@@ -295,14 +272,10 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
     error = png.colorize(
         pair.signed, -MAX_SHOWN_ERROR, MAX_SHOWN_ERROR, scale="RdBu_r", valid=pair.lit
     )
-    return sheet(
-        [
-            [
-                Panel("photograph", shown[0]),
-                Panel("rendering", shown[1]),
-                Panel(f"error, red +{100 * MAX_SHOWN_ERROR:.0f} %", error),
-            ]
-        ],
-        title=f"{shot.view} {shot.light} ({shot.held_out} held out): "
-        f"median {100 * pair.median:.1f} %",
-    )
+    panels = [
+        Panel("photograph", shown[0]),
+        Panel("rendering", shown[1]),
+        Panel(f"error, red +{100 * MAX_SHOWN_ERROR:.0f} %", error),
+    ]
+    held_out = f"{shot.view} {shot.light} ({shot.held_out} held out)"
+    return sheet([panels], title=f"{held_out}: median {100 * pair.median:.1f} %")

@@ -26,6 +26,11 @@ class CheckRow:
         return "better" if self.b.passed else "worse"
 
     @property
+    def outcome(self) -> str:
+        """What became of the verdict, in words."""
+        return self.changed or ("no" if self.a and self.b else "only in one")
+
+    @property
     def difference(self) -> float:
         """What B measured less what A did; NaN where one did not."""
         return float("nan") if self.a is None or self.b is None else self.b.got - self.a.got
@@ -70,15 +75,11 @@ def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
         return " and ".join(dict.fromkeys(bounds))
 
     yield page.Heading("Checks of both", level=2)
-    yield page.records(
-        rows,
-        (
-            ("check", lambda row: row.name),
-            (a.label, lambda row: told(row.a)),
-            (b.label, lambda row: told(row.b)),
-            ("difference", lambda row: row.difference),
-            ("limit", lambda row: limit(row)),
-            ("changed", lambda row: row.changed or ("no" if row.a and row.b else "only in one")),
-        ),
+    yield page.table(
+        ("check", a.label, b.label, "difference", "limit", "changed"),
+        [
+            (row.name, told(row.a), told(row.b), row.difference, limit(row), row.outcome)
+            for row in rows
+        ],
         caption="Verdicts that changed stand first; limits that follow a bound may differ",
     )

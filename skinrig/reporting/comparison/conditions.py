@@ -28,7 +28,7 @@ def settings(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         told |= {"source": side.source, "seed": str(side.seed)}
         told |= {f"left out: {what}": why for what, why in side.left_out}
         sides.append(told)
-    rows = _unequal(*sides)
+    rows = unequal(*sides)
     stages = [row for row in rows if row[0].startswith("parameter stages.")]
     rest = [row for row in rows if not row[0].startswith("parameter stages.")]
     yield page.Heading("What differs in the making")
@@ -42,7 +42,8 @@ def settings(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         yield page.note(f"Stages whose code, settings or inputs differ: {names}.")
 
 
-def _unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
+def unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """Return the entries that differ, with a dash where one lacks them."""
     return [
         (key, a.get(key, "–"), b.get(key, "–"))
         for key in sorted({*a, *b})
@@ -65,7 +66,7 @@ def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
             plots.append(bench_figures.compared_fronts(name, (a.label, stage), (b.label, other)))
     if not rows:
         return
-    machines = _unequal(
+    machines = unequal(
         *(provenance.flattened(document.get("machine", {})) for document in documents if document)
     )
     yield page.Heading("Error against run time", level=2)
@@ -76,21 +77,7 @@ def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
             machines,
             caption="Measured on different machines: seconds compare those, too",
         )
-    yield page.table(
-        (
-            "stage",
-            "setting",
-            "seconds A",
-            "seconds B",
-            "B over A",
-            "error A",
-            "error B",
-            "error B over A",
-            "68 % intervals apart",
-        ),
-        rows,
-        caption="Settings that both measured, at the same size",
-    )
+    yield page.view("compared_benchmarks", settings=rows)
 
 
 def _bench_of(run: Run) -> dict[str, Any] | None:
@@ -108,24 +95,9 @@ def _settings_of_stage(
     rows: list[tuple[object, ...]] = []
     for point in stage["points"]:
         match = known.get(str(point["knobs"]))
-        if match is None:
-            continue
-        (low, high), (low_b, high_b) = point["error_interval"], match["error_interval"]
-        apart = high < low_b or high_b < low
-        ratio = match["error"] / point["error"] if point["error"] else float("nan")
-        rows.append(
-            (
-                name,
-                ", ".join(f"{k} {v}" for k, v in point["knobs"].items()),
-                point["seconds"],
-                match["seconds"],
-                match["seconds"] / point["seconds"],
-                point["error"],
-                match["error"],
-                ratio,
-                "yes" if apart else "no",
-            )
-        )
+        if match is not None:
+            (low, high), (low_b, high_b) = point["error_interval"], match["error_interval"]
+            rows.append((name, point, match, high < low_b or high_b < low))
     return rows
 
 
@@ -170,18 +142,10 @@ def moved_calibrations(a: Run, b: Run) -> Iterator[page.Block]:
             except (CalibrationError, ValueError) as error:
                 rows.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
                 continue
-            rows += [
-                (
-                    f"{folder.name}, {path.stem}",
-                    one.serial,
-                    one.name,
-                    one.old,
-                    one.new,
-                    float("nan") if one.sigmas is None else one.sigmas,
-                    f"{len(moved)} moved",
-                )
-                for one in moved[:MAX_LISTED_DRIFTS]
-            ]
+            for one in moved[:MAX_LISTED_DRIFTS]:
+                apart = float("nan") if one.sigmas is None else one.sigmas
+                moves = (one.serial, one.name, one.old, one.new, apart, f"{len(moved)} moved")
+                rows.append((f"{folder.name}, {path.stem}", *moves))
     if not rows:
         return
     yield page.Heading("Calibrations that moved", level=2)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from model import store
 from skinrig.arrays import Float64Array
 from skinrig.reporting import map_images, page, provenance
-from skinrig.reporting.comparison.runs import Run
+from skinrig.reporting.comparison import conditions
+from skinrig.reporting.comparison.runs import Run, paired
 from skinrig.reporting.sections import images as image_section
 
 MAX_DRAWN_IMAGES = 4
@@ -75,15 +76,6 @@ class ImageDifference:
         return bool(np.array_equal(self.a, self.b))
 
 
-def pairs(a: Run, b: Run) -> list[tuple[str, Path, Path]]:
-    """Return the folders that belong together: by name, or the only ones."""
-    one, other = ({path.name: path for path in run.found.pictures} for run in (a, b))
-    if len(one) == len(other) == 1:
-        (name_a, path_a), (name_b, path_b) = *one.items(), *other.items()
-        return [(name_a if name_a == name_b else f"{name_a} and {name_b}", path_a, path_b)]
-    return [(name, path, other[name]) for name, path in one.items() if name in other]
-
-
 def compared(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, str]]]:
     """Return the pictures of two folders, and those that cannot be subtracted with the reason.
 
@@ -124,7 +116,11 @@ def compared(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, s
 
 def sentence(a: Run, b: Run) -> str:
     """Return how many pictures differ, empty without any that both have."""
-    both = [one for _, path_a, path_b in pairs(a, b) for one in compared(path_a, path_b)[0]]
+    both = [
+        one
+        for _, path_a, path_b in paired(a.pictures, b.pictures)
+        for one in compared(path_a, path_b)[0]
+    ]
     if not both:
         return ""
     differ = sum(not one.equal for one in both)
@@ -133,24 +129,12 @@ def sentence(a: Run, b: Run) -> str:
 
 def section(a: Run, b: Run) -> Iterator[page.Block]:
     """Yield the pictures of two runs with their differences, and what their records differ in."""
-    for name, path_a, path_b in pairs(a, b):
+    for name, path_a, path_b in paired(a.pictures, b.pictures):
         found, refused = compared(path_a, path_b)
         yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            yield page.records(
-                order,
-                (
-                    ("picture", lambda one: one.name),
-                    ("values", lambda one: one.kind),
-                    ("RMS of B − A over A, %", lambda one: 100 * one.relative_rms),
-                    ("mean B over A", lambda one: one.mean_ratio),
-                    ("largest |B − A|", lambda one: one.largest),
-                    ("equal", lambda one: "yes" if one.equal else "no"),
-                ),
-                caption="Linear values in the unit of the renderings; codes over 255, which follow "
-                "the brightness that each picture was shown with",
-            )
+            yield page.view("compared_images", pictures=order)
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MAX_DRAWN_IMAGES]:
                 yield page.Heading(one.name)
@@ -161,14 +145,6 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
         if refused:
             yield page.table(("picture", "why"), refused, caption="Pictures not subtracted")
         yield _records(a, b, path_a, path_b)
-
-
-def alone(a: Run, b: Run) -> list[tuple[str, str]]:
-    """Return folders of pictures that only one run has: name and the run's label."""
-    one, other = ({path.name for path in run.found.pictures} for run in (a, b))
-    if len(one) == len(other) == 1:
-        return []
-    return [(n, a.label) for n in sorted(one - other)] + [(n, b.label) for n in sorted(other - one)]
 
 
 def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
@@ -186,24 +162,13 @@ def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
             )
     every = np.ones(one.difference.shape, bool)
     reach = map_images.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
-    yield map_images.scalar_image(
-        "B − A, mean of the channels",
-        one.difference,
-        low=-reach,
-        high=reach,
-        scale="RdBu_r",
-        width=200,
-        of=one.name,
-    )
+    drawing = map_images.MapDrawing(one.name, width=200)
+    yield drawing.signed("B − A, mean of the channels", one.difference, reach)
 
 
 def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
-    rows = [
-        (key, sides[0].get(key, "–"), sides[1].get(key, "–"))
-        for key in sorted({*sides[0], *sides[1]})
-        if sides[0].get(key) != sides[1].get(key)
-    ]
+    rows = conditions.unequal(*sides)
     if not rows:
         return page.note("What was asked for, and all that the records say, is the same.")
     return page.table(

@@ -112,53 +112,26 @@ def compare(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
 
 def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     va, vb = a.values.astype(np.float64), b.values.astype(np.float64)
-    good_a, good_b = _known(a), _known(b)
-    both = good_a & good_b
+    both = _known(a) & _known(b)
     difference = vb - va
-    sigmas: Float64Array | None = None
-    combined = float("nan")
-    beyond: tuple[float, ...] = ()
+    sigmas = spread = None
     if a.stderr is not None and b.stderr is not None:
         spread = np.hypot(a.stderr.astype(np.float64), b.stderr.astype(np.float64))
         with np.errstate(divide="ignore", invalid="ignore"):
             sigmas = np.where(difference == 0.0, 0.0, difference / spread)
-        combined = _median(spread[both])
-        beyond = _beyond(sigmas[both])
-        if sigmas.ndim == 3:
-            farthest = np.argmax(np.abs(np.nan_to_num(sigmas)), axis=2)[..., None]
-            sigmas = np.take_along_axis(sigmas, farthest, axis=2)[..., 0]
-        sigmas = np.where(both, np.clip(sigmas, -MAX_SIGMAS, MAX_SIGMAS), np.nan)
-    told = difference[both]
-    return MapDifference(
-        name,
-        short_unit(a.unit),
-        int(both.sum()),
-        int((good_a & ~good_b).sum()),
-        int((good_b & ~good_a).sum()),
-        _median(va[both]),
-        _median(vb[both]),
-        _median(told),
-        _median(np.abs(told)),
-        float(np.percentile(np.abs(told), 95)) if told.size else float("nan"),
-        combined,
-        beyond,
-        np.where(both, difference if difference.ndim == 2 else difference.mean(axis=2), np.nan),
-        sigmas,
-    )
+    medians = _median(va[both]), _median(vb[both]), _median(difference[both])
+    return _difference(name, short_unit(a.unit), a, b, medians, difference, spread, sigmas)
 
 
 def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     from scipy.special import ndtri
 
-    good_a, good_b = _known(a), _known(b)
-    both = good_a & good_b
+    both = _known(a) & _known(b)
     angle = np.full(both.shape, np.nan)
     angle[both] = metrics.angular_error_rad(
         a.values[both].astype(np.float64), b.values[both].astype(np.float64)
     )
-    sigmas: Float64Array | None = None
-    combined = float("nan")
-    beyond: tuple[float, ...] = ()
+    sigmas = spread = None
     if a.stderr is not None and b.stderr is not None:
         spread = np.hypot(a.stderr[..., 0].astype(np.float64), b.stderr[..., 0].astype(np.float64))
         # an angle is the length of errors in two directions: as many standard errors as a number
@@ -167,32 +140,45 @@ def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
             chance = np.exp(-0.5 * np.square(angle / spread))
         chance = np.where(angle == 0.0, 1.0, chance)
         sigmas = np.fmin(-ndtri(np.maximum(0.5 * chance, 1e-300)), MAX_SIGMAS)
-        sigmas = np.where(both, sigmas, np.nan)
-        combined = float(np.degrees(_median(spread[both])))
-        beyond = _beyond(sigmas[both])
-    degrees = np.degrees(angle)
-    return MapDifference(
-        name,
-        "°",
-        int(both.sum()),
-        int((good_a & ~good_b).sum()),
-        int((good_b & ~good_a).sum()),
-        float("nan"),
-        float("nan"),
-        float("nan"),
-        _median(degrees[both]),
-        float(np.percentile(degrees[both], 95)) if both.any() else float("nan"),
-        combined,
-        beyond,
-        degrees,
-        sigmas,
-    )
+        spread = np.degrees(spread)
+    return _difference(name, "°", a, b, (np.nan, np.nan, np.nan), np.degrees(angle), spread, sigmas)
+
+
+def _difference(
+    name: str,
+    unit: str,
+    a: SkinMap,
+    b: SkinMap,
+    medians: tuple[float, float, float],
+    difference: Float64Array,
+    spread: Float64Array | None,
+    sigmas: Float64Array | None,
+) -> MapDifference:
+    """Summarize a difference in its unit, and over the combined standard error."""
+    good_a, good_b = _known(a), _known(b)
+    both = good_a & good_b
+    only = int((good_a & ~good_b).sum()), int((good_b & ~good_a).sum())
+    told = np.abs(difference[both])
+    high = float(np.percentile(told, 95)) if told.size else float("nan")
+    combined = float("nan")
+    beyond: tuple[float, ...] = ()
+    if spread is not None and sigmas is not None:
+        combined, beyond = _median(spread[both]), _beyond(sigmas[both])
+        if sigmas.ndim == 3:
+            farthest = np.argmax(np.abs(np.nan_to_num(sigmas)), axis=2)[..., None]
+            sigmas = np.take_along_axis(sigmas, farthest, axis=2)[..., 0]
+        sigmas = np.where(both, np.clip(sigmas, -MAX_SIGMAS, MAX_SIGMAS), np.nan)
+    flat = difference if difference.ndim == 2 else difference.mean(axis=2)
+    middle = *medians, _median(told)
+    drawn = np.where(both, flat, np.nan)
+    pixels = int(both.sum()), *only
+    return MapDifference(name, unit, *pixels, *middle, high, combined, beyond, drawn, sigmas)
 
 
 def _known(one: SkinMap) -> BoolArray:
     finite = np.isfinite(one.values)
     good = finite if finite.ndim == 2 else finite.all(axis=2)
-    return np.asarray(good if one.valid is None else good & one.valid, bool)
+    return np.asarray(good & one.mask, bool)
 
 
 def _beyond(sigmas: Float64Array) -> tuple[float, ...]:

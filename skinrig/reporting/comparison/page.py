@@ -91,8 +91,7 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     yield from conditions.seconds(a, b)
     yield from conditions.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
-    missing = [*alone(a, b), *image_comparison.alone(a, b)]
-    if missing:
+    if missing := alone(a, b):
         yield page.Heading("Only in one", level=2)
         yield page.table(
             ("folder", "in"),
@@ -110,28 +109,7 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
             "Both were made of the same frames: they share the frames' noise, so that every "
             "difference is the processing's, and combined standard errors are too large for it."
         )
-    yield page.table(
-        (
-            "map",
-            "verdict",
-            "beyond 3 σ, %",
-            "2 σ, %",
-            "1 σ, %",
-            "median A",
-            "median B",
-            "median B − A",
-            "median |B − A|",
-            "95th percentile",
-            "σ",
-            "unit",
-            "pixels",
-            "only A",
-            "only B",
-        ),
-        [_difference_row(one) for one in sorted(pair.differences, key=_farthest_first)],
-        caption="Pixel by pixel; σ: the two standard errors combined, median; beyond: share of "
-        "pixels that far apart, by chance 0.27, 4.6 and 31.7 %; only: pixels without a partner",
-    )
+    yield page.view("compared_maps", maps=sorted(pair.differences, key=_farthest_first))
     if pair.refused:
         table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
         yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
@@ -143,28 +121,6 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
 
 def _farthest_first(one: MapDifference) -> tuple[float, str]:
     return (-one.beyond[-1] if one.beyond else 1.0, one.name)
-
-
-def _difference_row(one: MapDifference) -> tuple[object, ...]:
-    shares = [100 * share for share in one.beyond] or [float("nan")] * 3
-    verdict = "no standard errors"
-    if one.beyond:
-        verdict = "disagree" if one.disagree else "equal" if one.high == 0.0 else "agree"
-    return (
-        words(one.name),
-        verdict,
-        *shares[::-1],
-        one.median_a,
-        one.median_b,
-        one.bias,
-        one.median,
-        one.high,
-        one.combined,
-        one.unit,
-        one.pixels,
-        one.only_a,
-        one.only_b,
-    )
 
 
 def _images(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
@@ -188,62 +144,38 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         """Return values as a picture, from the front where they lie on a mesh."""
         if place is None:
             return np.nan_to_num(values), both
-        rows, columns = np.nonzero(both if place.valid is None else both & place.valid)
+        rows, columns = np.nonzero(both & place.mask)
         points = place.values[rows, columns].astype(np.float64)
         view = FrontView.of(points, (points.min(axis=0), points.max(axis=0)))
         return view.picture(np.nan_to_num(values[rows, columns].astype(np.float64)))
 
     if not both.any():
         return
-    shown = np.concatenate([m.values[both].ravel() for m in maps]).astype(np.float64)
-    low, high = np.percentile(shown[np.isfinite(shown)], [1, 99])
+    values = np.concatenate([m.values[both].ravel() for m in maps]).astype(np.float64)
+    low, high = np.percentile(values[np.isfinite(values)], [1, 99])
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
+        shown = map_images.MapDrawing(one.name, one.unit, mask, IMAGE_WIDTH_PX)
         if one.unit == "°":
-            yield map_images.normal_image(
-                label, image, valid=mask, width=IMAGE_WIDTH_PX, of=one.name
-            )
+            yield shown.normals(label, image)
         elif image.ndim == 3:
             yield map_images.color_image(
                 label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name
             )
         else:
-            yield map_images.scalar_image(
-                label,
-                image,
-                low=low,
-                high=high,
-                valid=mask,
-                unit=one.unit,
-                width=IMAGE_WIDTH_PX,
-                of=one.name,
-            )
+            yield shown.scalar(label, image, low, high)
     image, mask = laid(one.difference)
     reach = map_images.reach_of(image, mask, 98) or 1.0
-    signed = one.unit != "°"
-    yield map_images.scalar_image(
-        "B − A" if signed else "angle between them",
-        image,
-        low=-reach if signed else 0.0,
-        high=reach,
-        scale="RdBu_r" if signed else "magma",
-        valid=mask,
-        unit=one.unit,
-        width=IMAGE_WIDTH_PX,
-        of=one.name,
-    )
+    drawing = map_images.MapDrawing(one.name, one.unit, mask, IMAGE_WIDTH_PX)
+    if one.unit == "°":
+        yield drawing.size("angle between them", image, reach)
+    else:
+        yield drawing.signed("B − A", image, reach)
     if one.sigmas is not None:
         image, mask = laid(one.sigmas)
-        yield map_images.scalar_image(
-            "in combined standard errors",
-            image,
-            low=-MAX_SHOWN_SIGMAS if signed else 0.0,
-            high=MAX_SHOWN_SIGMAS,
-            scale="RdBu_r" if signed else "magma",
-            valid=mask,
-            width=IMAGE_WIDTH_PX,
-            of=f"{one.name}, difference",
-        )
+        drawing = map_images.MapDrawing(f"{one.name}, difference", "", mask, IMAGE_WIDTH_PX)
+        draw = drawing.size if one.unit == "°" else drawing.signed
+        yield draw("in combined standard errors", image, MAX_SHOWN_SIGMAS)
 
 
 def _by_band(pair: Pair) -> Iterator[page.Block]:
@@ -263,36 +195,10 @@ def _by_band(pair: Pair) -> Iterator[page.Block]:
             inside &= ~np.isnan(one.sigmas)
             if np.count_nonzero(inside) < 20:
                 continue
-            sigmas = np.abs(one.sigmas[inside])
-            rows.append(
-                (
-                    words(one.name),
-                    melanin_band(low, high),
-                    one.unit,
-                    int(inside.sum()),
-                    float(np.median(one.difference[inside])),
-                    float(np.median(np.abs(one.difference[inside]))),
-                    float(np.median(sigmas)),
-                    100 * float(np.mean(sigmas > 3.0)),
-                )
-            )
-    if not rows:
-        return
-    yield page.Heading("By melanin band")
-    yield page.table(
-        (
-            "map",
-            "band",
-            "unit",
-            "pixels",
-            "median difference",
-            "median |difference|",
-            "median of combined standard errors",
-            "beyond 3 %",
-        ),
-        rows,
-        caption="By band of the melanin fraction C_m that both find on average",
-    )
+            off, sigmas = one.difference[inside], np.abs(one.sigmas[inside])
+            rows.append((words(one.name), melanin_band(low, high), one.unit, off, sigmas))
+    if rows:
+        yield page.view("compared_bands", bands=rows)
 
 
 def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
@@ -310,49 +216,12 @@ def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         {(row.quantity, row.skin): row for row in truth_errors.of(side, truth)}
         for side, truth in ((pair.a, truths[0]), (pair.b, truths[1]))
     )
-    rows = []
-    for key, one in found_a.items():
-        other = found_b.get(key)
-        if other is None:
-            continue
-        apart = one.interval[1] < other.interval[0] or other.interval[1] < one.interval[0]
-        known = np.isfinite([*one.interval, *other.interval]).all()
-        rows.append(
-            (
-                one.quantity,
-                one.skin,
-                one.unit,
-                one.error,
-                other.error,
-                other.error - one.error,
-                ("yes" if apart else "no") if known else "not known",
-                100 * one.coverage,
-                100 * other.coverage,
-            )
-        )
+    rows = [(one, found_b[key]) for key, one in found_a.items() if key in found_b]
     if not rows:
         return
-    yield page.Heading("Errors against the truths")
-    if any(
+    differ = any(
         not np.array_equal(one.values, truths[1].maps[key].values)
         for key, one in truths[0].maps.items()
         if key in truths[1].maps
-    ):
-        yield page.note(
-            "The truths differ, too: part of what differs between the maps is the skin's own."
-        )
-    yield page.table(
-        (
-            "error",
-            "skin",
-            "unit",
-            "A",
-            "B",
-            "difference",
-            "68 % intervals apart",
-            "68 % coverage % A",
-            "B",
-        ),
-        rows,
-        caption="Each against its own truth",
     )
+    yield page.view("compared_errors", errors=rows, truths_differ=differ)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from skinrig.reporting.folders import Findings, ReportError
 from skinrig.reporting.sections import bench
 from skinrig.reporting.sections import images as pictures
 
+T = TypeVar("T")
 Kind = Literal["maps", "benchmark", "pictures", "run", "truth", "other"]
 COMPARABLE_KINDS: tuple[Kind, ...] = ("maps", "benchmark", "pictures", "run")
 MAX_SAME_POINT_MM = 1.0
@@ -34,6 +35,11 @@ class Run:
     appearances: dict[str, SkinAppearance]
     checks: list[page.Check] = field(default_factory=list)
     """What its own report would judge."""
+
+    @property
+    def pictures(self) -> dict[str, Path]:
+        """Folders of renderings and analyses by name."""
+        return {path.name: path for path in sorted(self.found.pictures)}
 
     @staticmethod
     def of(label: str, path: Path, truths: Sequence[Path] = ()) -> Run:
@@ -132,25 +138,22 @@ def _labels(a: Path, b: Path) -> tuple[str, str]:
     return f"A: {a.parent.name}/{a.name}", f"B: {b.parent.name}/{b.name}"
 
 
-def pairs(a: Run, b: Run) -> list[tuple[str, SkinAppearance, SkinAppearance]]:
-    """Return the maps that belong together: by name of their folder, or the only ones."""
-    if len(a.appearances) == len(b.appearances) == 1:
-        (name_a, one), (name_b, other) = *a.appearances.items(), *b.appearances.items()
-        return [(name_a if name_a == name_b else f"{name_a} and {name_b}", one, other)]
-    return [
-        (name, one, b.appearances[name])
-        for name, one in a.appearances.items()
-        if name in b.appearances
-    ]
+def paired(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T]]:
+    """Return what belongs together of two runs: by name of its folder, or the only ones."""
+    if len(one) == len(other) == 1:
+        (name_a, a), (name_b, b) = *one.items(), *other.items()
+        return [(name_a if name_a == name_b else f"{name_a} and {name_b}", a, b)]
+    return [(name, found, other[name]) for name, found in one.items() if name in other]
 
 
 def alone(a: Run, b: Run) -> list[tuple[str, str]]:
-    """Return what only one of two runs has: its name and the run's label."""
-    if len(a.appearances) == len(b.appearances) == 1:
-        return []
-    return [(name, a.label) for name in a.appearances if name not in b.appearances] + [
-        (name, b.label) for name in b.appearances if name not in a.appearances
-    ]
+    """Return folders of maps or pictures that only one of two runs has: name, the run's label."""
+    found = []
+    for one, other in ((a.appearances, b.appearances), (a.pictures, b.pictures)):
+        if not len(one) == len(other) == 1:
+            found += [(name, a.label) for name in one if name not in other]
+            found += [(name, b.label) for name in other if name not in one]
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,7 @@ class Pair:
 def compared(a: Run, b: Run) -> list[Pair]:
     """Return the pairs of two runs with the differences of every map that both have."""
     found = []
-    for name, one, other in pairs(a, b):
+    for name, one, other in paired(a.appearances, b.appearances):
         differences, refused = [], []
         apart = _apart_mm(one, other)
         for key in sorted(set(one.maps) | set(other.maps)):
@@ -196,9 +199,7 @@ def _apart_mm(a: SkinAppearance, b: SkinAppearance) -> float:
     one, other = places[0], places[1]
     if one.values.shape != other.values.shape:
         return 0.0  # each map is then refused by its own shape
-    both = np.ones(one.values.shape[:2], bool)
-    for place in (one, other):
-        both &= True if place.valid is None else place.valid
+    both = one.mask & other.mask
     if not both.any():
         return float("inf")
     return float(np.median(np.linalg.norm(one.values[both] - other.values[both], axis=-1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,77 +62,34 @@ def of(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
     return rows
 
 
-def _chromophores(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
-    found = flash.compare(appearance, truth, rng=np.random.default_rng(0))
-    return [
-        TruthError(
-            f"{row.name}, median relative error against the {row.against} truth",
-            row.band_name,
-            "%",
-            100 * row.median_relative,
-            (100 * row.interval[0], 100 * row.interval[1]),
-            row.coverage.share,
-        )
-        for row in found
-    ]
+def _chromophores(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    for row in flash.compare(appearance, truth, rng=np.random.default_rng(0)):
+        name = f"{row.name}, median relative error against the {row.against} truth"
+        interval = 100 * row.interval[0], 100 * row.interval[1]
+        got = 100 * row.median_relative
+        yield TruthError(name, row.band_name, "%", got, interval, row.coverage.share)
 
 
-def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
-    found = surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
-    rows = [
-        TruthError(
-            f"{row.name}, median error",
-            "all",
-            unit_sign(row.unit),
-            row.median,
-            row.interval,
-            row.coverage.share,
-        )
-        for row in found
-    ]
+def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    for row in surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0)):
+        name, unit = f"{row.name}, median error", unit_sign(row.unit)
+        yield TruthError(name, "all", unit, row.median, row.interval, row.coverage.share)
     for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
-        rows.append(TruthError(f"{name}, median error", f"{band} skin", unit, middle))
-    return rows
+        yield TruthError(f"{name}, median error", f"{band} skin", unit, middle)
 
 
-def _microrelief(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
-    rows = []
+def _microrelief(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
     for one in microrelief.compare(appearance, truth, rng=np.random.default_rng(0)):
-        rows.append(
-            TruthError(
-                "normals, median error",
-                one.state,
-                "°",
-                one.median_deg,
-                one.interval_deg,
-                one.coverage,
-            )
-        )
+        angles = one.median_deg, one.interval_deg, one.coverage
+        yield TruthError("normals, median error", one.state, "°", *angles)
         if np.isfinite(one.height_um):
-            rows.append(
-                TruthError(
-                    "height, rms error of relief",
-                    one.state,
-                    "%",
-                    100 * one.height_relative,
-                    coverage=one.height_coverage,
-                )
-            )
-    return rows
+            name, got = "height, rms error of relief", 100 * one.height_relative
+            yield TruthError(name, one.state, "%", got, coverage=one.height_coverage)
 
 
-def _subsurface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
-    rows = []
+def _subsurface(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
     fits = subsurface.compare_fits(appearance, truth)
     for kind in dict.fromkeys(row.kind for row in fits):
         for one in subsurface.by_method([row for row in fits if row.kind == kind]):
-            rows.append(
-                TruthError(
-                    f"sigma_tr by {one.method}, median relative error",
-                    f"{kind} tissue",
-                    "%",
-                    100 * one.median,
-                    coverage=one.coverage,
-                )
-            )
-    return rows
+            name, skin = f"sigma_tr by {one.method}, median relative error", f"{kind} tissue"
+            yield TruthError(name, skin, "%", 100 * one.median, coverage=one.coverage)

@@ -38,52 +38,15 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     for name, stage in document["stages"].items():
         for limit in stage["limits"]:
             got = float("nan") if limit["got"] is None else limit["got"]
-            checks.append(
-                page.Check(
-                    f"{name}: {limit['name']}",
-                    got,
-                    limit["bound"],
-                    limit["sense"],
-                    limit["unit"],
-                    worst=_worst(stage),
-                )
-            )
+            judged = got, limit["bound"], limit["sense"], limit["unit"]
+            checks.append(page.Check(f"{name}: {limit['name']}", *judged, worst=_worst(stage)))
     plots = [
         bench_figures.error_against_seconds(name, stage)
         for name, stage in document["stages"].items()
         if stage["points"]
     ]
     yield page.Plots(plots)
-    yield page.table(
-        (
-            "stage",
-            "setting",
-            "seconds",
-            "cold, s",
-            "peak, MB",
-            "error",
-            "Cramér-Rao",
-            "efficiency",
-            "place",
-        ),
-        [
-            (
-                name,
-                ", ".join(f"{k} {v}" for k, v in point["knobs"].items()),
-                point["seconds"],
-                point["cold_seconds"],
-                _cell(point["peak_memory_mb"]),
-                point["error"],
-                _cell(point["cramer_rao_bound"]),
-                _cell(point.get("efficiency")),
-                "knee" if point["knee"] else "front" if point["on_front"] else "beaten",
-            )
-            for name, stage in document["stages"].items()
-            for point in stage["points"]
-        ],
-        caption="Every setting measured; errors in the unit on each plot's axis; efficiency is "
-        "variance over the Cramér-Rao bound, 1 is perfect; cold: the first call of a process",
-    )
+    yield page.view("benchmark", stages=document["stages"])
     bands = bench_table.bands(document)
     if bands:
         yield page.table(
@@ -117,7 +80,3 @@ def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
             "Measured at small size, so that limits were not judged: "
             f"{', '.join(document['not_judged'])}."
         )
-
-
-def _cell(value: float | None) -> float | str:
-    return "" if value is None else float(value)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,13 @@ MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
 
+FIGURES_OF: Mapping[str, Callable[[Float64Array], float]] = {
+    "largest": lambda values: float(np.max(np.abs(values))),
+    "mean": lambda values: float(np.mean(values)),
+}
+"""Numbers of a device by one number."""
+
+
 @dataclass(frozen=True, slots=True)
 class Figure:
     """One number by which a calibration is judged, for each device that has it."""
@@ -30,40 +39,23 @@ class Figure:
     quantity: str
     words: str
     unit: str
-    of: Callable[[Float64Array], float] = lambda values: float(np.max(np.abs(values)))
-    factor: float = 1.0
-    worst: Callable[[Sequence[float]], float] = max
+    of: Callable[[Float64Array], float]
+    factor: float
+    worst: Callable[[Sequence[float]], float]
 
 
-QUALITY_FIGURES: Mapping[str, tuple[Figure, ...]] = {
-    "sensor": (
-        Figure("read_noise_e", "read noise", "e-"),
-        Figure("linearity_deviation", "deviation from a straight line", "%", factor=100.0),
-        Figure("prnu", "pixels' response differs by", "%", factor=100.0),
-        Figure("flat_residual", "left by the flat field", "%", factor=100.0),
-        Figure("chi2_per_dof", "chi² per degree of freedom of the photon transfer", ""),
-    ),
-    "color": (
-        Figure("delta_e_mean", "Delta E 2000, patches held out, mean", ""),
-        Figure("delta_e_max", "Delta E 2000, patches held out, largest", ""),
-    ),
-    "polarization": (
-        Figure("extinction_r", "extinction ratio, red", "", worst=min),
-        Figure("extinction_g", "extinction ratio, green", "", worst=min),
-        Figure("extinction_b", "extinction ratio, blue", "", worst=min),
-        Figure("leakage", "a mirror's light crossed over parallel", ""),
-        Figure("light_jitter", "light from pop to pop", "%", factor=100.0),
-    ),
-    "white": (Figure("residual", "left by the smooth white reference", "%", factor=100.0),),
-    "geometry": (Figure("reprojection_px", "reprojection", "px"),),
-    "lights": (
-        Figure("intensity", "light", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
-    ),
-    "fibre": (
-        Figure("gain", "gain of a fibre", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
-        Figure("spot_edge_px", "edge of a fibre's spot", "px"),
-    ),
-}
+def _quality_figures() -> dict[str, list[Figure]]:
+    table = resources.files("skinrig").joinpath("data/calibration_figures.csv")
+    found: dict[str, list[Figure]] = {}
+    for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
+        of = FIGURES_OF[row["of"]]
+        worst = {"min": min, "max": max}[row["worst"]]
+        words = row["quantity"], row["words"], row["unit"]
+        found.setdefault(row["kind"], []).append(Figure(*words, of, float(row["factor"]), worst))
+    return found
+
+
+QUALITY_FIGURES = _quality_figures()
 """Figures of each kind; what a calibration lacks is left out."""
 
 
@@ -111,36 +103,10 @@ def section(
             figures += _figures(folder.name, found)
             values.append(_values(folder.name, found))
         if left:
-            checks.append(
-                page.Check(
-                    f"{folder.name}: days that it would still have held at capture, least",
-                    float(np.min(left)),
-                    0.0,
-                    ">=",
-                    "d",
-                )
-            )
+            name = f"{folder.name}: days that it would still have held at capture, least"
+            checks.append(page.Check(name, float(np.min(left)), 0.0, ">=", "d"))
     yield page.Heading("Calibration: quality and age", level=2)
-    yield page.table(
-        ("calibration", "made", "valid until", "used for", "captured", "age then, days", "verdict"),
-        ages,
-        caption="Age at the day of capture against validity; used for: maps here that name this "
-        "very file among their inputs",
-    )
-    yield page.table(
-        (
-            "calibration",
-            "figure",
-            "unit",
-            "devices",
-            "median",
-            "worst",
-            "worst device",
-            "largest standard error",
-        ),
-        figures,
-        caption="Quality; standard errors are of the figure itself where the calibration has them",
-    )
+    yield page.view("calibrations", ages=ages, figures=figures)
     yield from values
 
 
@@ -193,56 +159,40 @@ def _left(found: Calibration, day: date) -> int:
 
 
 def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
+    calibration = f"{folder}, {found.kind}"
     rows: list[tuple[object, ...]] = []
     for figure in QUALITY_FIGURES.get(found.kind, ()):
-        told = {
-            serial: figure.factor * figure.of(np.asarray(names[figure.quantity].value, float))
+        held = {
+            serial: (np.asarray(names[figure.quantity].value, float), names[figure.quantity].stderr)
             for serial, names in sorted(found.values.items())
             if figure.quantity in names
-            and np.isfinite(np.asarray(names[figure.quantity].value, float)).all()
+        }
+        told = {
+            serial: figure.factor * figure.of(value)
+            for serial, (value, _) in held.items()
+            if np.isfinite(value).all()
         }
         if not told or (found.kind == "white" and not any(told.values())):
             continue  # a white reference that nothing smoothed leaves nothing
         errors = [
             figure.factor * float(np.max(stderr))
-            for names in found.values.values()
-            if figure.quantity in names
-            and (stderr := names[figure.quantity].stderr) is not None
-            and np.isfinite(stderr).all()
+            for _, stderr in held.values()
+            if stderr is not None and np.isfinite(stderr).all()
         ]
-        worst = figure.worst(list(told.values()))
+        median, worst = float(np.median(list(told.values()))), figure.worst(list(told.values()))
         device = next(serial for serial, value in told.items() if value == worst)
-        rows.append(
-            (
-                f"{folder}, {found.kind}",
-                figure.words,
-                figure.unit,
-                len(told),
-                float(np.median(list(told.values()))),
-                worst,
-                device,
-                max(errors) if errors else "",
-            )
-        )
-    flagged = [
-        serial
+        of_all = len(told), median, worst, device, max(errors) if errors else ""
+        rows.append((calibration, figure.words, figure.unit, *of_all))
+    valid = {
+        serial: np.asarray(names["valid"].value, bool).all()
         for serial, names in sorted(found.values.items())
-        if "valid" in names and not np.asarray(names["valid"].value, bool).all()
-    ]
-    counted = sum("valid" in names for names in found.values.values())
-    if counted:
-        rows.append(
-            (
-                f"{folder}, {found.kind}",
-                "devices found not valid",
-                "",
-                counted,
-                float(len(flagged)),
-                float(len(flagged)),
-                ", ".join(flagged[:6]),
-                "",
-            )
-        )
+        if "valid" in names
+    }
+    if valid:
+        flagged = [serial for serial, good in valid.items() if not good]
+        count = float(len(flagged))
+        of_all = len(valid), count, count, ", ".join(flagged[:6]), ""
+        rows.append((calibration, "devices found not valid", "", *of_all))
     return rows
 
 

@@ -54,19 +54,10 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-    if (
-        max(abs(low), abs(high)) < MAX_ROUNDING_ERROR
-    ):  # what rounding leaves is not to look like structure
-        low, high = 0.0, 1.0
-    return map_images.scalar_image(
-        map_names.heading(key),
-        skin_map.values,
-        low=low,
-        high=high,
-        valid=mask,
-        unit=page.short_unit(skin_map.unit),
-        width=SMALL_WIDTH_PX,
-    )
+    if max(abs(low), abs(high)) < MAX_ROUNDING_ERROR:
+        low, high = 0.0, 1.0  # what rounding leaves is not to look like structure
+    drawing = map_images.MapDrawing("", page.short_unit(skin_map.unit), mask, SMALL_WIDTH_PX)
+    return drawing.scalar(map_names.heading(key), skin_map.values, low, high)
 
 
 def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
@@ -92,15 +83,12 @@ def errors(
     blurred = [row for row in rows if row.against == "blurred"]
     for row in blurred:
         if row.band is None:
-            own = [r for r in blurred if r.name == row.name and r.band is not None]
-            worst, worst_got = _worst(own)
+            worst, worst_got = _worst([r for r in blurred if r.name == row.name and r.band])
             checks.append(
-                page.Check(
+                page.Check.of_shares(
                     f"{name}: {row.name}, median error",
-                    100 * row.median_relative,
-                    100 * flash.limit(row),
-                    "<=",
-                    "%",
+                    row.median_relative,
+                    flash.limit(row),
                     f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
                     masked=row.masked,
                     coverage=row.coverage.share,
@@ -108,29 +96,7 @@ def errors(
                     worst_got=worst_got,
                 )
             )
-    yield page.Heading("Errors by melanin band")
-    yield page.records(
-        rows,
-        (
-            ("map", lambda row: row.name),
-            ("truth", lambda row: row.against),
-            ("band", lambda row: row.band_name),
-            ("pixels", lambda row: row.pixels),
-            ("masked, %", lambda row: 100 * row.masked),
-            ("median |error|, %", lambda row: 100 * row.median_relative),
-            (
-                "68 % interval",
-                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-            ),
-            ("bias, %", lambda row: 100 * row.bias),
-            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
-            ("by noise alone, %", lambda row: 100 * row.noise_coverage),
-            ("median standard error, %", lambda row: 100 * row.median_stderr),
-            ("bound, %", lambda row: 100 * row.median_bound),
-        ),
-        caption="Relative errors against what the subject is made of (sharp) and against what "
-        "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
-    )
+    yield page.view("chromophore_errors", errors=rows)
     limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
     yield from _bars([row for row in blurred if row.band is not None], limits)
 
@@ -155,14 +121,8 @@ def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> Iterator
         key: [found.get((key, label), float("nan")) for label in labels]
         for key in dict.fromkeys(row.name for row in banded)
     }
-    plot = figures.bars(
-        "median error by melanin band; dashed: limit of all bands together",
-        labels,
-        series,
-        unit="%",
-        limits=limits,
-    )
-    yield page.Plots([plot])
+    title = "median error by melanin band; dashed: limit of all bands together"
+    yield page.Plots([figures.bars(title, labels, series, unit="%", limits=limits)])
 
 
 def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Block]:
@@ -192,7 +152,6 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Bloc
 
 
 def _plots_of_table(camera: str, illuminant: str) -> list[str]:
-
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
     plots = []
     choices: tuple[tuple[Literal["known"] | None, str], ...] = (
@@ -207,11 +166,9 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
             model_error=model_error.load(),
             size=48,
         )
-        for name, relative in (
-            ("melanin", found.stderr_melanin),
-            ("hemoglobin", found.stderr_hemoglobin),
-        ):
-            plots.append(
-                figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
-            )
+        errors = {"melanin": found.stderr_melanin, "hemoglobin": found.stderr_hemoglobin}
+        plots += [
+            figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
+            for name, relative in errors.items()
+        ]
     return plots

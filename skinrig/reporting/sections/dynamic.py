@@ -22,7 +22,6 @@ from skinrig.appearances.dynamic import (
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.sections import facial_color
 
 MAX_SHOWN_EXPRESSIONS = 4
@@ -85,34 +84,17 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
     for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
         shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
-    for title, normals in shown.items():
-        every = np.ones(normals.shape[:2], bool)
-        images.append(map_images.normal_image(title, normals, valid=every, width=WIDTH_PX))
+    drawing = map_images.MapDrawing(width=WIDTH_PX)
+    images += [drawing.normals(title, normals) for title, normals in shown.items()]
     table: Any = layer.table
-    rows = []
-    for name, row in table.rows.items():
-        stderr = model.weight_stderr.get(name, ())
-        rows.append(
-            (
-                name,
-                *(
-                    f"{w:.2f} ({e:.2f})" if np.isfinite(e) else "not determined"
-                    for w, e in zip(row, stderr or [np.inf] * len(row), strict=True)
-                ),
-            )
-        )
     together = dict.fromkeys(list(table.rows)[:2], 1.0)
     sums = zone_sums(together, table)
-    clamps = [(clamp, *(float(v) for v in clamped(sums, clamp))) for clamp in ("unit", "signed")]
+    clamps = {clamp: clamped(sums, clamp).tolist() for clamp in ("unit", "signed")}
     yield page.Heading("Wrinkles")
     yield page.Images(images)
-    yield page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
-    yield page.table(
-        ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
-    )
-    yield page.note(
-        f"Map and zones explain {100 * part['explained']:.0f} % of the differences between "
-        "expressions and neutral."
+    stderr = model.weight_stderr
+    yield page.view(
+        "wrinkles", table=table, stderr=stderr, part=part, together=together, clamps=clamps
     )
 
 
@@ -132,28 +114,12 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         alphas.append(figures.Curve(site, r.tolist(), alpha.tolist(), marks=False))
         sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
-        spread = 2.5 * float(np.std(relief.values[valid_of(relief)]))
-        images.append(
-            map_images.scalar_image(
-                f"{site}: neutral relief",
-                relief.values,
-                low=-spread,
-                high=spread,
-                scale="gray",
-                valid=relief.valid,
-                unit="um",
-                width=WIDTH_PX,
-            )
-        )
-        rows.append(
-            (
-                site,
-                entry["pixel_um"],
-                entry["kernels"] or "the paper's table",
-                f"{low:.2f} – {high:.2f}",
-                table.source,
-            )
-        )
+        spread = 2.5 * float(np.std(relief.values[relief.mask]))
+        drawing = map_images.MapDrawing("", "um", relief.valid, WIDTH_PX)
+        title = f"{site}: neutral relief"
+        images.append(drawing.scalar(title, relief.values, -spread, spread, "gray"))
+        kernels, stretch = entry["kernels"] or "the paper's table", f"{low:.2f} – {high:.2f}"
+        rows.append((site, entry["pixel_um"], kernels, stretch, table.source))
     yield page.Heading("Microstructure")
     yield page.Images(images)
     yield page.Plots(

@@ -62,11 +62,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     checks.append(page.Check("extremes that failed", failed, 0, "<=", "", f"of {len(cases)}"))
     rows = [
         (
-            case["stage"],
-            case["name"],
-            case["extreme"],
-            case["danger"],
-            case["expected"],
+            *(case[key] for key in ("stage", "name", "extreme", "danger", "expected")),
             *(
                 ("" if case[name]["passed"] else "FAILED: ") + case[name]["got"]
                 for name in INPUT_PRECISIONS

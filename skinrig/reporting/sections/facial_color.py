@@ -14,7 +14,6 @@ from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.evaluating.flash import MELANIN_RANGES
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import melanin_band
 
 MAX_SHOWN_STATES = 4
@@ -53,37 +52,11 @@ def section(
         f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination."
     )
     yield from _blends(appearance, rig)
-    rows = []
-    for state, maps in rig.states.items():
-        placed = [row for row in part["alignment"] if row["state"] == state]
-        rms, largest = part["storage_error"][state]
-        change = appearance.maps.get(f"change_{state}")
-        rows.append(
-            (
-                state,
-                _mean(change),
-                float(np.median(maps.scale[maps.valid])),
-                100 * rms,
-                100 * largest,
-                placed[0]["median_error_px"] if placed else "",
-                placed[0]["by"] if placed else "",
-            )
-        )
-    yield page.table(
-        (
-            "state",
-            "mean change of blood, points",
-            "median scale",
-            "lost by storing small, rms, points",
-            "largest, points",
-            "error of place, px",
-            "placed by",
-        ),
-        rows,
-        caption="States; points are percent of the dermis' volume, the mean change is over all "
-        "pixels whose change was found",
-    )
-    yield from _repeats(part.get("repeatability"))
+    mean = {state: _mean(appearance.maps.get(f"change_{state}")) for state in rig.states}
+    scales = {state: float(np.median(m.scale[m.valid])) for state, m in rig.states.items()}
+    yield page.view("facial_states", states=rig.states, part=part, changes=mean, scales=scales)
+    if repeats := part.get("repeatability"):
+        yield page.view("facial_repeats", repeats=repeats)
     if truths:
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
         banded = errors_by_band(rig, truths)
@@ -94,7 +67,7 @@ def section(
         if measured is None:
             continue
         blend = rig.evaluate({state: 1.0})
-        seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
+        seen = blend.valid if true is None else blend.valid & true.mask
         yield from map_images.map_panel(
             f"blood of {state}, by the rig",
             "volume fraction",
@@ -103,45 +76,6 @@ def section(
             truth=None if true is None else true.values,
             valid=seen,
         )
-
-
-def _repeats(told: Mapping[str, Any] | None) -> Iterator[page.Block]:
-    """Yield how far states repeat, and whether melanin drifts."""
-    if not told:
-        return
-    drifts = {row["region"]: row for row in told["melanin_drift"]}
-    rows = []
-    for row in told["hemoglobin"]:
-        drift = drifts.get(row["region"])
-        slope = (
-            ""
-            if drift is None
-            else (f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})")
-        )
-        rows.append(
-            (
-                row["region"],
-                100 * row["within"],
-                100 * row["between"],
-                float("nan") if row["correlation"] is None else row["correlation"],
-                "yes" if row["scatters"] else "no",
-                slope,
-                "" if drift is None else f"{drift['p_value']:.2g}",
-            )
-        )
-    yield page.table(
-        (
-            "region",
-            "between repeats, points",
-            "between states, points",
-            "intraclass correlation",
-            "more than noise",
-            "melanin's drift a minute, points",
-            "p",
-        ),
-        rows,
-        caption="Repeats: standard deviations of blood",
-    )
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Block]:
@@ -157,7 +91,7 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
     images = []
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
-        seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
+        seen = blend.valid & melanin.mask
         color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
         images.append(map_images.color_image(title, color, width=WIDTH_PX))
     yield page.Images(images)
@@ -175,65 +109,20 @@ def _errors(
         return
     by_rig = [row for row in states if row.way == evaluation.PREDICTION_METHODS[1]]
     for row in by_rig:
-        worst = _worst(row.state, banded)
         checks.append(
-            page.Check(
+            page.Check.of_shares(
                 f"{name}: blood of {row.state} by the rig, median error",
-                100 * row.median_relative,
-                100 * evaluation.MAX_LEVEL_ERROR,
-                "<=",
-                "%",
+                row.median_relative,
+                evaluation.MAX_LEVEL_ERROR,
                 coverage=row.coverage,
-                worst=worst,
+                worst=_worst(row.state, banded),
             )
         )
-    yield page.Heading("Blood of each state: error by way")
-    yield page.records(
-        states,
-        (
-            ("state", lambda row: row.state),
-            ("way", lambda row: row.way),
-            ("median |error|, %", lambda row: 100 * row.median_relative),
-            (
-                "68 % interval",
-                lambda row: f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-            ),
-            ("rms, points", lambda row: 100 * row.rms),
-            ("bias, %", lambda row: 100 * row.bias),
-            ("68 % coverage, %", lambda row: 100 * row.coverage),
-            ("pixels", lambda row: row.pixels),
-        ),
-        caption="Against the true blood of each state, by way of getting it; pixels that every "
-        "way tells",
-    )
-    yield page.records(
-        changes,
-        (
-            ("state", lambda row: row.state),
-            ("true change, points", lambda row: 100 * row.true),
-            ("found, points", lambda row: 100 * row.found),
-            ("rms of the map, points", lambda row: 100 * row.rms),
-            ("68 % coverage, %", lambda row: 100 * row.coverage),
-        ),
-        caption="Change of blood from the neutral state, one melanin for all states; over those of "
-        "these pixels whose change was found",
-    )
-    if banded:
-        yield page.table(
-            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"),
-            banded,
-            caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
-            "the rig tells, also where the state itself was not measured",
-        )
+    yield page.view("facial_errors", states=states, changes=changes, banded=banded)
     labels = list(dict.fromkeys(row.state for row in states))
+    found = {(row.state, row.way): 100 * row.median_relative for row in reversed(states)}
     series = {
-        way: [
-            next(
-                (100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
-                float("nan"),
-            )
-            for label in labels
-        ]
+        way: [found.get((label, way), float("nan")) for label in labels]
         for way in evaluation.PREDICTION_METHODS
     }
     yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
@@ -267,9 +156,7 @@ def errors_by_band(
         blend = rig.evaluate({state: 1.0})
         if melanin.values.shape != blend.hemoglobin.shape:
             continue
-        good = blend.valid & (true.values > 0)
-        if true.valid is not None:
-            good = good & true.valid
+        good = blend.valid & (true.values > 0) & true.mask
         for low, high in MELANIN_RANGES:
             inside = good & (melanin.values >= low) & (melanin.values < high)
             if np.count_nonzero(inside) < MIN_BAND_PIXELS:
@@ -277,16 +164,9 @@ def errors_by_band(
             found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
             relative = (found - real) / real
             held = np.abs(found - real) <= blend.stderr[inside]
-            rows.append(
-                (
-                    state,
-                    melanin_band(low, high),
-                    int(inside.sum()),
-                    100 * float(np.median(np.abs(relative))),
-                    100 * float(np.median(relative)),
-                    100 * float(np.mean(held)),
-                )
-            )
+            off = np.median(np.abs(relative)), np.median(relative), np.mean(held)
+            percent = (100 * float(one) for one in off)
+            rows.append((state, melanin_band(low, high), int(inside.sum()), *percent))
     return rows
 
 
@@ -302,5 +182,5 @@ def _worst(state: str, banded: list[tuple[object, ...]]) -> str:
 def _mean(skin_map: SkinMap | None) -> float:
     if skin_map is None:
         return float("nan")
-    good = valid_of(skin_map)
+    good = skin_map.mask
     return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")

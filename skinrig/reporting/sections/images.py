@@ -61,11 +61,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
     yield from _images(folder)
     if document.get("assumed"):
         yield page.Heading("Assumed")
-        yield page.table(
-            ("assumption",),
-            [[t] for t in document["assumed"]],
-            caption="Taken for granted, not measured",
-        )
+        yield page.assumptions(document["assumed"])
 
 
 def _heading(document: Mapping[str, Any]) -> str:
@@ -79,47 +75,16 @@ def _comparison(
 ) -> Iterator[page.Block]:
     full = document[FULL_MODEL]
     checks.append(
-        page.Check(
+        page.Check.of_shares(
             f"{name}: luminance of held-out photographs, median error on lit pixels",
-            100 * full["median"],
-            100 * document["limit"],
-            "<=",
-            "%",
+            full["median"],
+            document["limit"],
             f"noise alone makes {100 * full['noise']:.2f} %",
         )
     )
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
-    rows = {FULL_MODEL: full, **kinds, **document["ablation"]}
-    yield page.table(
-        (
-            "model",
-            "photographs",
-            "median error, %",
-            "68 % below, %",
-            "95 % below, %",
-            "bias, %",
-            "all skin, %",
-            "SSIM",
-        ),
-        [
-            (
-                label,
-                row["pairs"],
-                *(100 * row[key] for key in ("median", "p68", "p95", "bias", "total_error")),
-                row["ssim"],
-            )
-            for label, row in rows.items()
-        ],
-        caption="Luminance of photographs that no fit has seen; parts of the model left out",
-    )
-    bands = [
-        (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
-    ]
-    yield page.table(
-        ("skin", "pixels", "median error, %"),
-        bands,
-        caption="The full model by skin color, from the individual typology angle",
-    )
+    models = {FULL_MODEL: full, **kinds, **document["ablation"]}
+    yield page.view("photographs", models=models, bands=document["by_band"])
 
 
 def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
@@ -131,12 +96,8 @@ def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
         (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
         for k, rank in enumerate(ranks)
     ]
-    name = one.get("name", "")
-    yield page.table(
-        ("lobes", *(n.replace("_", " ") for n in head)),
-        rows,
-        caption=f"Errors by number of lobes: {name}",
-    )
+    caption = f"Errors by number of lobes: {one.get('name', '')}"
+    yield page.table(("lobes", *(n.replace("_", " ") for n in head)), rows, caption=caption)
 
 
 def _images(folder: Path) -> Iterator[page.Block]:

@@ -61,7 +61,7 @@ def section(sessions: Sequence[Path]) -> Iterator[page.Block]:
     if not alike:
         return
     yield page.Heading("What simulated scenes leave out", level=2)
-    yield page.Fixed("reporting/templates/omissions.html")
+    yield page.view("omissions")
     for text, names in alike.items():
         effects = json.loads(text)
         rows = sorted((_row(effect) for effect in effects), key=lambda row: _place(row[1]))

@@ -61,10 +61,9 @@ def section(
     )
     rows: list[tuple[object, ...]] = []
     for c, channel in enumerate(CHANNEL_NAMES):
-        row: list[object] = ["published (Weyrich et al. 2005, table 2)", channel]
-        for s in range(len(published.sites)):
-            row += [float(published.mean_per_mm[s, c]), float(published.deviation_per_mm[s, c])]
-        rows.append(tuple(row))
+        pairs = zip(published.mean_per_mm[:, c], published.deviation_per_mm[:, c], strict=True)
+        cells = (float(one) for pair in pairs for one in pair)
+        rows.append(("published (Weyrich et al. 2005, table 2)", channel, *cells))
     rows += _rows(f"simulated, {POPULATION_SIZE} people drawn from it", drawn, published.sites)
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]
     if measured:

@@ -35,7 +35,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
             f"{told['shot_period_s']:g} s; ordered by the flash's true time."
         )
     yield _curves(told, cycle_s)
-    yield from _table(told)
+    yield page.view("sequence", told=told, seen=_words)
 
 
 def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
@@ -46,51 +46,11 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
     for index, (place, one) in enumerate(told["curves"].items()):
         values = 100.0 * np.array([number(v) for v in one["hemoglobin"]])
         errors = 100.0 * np.array([number(v) for v in one["stderr"]])
-        curves.append(
-            figures.Curve(
-                place,
-                when[order].tolist(),
-                values[order].tolist(),
-                errors[order].tolist(),
-                line=cycle_s is None,
-                color=PLACE_COLORS[index % len(PLACE_COLORS)],
-            )
-        )
-    plot = figures.curves(
-        f"blood in {told['state']}", axis, "blood, % of the dermis' volume", curves
-    )
-    return page.Plots([plot])
-
-
-def _table(told: Mapping[str, Any]) -> Iterator[page.Block]:
-    rows = []
-    transitions, repeats = told.get("transition", {}), told.get("reproducibility", {})
-    for place, fit in told["fits"].items():
-        seen = transitions.get(place)
-        repeat = repeats.get(place)
-        rows.append(
-            (
-                place,
-                100 * number(fit["start"]),
-                100 * number(fit["end"]),
-                fit["text"],
-                "" if seen is None else _words(seen),
-                float("nan") if repeat is None else 100 * number(repeat["sd"]),
-            )
-        )
-    yield page.table(
-        (
-            "place",
-            "level at the start, %",
-            "at the end, %",
-            "time constant",
-            "transition seen",
-            "between cycles, points",
-        ),
-        rows,
-        caption="Levels and time constants by place; points are percent of the dermis' volume",
-    )
-    yield page.note(f"Time constant, all places together: {told['fit_of_all']['text']}.")
+        color, line = PLACE_COLORS[index % len(PLACE_COLORS)], cycle_s is None
+        points = when[order], values[order], errors[order]
+        curves.append(figures.Curve(place, *points, line=line, color=color))
+    title = f"blood in {told['state']}"
+    return page.Plots([figures.curves(title, axis, "blood, % of the dermis' volume", curves)])
 
 
 def _words(transition: Mapping[str, Any]) -> str:

@@ -22,6 +22,12 @@ class SessionFacts:
     frames: int
     megabytes: float
 
+    @property
+    def cells(self) -> tuple[object, ...]:
+        """What a row of the table says of it."""
+        seed = "" if self.seed is None else self.seed
+        return self.rig, self.day.isoformat(), self.source, seed, self.frames, self.megabytes
+
 
 def facts_of(folders: Sequence[Path]) -> dict[str, SessionFacts]:
     """Return what sessions say of themselves, by folder name."""
@@ -47,17 +53,6 @@ def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
     yield page.Heading("Sessions", level=2)
     yield page.table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
-        [
-            (
-                name,
-                one.rig,
-                one.day.isoformat(),
-                one.source,
-                "" if one.seed is None else one.seed,
-                one.frames,
-                one.megabytes,
-            )
-            for name, one in sessions.items()
-        ],
+        [(name, *one.cells) for name, one in sessions.items()],
         caption="Frames on disk; `skinrig verify` checks every one of them",
     )

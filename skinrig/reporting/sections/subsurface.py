@@ -17,7 +17,7 @@ from reconstruction.pipeline.probe.stages import (
 )
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.evaluating.subsurface import number, numbers
+from skinrig.evaluating.subsurface import numbers
 from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
@@ -54,8 +54,12 @@ def section(
     yield from _fits(appearance, truth)
     if truth is not None:
         yield from _errors(name, appearance, truth, checks)
-    yield from _anisotropy(appearance)
-    yield from _sites(appearance)
+    anisotropy = evaluation.document_of(appearance, ANISOTROPY_FILE)
+    if anisotropy is not None and anisotropy["sites"]:
+        yield page.view("anisotropy", sites=anisotropy["sites"])
+    fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
+    if fitted is not None and fitted.get("sites"):
+        yield page.view("sites", sites=fitted["sites"])
     yield from _map(appearance)
 
 
@@ -71,41 +75,18 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
         found = by_name.get(entry["name"])
         series = []
         for channel in CHANNEL_NAMES:
-            one = entry["channels"][channel]
+            one, color = entry["channels"][channel], CHANNEL_COLORS[channel]
             value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             value = np.where(np.asarray(one["valid"], bool), value, np.nan)
-            series.append(
-                figures.Curve(
-                    f"{channel}, measured",
-                    radius,
-                    value.tolist(),
-                    stderr.tolist(),
-                    line=False,
-                    color=CHANNEL_COLORS[channel],
-                )
-            )
+            name = f"{channel}, measured"
+            series.append(figures.Curve(name, radius, value, stderr, line=False, color=color))
             for fit in [] if found is None else found["fits"]:
-                if fit["channel"] != channel or fit["method"] != evaluation.RECOMMENDED_METHOD:
-                    continue
-                predicted = numbers(fit["predicted_per_mm2"])
-                series.append(
-                    figures.Curve(
-                        f"{channel}, fit",
-                        radius,
-                        predicted.tolist(),
-                        marks=False,
-                        color=CHANNEL_COLORS[channel],
-                    )
-                )
-        plots.append(
-            figures.curves(
-                f"{_words(entry)}: profile and photon-table fit",
-                "distance from the source, mm",
-                "reflectance, 1/mm²",
-                series,
-                log_y=True,
-            )
-        )
+                if fit["channel"] == channel and fit["method"] == evaluation.RECOMMENDED_METHOD:
+                    predicted, name = numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
+                    series.append(figures.Curve(name, radius, predicted, marks=False, color=color))
+        title = f"{_words(entry)}: profile and photon-table fit"
+        axes = "distance from the source, mm", "reflectance, 1/mm²"
+        plots.append(figures.curves(title, *axes, series, log_y=True))
         plots += _residuals(entry, found, radius)
     yield page.Heading("Radial profiles")
     yield page.Plots(plots)
@@ -123,14 +104,8 @@ def _residuals(
     for fit in [] if found is None else found["fits"]:
         if fit["channel"] == channel and fit["valid"]:
             left = 100.0 * np.where(told, value / numbers(fit["predicted_per_mm2"]) - 1.0, np.nan)
-            series.append(
-                figures.Curve(
-                    METHOD_NAMES[fit["method"]],
-                    radius,
-                    left.tolist(),
-                    (100.0 * stderr / np.where(told, value, np.nan)).tolist(),
-                )
-            )
+            spread = 100.0 * stderr / np.where(told, value, np.nan)
+            series.append(figures.Curve(METHOD_NAMES[fit["method"]], radius, left, spread))
     if not series:
         return []
     title = f"{_words(entry)}, {channel}: measured less fitted"
@@ -141,60 +116,17 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if fitted is None:
         return
-    known = evaluation.true_profiles(truth)
-    rows = []
-    for entry in fitted["measurements"]:
-        true = known.get(entry["name"])
-        for fit in entry["fits"]:
-            real = float("nan")
-            if true is not None:
-                real = float(true["sigma_tr_per_mm"][CHANNEL_NAMES.index(fit["channel"])])
-            found = number(fit["sigma_tr_per_mm"])
-            low, high = numbers(fit["interval_per_mm"])
-            rows.append(
-                (
-                    _words(entry),
-                    fit["channel"],
-                    METHOD_NAMES[fit["method"]],
-                    real,
-                    found,
-                    f"{low:.3g} – {high:.3g}",
-                    100 * (found / real - 1),
-                    number(fit["sigma_a_per_mm"]),
-                    number(fit["sigma_s_prime_per_mm"]),
-                    number(fit["correlation"]),
-                    number(fit["chi2"]),
-                    fit["dof"],
-                    sum(fit["used"]),
-                    "yes" if fit["valid"] else fit["reason"] or "no",
-                )
-            )
-    table = page.table(
-        (
-            "measurement",
-            "channel",
-            "method",
-            "true sigma_tr, 1/mm",
-            "sigma_tr",
-            "68 % interval",
-            "error, %",
-            "sigma_a",
-            "sigma_s'",
-            "their correlation",
-            "chi²",
-            "degrees of freedom",
-            "fibres",
-            "valid",
-        ),
-        rows,
-        caption="Every fit, with what it says of itself",
-    )
-    yield page.Heading("sigma_tr by method")
-    yield page.note(
-        "1/sigma_tr is the translucency: the smallest sigma_tr is the most translucent skin. The "
-        "true sigma_tr of layers is that of the homogeneous medium whose profile fits best."
-    )
-    yield page.Folded(f"{len(rows)} fits", [table])
+    true = {
+        (name, channel): float(one["sigma_tr_per_mm"][c])
+        for name, one in evaluation.true_profiles(truth).items()
+        for c, channel in enumerate(CHANNEL_NAMES)
+    }
+    fits = [
+        (entry["name"], _words(entry), fit)
+        for entry in fitted["measurements"]
+        for fit in entry["fits"]
+    ]
+    yield page.view("fits", fits=fits, truths=true, methods=METHOD_NAMES)
 
 
 def _errors(
@@ -205,18 +137,7 @@ def _errors(
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.by_method([row for row in rows if row.kind == kind])
         yield page.Heading(f"Error of sigma_tr against the truth, {kind} tissue")
-        yield page.records(
-            found,
-            (
-                ("method", lambda row: METHOD_NAMES[row.method]),
-                ("fits", lambda row: row.fits),
-                ("median |error|, %", lambda row: 100 * row.median),
-                ("worst, %", lambda row: 100 * row.worst),
-                ("bias, %", lambda row: 100 * row.bias),
-                ("68 % interval covers, %", lambda row: 100 * row.coverage),
-            ),
-            caption=f"By method, {kind} tissue",
-        )
+        yield page.view("methods", errors=found, methods=METHOD_NAMES, kind=kind)
         yield from _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED_METHOD), None)
         if kind == "homogeneous" and best is not None:
@@ -224,24 +145,9 @@ def _errors(
                 ("median", best.median, evaluation.MAX_MEDIAN_ERROR),
                 ("worst", best.worst, evaluation.MAX_WORST_ERROR),
             ):
-                checks.append(
-                    page.Check(f"{name}: sigma_tr, {word} error", 100 * got, 100 * bound, "<=", "%")
-                )
-    profiles = evaluation.compare_profiles(appearance, truth)
-    if profiles:
-        yield page.Heading("Profiles against the truth")
-        yield page.records(
-            profiles,
-            (
-                ("measurement", lambda row: _words_of_name(row.name)),
-                ("channel", lambda row: row.channel),
-                ("fibres", lambda row: row.fibres),
-                ("median |error|, %", lambda row: 100 * row.median),
-                ("worst, %", lambda row: 100 * row.worst),
-                ("68 % interval covers, %", lambda row: 100 * row.coverage),
-            ),
-            caption="Over fibres whose signal is ten times its standard error",
-        )
+                checks.append(page.Check.of_shares(f"{name}: sigma_tr, {word} error", got, bound))
+    if profiles := evaluation.compare_profiles(appearance, truth):
+        yield page.view("profiles", errors=profiles, measurement=_words_of_name)
 
 
 def _by_channel(rows: Sequence[evaluation.FitError]) -> Iterator[page.Block]:
@@ -257,81 +163,23 @@ def _by_channel(rows: Sequence[evaluation.FitError]) -> Iterator[page.Block]:
     yield page.Plots([figures.bars("error of sigma_tr", short, series, unit="%")])
 
 
-def _anisotropy(appearance: SkinAppearance) -> Iterator[page.Block]:
-    document = evaluation.document_of(appearance, ANISOTROPY_FILE)
-    if document is None or not document["sites"]:
-        return
-    yield page.Heading("Dependence on direction")
-    yield page.records(
-        document["sites"],
-        (
-            ("site", lambda entry: entry["site"]),
-            ("repeat", lambda entry: entry["repeat"]),
-            ("channel", lambda entry: entry["channel"]),
-            ("directions", lambda entry: entry["directions"]),
-            ("ratio", lambda entry: number(entry["ratio"])),
-            ("standard error", lambda entry: number(entry["ratio_stderr"])),
-            ("axis, °", lambda entry: number(entry["axis_deg"])),
-            ("standard error, °", lambda entry: number(entry["axis_stderr_deg"])),
-            ("chance if isotropic", lambda entry: number(entry["p_value"])),
-            (
-                "one direction is off by up to, %",
-                lambda entry: number(entry["worst_direction_percent"]),
-            ),
-            ("valid", lambda entry: "yes" if entry["valid"] else entry["reason"]),
-        ),
-        caption="sigma_tr along the long axis over that across it",
-    )
-
-
-def _sites(appearance: SkinAppearance) -> Iterator[page.Block]:
-    fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
-    if fitted is None or not fitted.get("sites"):
-        return
-    yield page.Heading("Sites")
-    yield page.records(
-        fitted["sites"],
-        (
-            ("site", lambda entry: entry["site"]),
-            ("channel", lambda entry: entry["channel"]),
-            ("measurements", lambda entry: entry["measurements"]),
-            ("sigma_tr, 1/mm", lambda entry: number(entry["sigma_tr_per_mm"])),
-            ("standard error", lambda entry: number(entry["sigma_tr_stderr"])),
-            ("translucency, mm", lambda entry: number(entry["translucency_mm"])),
-            ("standard error", lambda entry: number(entry["translucency_stderr_mm"])),
-        ),
-        caption="Mean of each site's measurements; translucency is 1/sigma_tr",
-    )
-
-
 def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     """Yield 1/sigma_tr over the face's texture, each channel beside its standard error."""
     found = appearance.maps.get("translucency")
     if found is None:
         return
     images = []
+    drawing = map_images.MapDrawing("", "mm", found.valid, WIDTH_PX)
     for c, channel in enumerate(CHANNEL_NAMES):
         values = found.values[..., c]
-        inside = values if found.valid is None else values[found.valid]
+        inside = values[found.mask]
         if not inside.size:
             continue
-        shown = [(f"translucency, {channel}", values, inside.min(), inside.max(), "viridis")]
+        low, high = float(inside.min()), float(inside.max())
+        images.append(drawing.scalar(f"translucency, {channel}", values, low, high))
         if found.stderr is not None:
             spread = found.stderr[..., c]
-            shown.append(("standard error", spread, 0.0, spread.max(), "magma"))
-        images += [
-            map_images.scalar_image(
-                title,
-                drawn,
-                low=float(low),
-                high=float(high),
-                scale=scale,
-                valid=found.valid,
-                unit="mm",
-                width=WIDTH_PX,
-            )
-            for title, drawn, low, high, scale in shown
-        ]
+            images.append(drawing.size("standard error", spread, float(spread.max())))
     yield page.Heading("Translucency map")
     yield page.note(
         "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "

@@ -5,21 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX, FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.evaluating.surface_bands import Banded, errors_by_band
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_images import valid_of
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign
 
 SMALL_WIDTH_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
 BACKGROUND_CODE = 0.5
+Box = tuple[FloatArray, FloatArray]
+Index = NDArray[np.intp]
 RELATIVE_ERROR_MAPS = ("r_d",)
 """Maps whose standard errors are shown in percent of the estimate."""
 FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
@@ -42,7 +44,7 @@ def section(
         Judgements are added to it.
     """
     place = appearance.maps["position"]
-    rows, columns = np.nonzero(valid_of(place))
+    rows, columns = np.nonzero(place.mask)
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
         yield page.note("No texel of these maps is valid.")
@@ -53,7 +55,7 @@ def section(
     if truth is not None:
         pairs = evaluation.match(appearance, truth)
         true_place = truth.maps["position"]
-        usable = valid_of(true_place)
+        usable = true_place.mask
         if "mask" in truth.maps:
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
@@ -66,7 +68,7 @@ def section(
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
-        good = valid_of(skin_map)[rows, columns]
+        good = skin_map.mask[rows, columns]
         width = FRONT_VIEW_WIDTH_PX if key in large else SMALL_WIDTH_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
@@ -79,10 +81,10 @@ def section(
                 shown_truths.add(true_name)
         figures.append(_shown("estimate", key, *view.picture(values, valid=good), width=width))
         if truth is not None and known_truth:
-            figures.append(_error(key, appearance, truth, pairs, box, width=width))
+            figures.append(_error(key, (appearance, truth), pairs, box, width))
         if skin_map.stderr is not None:
             stderr = skin_map.stderr[rows, columns]
-            figures.append(_spread(key, skin_map.unit, values, stderr, view, good, width=width))
+            figures.append(_spread(key, skin_map, stderr, view, (rows, columns), width))
         if key in FIRST_MAPS:
             yield page.Heading(heading(key))
             yield page.Images(figures, small=key not in large)
@@ -104,14 +106,13 @@ def _rank(key: str) -> tuple[int, str]:
 def _shown(
     title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int
 ) -> page.Image:
+    drawing = map_images.MapDrawing(key, "", valid, width)
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-        return map_images.scalar_image(
-            _title(title, key), image, low=low, high=high, valid=valid, of=key, width=width
-        )
+        return drawing.scalar(_title(title, key), image, low, high)
     if "normals" in key:
-        return map_images.normal_image(title, image, valid=valid, of=key, width=width)
+        return drawing.normals(title, image)
     return map_images.color_image(
         title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
     )
@@ -124,56 +125,33 @@ def _title(title: str, key: str) -> str:
 
 def _error(
     key: str,
-    appearance: SkinAppearance,
-    truth: SkinAppearance,
+    both: tuple[SkinAppearance, SkinAppearance],
     pairs: evaluation.Match,
-    box: tuple[FloatArray, FloatArray],
-    *,
+    box: Box,
     width: int,
 ) -> page.Image:
-    error = evaluation.errors_at(key, appearance, truth, pairs)
-    points = appearance.maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
+    error = evaluation.errors_at(key, *both, pairs)
+    points = both[0].maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
     image, valid = FrontView.of(points, box).picture(np.nan_to_num(error), valid=good)
     reach = map_images.reach_of(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
-        return map_images.scalar_image(
-            "error",
-            image,
-            low=0.0,
-            high=reach,
-            scale="magma",
-            valid=valid,
-            unit="°",
-            of=key,
-            width=width,
-        )
-    return map_images.scalar_image(
-        "estimate − truth",
-        image,
-        low=-reach,
-        high=reach,
-        scale="RdBu_r",
-        valid=valid,
-        unit="%",
-        of=key,
-        width=width,
-    )
+        return map_images.MapDrawing(key, "°", valid, width).size("error", image, reach)
+    return map_images.MapDrawing(key, "%", valid, width).signed("estimate − truth", image, reach)
 
 
 def _spread(
     key: str,
-    unit: str,
-    values: FloatArray,
+    skin_map: SkinMap,
     stderr: FloatArray,
     view: FrontView,
-    good: BoolArray,
-    *,
+    at: tuple[Index, Index],
     width: int,
 ) -> page.Image:
-    stderr, unit = stderr.astype(np.float64), page.short_unit(unit)
+    unit = page.short_unit(skin_map.unit)
+    good = skin_map.mask[at]
     if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
-        size = np.abs(values.astype(np.float64))
+        size = np.abs(skin_map.values[at].astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
         stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
     if stderr.ndim == 2:
@@ -182,17 +160,8 @@ def _spread(
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.picture(stderr, valid=good)
     reach = map_images.reach_of(image, valid, 98)
-    return map_images.scalar_image(
-        _title("standard error", key),
-        image,
-        low=0.0,
-        high=reach,
-        scale="magma",
-        valid=valid,
-        unit=unit,
-        of=key,
-        width=width,
-    )
+    drawing = map_images.MapDrawing(key, unit, valid, width)
+    return drawing.size(_title("standard error", key), image, reach)
 
 
 def _errors(
@@ -224,37 +193,9 @@ def _errors(
                 worst_got=worst_got,
             )
         )
-    yield page.Heading("Errors on the surface")
-    if coarse:
-        yield page.note(
-            f"A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
-            f"limit of {evaluation.MAX_NORMAL_ERROR_DEG:g}° is promised for "
-            f"{evaluation.MAX_EVALUATED_PIXEL_MM:g} mm and finer, so normals are shown but not "
-            "judged."
-        )
-    yield page.records(
-        found,
-        (
-            ("map", lambda row: words(row.name)),
-            ("unit", lambda row: unit_sign(row.unit)),
-            ("points", lambda row: row.points),
-            ("masked, %", lambda row: 100 * row.masked),
-            ("mean |error|", lambda row: row.mean),
-            ("median", lambda row: row.median),
-            ("68 % interval", lambda row: f"{row.interval[0]:.3g} – {row.interval[1]:.3g}"),
-            ("95th percentile", lambda row: row.high),
-            ("bias", lambda row: row.bias),
-            ("68 % coverage, %", lambda row: 100 * row.coverage.share),
-            ("median standard error", lambda row: row.median_stderr),
-        ),
-        caption="Texel by texel against the nearest true point; angles in degrees",
-    )
-    yield page.table(
-        ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
-        [(words(row[0]), *row[1:]) for row in banded],
-        caption="By skin color: the individual typology angle of the true reflectance "
-        "(Chardon et al. 1991)",
-    )
+    bounds = evaluation.MAX_NORMAL_ERROR_DEG, evaluation.MAX_EVALUATED_PIXEL_MM
+    pixel = pixel_mm if coarse else None
+    yield page.view("surface_errors", errors=found, banded=banded, pixel_mm=pixel, bounds=bounds)
 
 
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
@@ -274,30 +215,14 @@ def _reflection(
     if held_out is None:
         return
     checks.append(
-        page.Check(
+        page.Check.of_shares(
             f"{name}: reflection in held-out directions, median error",
-            100 * held_out.median,
-            100 * reflection.MAX_HELD_OUT_ERROR,
-            "<=",
-            "%",
+            held_out.median,
+            reflection.MAX_HELD_OUT_ERROR,
             f"{held_out.points} points × {held_out.directions} directions",
         )
     )
-    low, high = held_out.interval
-    yield page.Heading("Reflection in directions that no light of the capture had")
-    yield page.table(
-        ("points", "directions", "median error, %", "68 % interval", "in highlights, %"),
-        [
-            (
-                held_out.points,
-                held_out.directions,
-                100 * held_out.median,
-                f"{100 * low:.3g} – {100 * high:.3g}",
-                100 * held_out.highlights,
-            )
-        ],
-        caption="Against the true reflection at points of the surface",
-    )
+    yield page.view("reflection", found=held_out)
     figures = []
     for site, true_image, image in reflection.spheres(appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0

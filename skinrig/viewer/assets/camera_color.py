@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,13 +18,10 @@ from capture.calibration import store
 from capture.calibration.color import matrix as color
 from capture.session import Session, SessionError
 from model import color_table, spectra
+from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import Float64Array
-
-if TYPE_CHECKING:
-    from model.skin import SkinAppearance
-    from skinrig.viewer.scene import SceneSource
-
+from skinrig.viewer.scene import SceneSource
 
 COLOR_KIND: Final = "color"
 CALIBRATION_INPUT_PREFIX: Final = "calibration "
@@ -66,12 +63,11 @@ def of(source: SceneSource) -> CameraColor:
     if folder is not None:
         return _calibrated(folder)
     found = None if path is None else _tabulated(appearance, path)
-    return found or CameraColor(
-        lambda rgb: rgb,
+    shown = (
         "its camera RGB is shown as if it were linear sRGB; --calibration names a folder with a "
-        "color calibration",
-        known=False,
+        "color calibration"
     )
+    return found or CameraColor(lambda rgb: rgb, shown, known=False)
 
 
 def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
@@ -102,14 +98,12 @@ def _calibrated(folder: Path) -> CameraColor:
 
     def convert(rgb: Float64Array) -> Float64Array:
         # maps merge all cameras: so are their colors
-        return np.asarray(
-            np.mean([one.to_linear_srgb(rgb * white) for one, white in cameras], axis=0)
-        )
+        seen = [one.to_linear_srgb(rgb * white) for one, white in cameras]
+        return np.asarray(np.mean(seen, axis=0))
 
     several = f" of {len(cameras)} cameras" if len(cameras) > 1 else ""
-    return CameraColor(
-        convert, f"{folder.name}/{COLOR_KIND}.json{several}, {error:.1f} dE2000 on held-out patches"
-    )
+    quality = f"{error:.1f} dE2000 on held-out patches"
+    return CameraColor(convert, f"{folder.name}/{COLOR_KIND}.json{several}, {quality}")
 
 
 def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:

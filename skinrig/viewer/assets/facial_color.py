@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,20 +11,17 @@ from model.facial_color import HemoglobinRig
 from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.appearances import face_textures
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
-from skinrig.arrays import BoolArray, Float64Array
+from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import camera_color
 from skinrig.viewer.assets.camera_color import CameraColor
-from skinrig.viewer.assets.face_color import RIG_PX, FaceColor
-from skinrig.viewer.assets.placed_color import placed
+from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, placed
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
-
-if TYPE_CHECKING:
-    from rigsim.subject import SimulatedSubject
-
 
 TABLE_NODES: Final = 128
 """Nodes along each axis of the color table."""
@@ -57,17 +54,14 @@ def assets(source: SceneSource) -> Assets:
             **found.facts,
         },
     }
-    left_out = list(found.left_out)
+    left_out = dict(found.left_out)
     if albedo is not None:
         textures["albedo_map"], seen = albedo
         facts["albedo_color"] = seen.provenance
         if not seen.known:
-            left_out.append(("colors of this face", seen.provenance))
-        left_out.append(
-            (
-                "chromophores of this face",
-                "the dome measures color alone: states change it by the ratio of simulated blood",
-            )
+            left_out["colors of this face"] = seen.provenance
+        left_out["chromophores of this face"] = (
+            "the dome measures color alone: states change it by the ratio of simulated blood"
         )
     return {
         "textures": textures,
@@ -75,7 +69,7 @@ def assets(source: SceneSource) -> Assets:
         "tables": {"skin_color": table.rgb.astype(np.float16).astype(np.float32)},
         "facts": facts,
         "params": {"weights": dict.fromkeys([*names[1:], *source.mesh.shapes], 0.0)},
-        "left_out": tuple(left_out),
+        "left_out": tuple(left_out.items()),
     }
 
 
@@ -127,14 +121,11 @@ def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
 
 def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
     """Return the measured albedo, (N, N, 3), of the dome's or a fitted model's folder."""
-    for kind in ("model", "dome"):
-        appearance = source.appearances.get(kind)
-        if appearance is None or ALBEDO_MAP not in appearance.maps:
+    for appearance in source.fitted:
+        if ALBEDO_MAP not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO_MAP]
-        valid: BoolArray = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
-        if found.valid is not None:
-            valid = valid & found.valid
+        valid = face_textures.valid_of(found)
         values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
         seen = camera_color.of(source)
         shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)

@@ -25,17 +25,14 @@ def assets(source: SceneSource) -> Assets:
         For a fitted folder that is damaged.
     """
     found = reflectance_assets.lobes_of(source)
-    left_out: list[tuple[str, str]] = []
+    left_out: dict[str, str] = {}
     textures: dict[str, Texture] = {}
     facts: dict[str, Any] = {}
     names: list[str] = []
     surface = trait_assets.surface_traits(found)
     if surface is None:
-        left_out.append(
-            (
-                "traits of the surface",
-                "the lobes were fitted with other materials than the traits were learned with",
-            )
+        left_out["traits of the surface"] = (
+            "the lobes were fitted with other materials than the traits were learned with"
         )
     else:
         found = surface.lobes
@@ -43,7 +40,7 @@ def assets(source: SceneSource) -> Assets:
         names += surface.pull
     albedo = albedo_trait_assets.albedo_traits(source)
     if isinstance(albedo, str):
-        left_out.append(("traits of the albedo", albedo))
+        left_out["traits of the albedo"] = albedo
     else:
         textures["albedo_traits"] = albedo.texture()
         facts["albedo_traits"] = albedo.facts()
@@ -53,5 +50,5 @@ def assets(source: SceneSource) -> Assets:
         "textures": {**base["textures"], **textures},
         "params": {"traits": dict.fromkeys(names, 0.0)},
         "facts": {**base["facts"], **facts},
-        "left_out": (*base["left_out"], *left_out),
+        "left_out": (*base["left_out"], *left_out.items()),
     }

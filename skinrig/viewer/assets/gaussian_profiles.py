@@ -13,7 +13,7 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 9 (albedo and transluc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +54,11 @@ class GaussianProfile:
     weights: Float64Array
     edge_error: Float64Array
     radial_error: Float64Array
+
+    def facts(self, told: str) -> dict[str, Any]:
+        """Return what the page says of it, and where it comes from, as JSON values."""
+        names = ("variances_mm2", "weights", "edge_error", "radial_error")
+        return {**{name: getattr(self, name).tolist() for name in names}, "told": told}
 
     def edge(self, distance_mm: ArrayLike) -> Float64Array:
         """Return the light at distances from an edge, (..., 3): lit where the distance is > 0.

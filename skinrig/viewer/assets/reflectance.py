@@ -15,7 +15,7 @@ import numpy as np
 from model import color_table, skin_reflectance, spectra
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-from model.skin import SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from model.skin_reflectance import TRANSLUCENCY_MAP
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
@@ -23,7 +23,7 @@ from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.editing import surface_mixtures
 from skinrig.viewer.assets import compact_brdf, gaussian_profiles
-from skinrig.viewer.assets.compact_brdf import LOBES_PER_LOOKUP, CompactBrdf
+from skinrig.viewer.assets.compact_brdf import CompactBrdf
 from skinrig.viewer.assets.gaussian_profiles import GaussianProfile
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
@@ -33,10 +33,10 @@ SHARE_BITS: Final = 7
 """Binary digits of a share in the page: within 0.8 %, a sixth of a fit's own errors."""
 TRANSLUCENCY_PX: Final = 128
 """Texels a side of the map of widths: a probe measures few places, between them it is smooth."""
-FITTED_KINDS: Final = ("model", "dome")
-"""Folders that hold lobes, the better one first."""
 POPULATION_SPACE: Final = "surface"
 """Space of the trait library whose centre is the mean surface of a population."""
+FACIAL_R_D: Final = (0.46, 0.31, 0.23)
+"""R_d of facial skin, Weyrich et al. 2006, figure 11, linear sRGB; it shapes the profile's core."""
 TYPICAL_CHROMOPHORES: Final = (0.03, 0.03)
 """Volume fractions of melanin and hemoglobin, whose color stands in for R_d where there is none:
 the shape of a profile depends little on it."""
@@ -73,28 +73,35 @@ def assemble(source: SceneSource, found: PageLobes) -> Assets:
     """Return the assets of some lobes, which may hold those of traits too."""
     compact = compact_brdf.chosen(found.lobes)
     profile, widths, told = _diffusion_of(source)
+    # the packer turns pictures over; this one's rows stand as the shader counts them
+    rows = np.ascontiguousarray(compact_brdf.atlas(compact)[::-1])
     textures = {
-        "lobe_atlas": Texture(
-            # the packer turns pictures over; this one's rows stand as the shader counts them
-            np.ascontiguousarray(compact_brdf.atlas(compact)[::-1]),
-            "f16",
-        ),
-        "lobe_shares": Texture(rounded(_layers_of(found.shares)), "f16"),
+        "lobe_atlas": Texture(rows, "f16"),
+        "lobe_shares": Texture(rounded(compact_brdf.in_fours(found.shares)), "f16"),
     }
     if widths is not None:
         textures["translucency"] = Texture(widths[..., None], "u8")
     return {
         "textures": textures,
-        "facts": {"reflectance": _facts(found, compact), "profile": _profile_facts(profile, told)},
+        "facts": {"reflectance": _facts(found, compact), "profile": profile.facts(told)},
         "left_out": _left_out(found, told),
     }
 
 
+def default_scattering(source: SceneSource) -> Assets:
+    """Return the profile of the population's mean dipole, for skin of which nothing was measured.
+
+    The page switches between it and that of the fitted reflectance.
+    """
+    depth_mm, told = skin_reflectance.population_mean_mm()
+    profile = gaussian_profiles.fit(FACIAL_R_D, 1.0 / depth_mm)
+    return {"facts": {"scattering": profile.facts(told)}}
+
+
 def lobes_of(source: SceneSource) -> PageLobes:
     """Return the lobes of a face, or of the mean of a population."""
-    for kind in FITTED_KINDS:
-        appearance = source.appearances.get(kind)
-        if appearance is not None and skin_reflectance.BASIS_FILE in appearance.files:
+    for appearance in source.fitted:
+        if skin_reflectance.BASIS_FILE in appearance.files:
             lobes = skin_reflectance.lobes_of(appearance)
             mixtures = surface_mixtures.read(appearance)
             shares = filled(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
@@ -106,23 +113,9 @@ def lobes_of(source: SceneSource) -> PageLobes:
         raise RuntimeError("the packaged traits are of other materials than this package's")
     mix = np.maximum(space.center, 0.0)[None, :]
     total = float(mix.sum())
-    return PageLobes(
-        materials.mixed(mix / total),
-        np.full((1, 1, 1), total, np.float32),
-        mix / total,
-        materials.names,
-        "population",
-    )
-
-
-def _layers_of(shares: Float32Array) -> Float32Array:
-    """Return shares (H, W, K) as layers of four, (L, H, W, 4); what fills them up is 0."""
-    height, width, count = shares.shape
-    groups = -(-count // LOBES_PER_LOOKUP)
-    padded = np.zeros((height, width, groups * LOBES_PER_LOOKUP), np.float32)
-    padded[..., :count] = shares
-    split = padded.reshape(height, width, groups, LOBES_PER_LOOKUP)
-    return np.ascontiguousarray(np.moveaxis(split, 2, 0))
+    shares = np.full((1, 1, 1), total, np.float32)
+    lobes = materials.mixed(mix / total)
+    return PageLobes(lobes, shares, mix / total, materials.names, "population")
 
 
 def rounded(values: Float32Array) -> Float32Array:
@@ -173,14 +166,11 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     told
         Where the translucency comes from, for people.
     """
-    for kind in FITTED_KINDS:
-        appearance = source.appearances.get(kind)
-        if appearance is None:
-            continue
+    for appearance in source.fitted:
         r_d = _mean_albedo(appearance)
         if TRANSLUCENCY_MAP in appearance.maps:
             depth = appearance.maps[TRANSLUCENCY_MAP]
-            known = _valid(depth) & np.isfinite(depth.values).all(-1) & (depth.values > 0).all(-1)
+            known = depth.mask & np.isfinite(depth.values).all(-1) & (depth.values > 0).all(-1)
             if known.any():
                 logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
                 mean = logs[known].astype(np.float64).mean(axis=0)
@@ -199,7 +189,7 @@ def _mean_albedo(appearance: SkinAppearance) -> Float64Array:
     if "r_d" not in appearance.maps:
         return _typical_r_d()
     r_d = appearance.maps["r_d"]
-    good = _valid(r_d) & np.isfinite(r_d.values).all(-1)
+    good = r_d.mask & np.isfinite(r_d.values).all(-1)
     if not good.any():
         return _typical_r_d()
     return np.asarray(np.clip(np.median(r_d.values[good].astype(np.float64), axis=0), 0.01, 0.98))
@@ -217,10 +207,6 @@ def _told(appearance: SkinAppearance) -> str:
     return skin_reflectance.population_mean_mm()[1]
 
 
-def _valid(one: SkinMap) -> BoolArray:
-    return np.ones(one.values.shape[:2], np.bool_) if one.valid is None else one.valid
-
-
 def _blocks(values: Float32Array, step: int) -> Float32Array:
     """Return means over blocks of `step` texels; what is beyond whole blocks is left out."""
     height, width = (size // step * step for size in values.shape[:2])
@@ -233,7 +219,7 @@ def _facts(found: PageLobes, compact: CompactBrdf) -> dict[str, Any]:
     return {
         "origin": found.origin,
         "lobes": found.lobes.size,
-        "slabs": compact.detail,
+        "slabs": compact.slabs,
         "table_bytes": compact.size_bytes,
         "lookups": compact.lookups,
         "rms_error": compact.rms_error,
@@ -242,26 +228,13 @@ def _facts(found: PageLobes, compact: CompactBrdf) -> dict[str, Any]:
     }
 
 
-def _profile_facts(profile: GaussianProfile, told: str) -> dict[str, Any]:
-    return {
-        "variances_mm2": profile.variances_mm2.tolist(),
-        "weights": profile.weights.tolist(),
-        "edge_error": profile.edge_error.tolist(),
-        "radial_error": profile.radial_error.tolist(),
-        "told": told,
-    }
-
-
 def _left_out(found: PageLobes, told: str) -> tuple[tuple[str, str], ...]:
-    rows = []
+    rows = {}
     if found.origin == "population":
-        rows.append(
-            (
-                "lobes of this face",
-                "none are fitted: the fitted reflectance shown is the mean surface of simulated "
-                "people; `skinrig view MODEL` with a dome's maps shows a face's own",
-            )
+        rows["lobes of this face"] = (
+            "none are fitted: the fitted reflectance shown is the mean surface of simulated "
+            "people; `skinrig view MODEL` with a dome's maps shows a face's own"
         )
     if "probe" not in told:
-        rows.append(("translucency of this face", f"no probe measured it: {told}"))
-    return tuple(rows)
+        rows["translucency of this face"] = f"no probe measured it: {told}"
+    return tuple(rows.items())

@@ -28,23 +28,13 @@ def assets(source: SceneSource) -> Assets:
     # hair hides the skin's gloss, as the subject's own renderings have it
     intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
-    left_out: tuple[tuple[str, str], ...] = ()
-    if source.kind in ("dynamic", "dome", "model"):
-        left_out = (
-            (
-                "pores and roughness of this face",
-                "what is drawn of them is simulated; the analytic reflection uses it",
-            ),
-        )
+    why = "what is drawn of them is simulated; the analytic reflection uses it"
+    captured = source.kind in ("dynamic", "dome", "model")
+    fine = FINEST_STEP_WORDS if len(height) >= 2048 else 1
     return {
         "textures": {
-            "relief_height": Texture(
-                height.astype(np.float32),
-                "u8",
-                "mipmap",
-                fine=FINEST_STEP_WORDS if len(height) >= 2048 else 1,
-            ),
+            "relief_height": Texture(height.astype(np.float32), "u8", "mipmap", fine=fine),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
         },
-        "left_out": left_out,
+        "left_out": (("pores and roughness of this face", why),) if captured else (),
     }

@@ -136,7 +136,6 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
     scale = np.where(scale > 0.0, scale, 1.0)
     cosines = gram / scale / scale[:, None]
     np.fill_diagonal(cosines, 1.0)
-    pulls = {name: times @ traits.trait(name).vector / scale for name in names}
     height, width, count = found.shares.shape
     shares = np.zeros((height, width, len(mix)), np.float32)
     shares[..., :count] = found.shares
@@ -144,14 +143,12 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
     table = np.array(mixed.table)
     table[..., :count] = found.lobes.table[..., :count]  # the face's own, bit for bit
     basis = BrdfBasis(table, mixed.names, found.lobes.light_radius_rad)
-    made = LobeTraits(
-        dataclasses.replace(found, lobes=basis, shares=shares, mix=mix),
-        cosines.astype(np.float32),
-        scale.astype(np.float32),
-        {name: pull.astype(np.float32) for name, pull in pulls.items()},
-        {name: _misfit(mix, traits, name) for name in names},
-        {},
-    )
+    lobes = dataclasses.replace(found, lobes=basis, shares=shares, mix=mix)
+    pulls = {name: times @ traits.trait(name).vector / scale for name in names}
+    single = {name: pull.astype(np.float32) for name, pull in pulls.items()}
+    misfit = {name: _misfit(mix, traits, name) for name in names}
+    metric = cosines.astype(np.float32), scale.astype(np.float32)
+    made = LobeTraits(lobes, *metric, single, misfit, {})
     tried = _padded(rows, len(mix))
     errors = {
         name: (_held_error(made, tried, traits, name, -1.0), _held_error(made, tried, traits, name))
@@ -162,19 +159,12 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
 
 def surface_facts(traits: LobeTraits) -> dict[str, Any]:
     """Return what the page needs to know of surface traits; lobes and shares go with the lobes'."""
-    return {
-        "sweeps": DESCENT_SWEEPS,
-        "gram": [float(x) for x in traits.gram.reshape(-1)],
-        "scale": [float(x) for x in traits.scale],
-        "traits": {
-            name: {
-                "pull": [float(x) for x in pull],
-                "misfit": traits.misfit[name],
-                "held_error": list(traits.held_error[name]),
-            }
-            for name, pull in traits.pull.items()
-        },
-    }
+    found = {}
+    for name, pull in traits.pull.items():
+        errors = {"misfit": traits.misfit[name], "held_error": list(traits.held_error[name])}
+        found[name] = {"pull": pull.tolist(), **errors}
+    numbers = {"gram": traits.gram.reshape(-1).tolist(), "scale": traits.scale.tolist()}
+    return {"sweeps": DESCENT_SWEEPS, **numbers, "traits": found}
 
 
 def _some(shares: Float32Array) -> Float64Array:

@@ -7,7 +7,7 @@ them, otherwise fitted to the simulated person's own expressions. The page adds 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,15 +17,11 @@ from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import as_table
 from reconstruction.wrinkles.fit import fit
 from reconstruction.wrinkles.zones import amplitudes, fit_zones
-from rigsim.subject import make_subject
+from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.subject.expressions import EXPRESSION_STRENGTHS
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
-
-if TYPE_CHECKING:
-    from rigsim.subject import SimulatedSubject
-
 
 MAP_PX: Final = 512
 """Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
@@ -77,19 +73,13 @@ def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     neutral = rest.tangent_normal()
     posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSION_STRENGTHS}
     few = min(MASK_PX, size)
-    zones = fit_zones(
-        amplitudes(neutral, posed, size=(few, few)),
-        zones=ZONES_PER_LAYER,
-        rng=np.random.default_rng(subject.seed),
-    )
+    moved = amplitudes(neutral, posed, size=(few, few))
+    rng = np.random.default_rng(subject.seed)
+    zones = fit_zones(moved, zones=ZONES_PER_LAYER, rng=rng)
     # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
     coarse = (min(WEIGHTS_PX, size),) * 2
-    rough = fit(
-        _coarser(neutral, coarse),
-        {name: _coarser(n, coarse) for name, n in posed.items()},
-        zones.masks,
-        size=coarse,
-    )
+    small = {name: _coarser(normals, coarse) for name, normals in posed.items()}
+    rough = fit(_coarser(neutral, coarse), small, zones.masks, size=coarse)
     table = as_table(rough.model().layers[0].table)
     return fit(neutral, posed, zones.masks, size=(size, size), table=table).model()
 
@@ -118,11 +108,8 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
     driven = sorted({name for table in tables for name in table.rows} & set(source.mesh.shapes))
     if not driven:
         rows = ", ".join(tables[0].rows) if tables else "none"
-        return Assets(
-            left_out=(
-                ("wrinkles", f"none of their expressions ({rows}) is a blend shape of the mesh"),
-            )
-        )
+        why = f"none of their expressions ({rows}) is a blend shape of the mesh"
+        return Assets(left_out=(("wrinkles", why),))
     shape = _map_shape(model)
     maps = np.stack([_plane(layer.wrinkle, shape) for layer in model.layers])
     textures = {
@@ -133,24 +120,13 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
         valid = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
         base = np.stack([filled(model.base[..., c], valid) for c in range(2)], axis=-1)
         textures["wrinkle_base"] = Texture(base.astype(np.float32), "u8")
-    return Assets(
-        textures=textures,
-        facts={
-            "wrinkles": {
-                "expressions": driven,
-                "layers": [
-                    {
-                        "zones": list(table.zones),
-                        "rows": {name: list(table.rows[name]) for name in sorted(table.rows)},
-                    }
-                    for table in tables
-                ],
-                "clamp": model.clamp,
-                "origin": origin,
-                "slope_rms": retained_rms(model, shape),
-            }
-        },
-    )
+    layers = [
+        {"zones": list(table.zones), "rows": {n: list(table.rows[n]) for n in sorted(table.rows)}}
+        for table in tables
+    ]
+    facts: dict[str, Any] = {"expressions": driven, "layers": layers}
+    facts |= {"clamp": model.clamp, "origin": origin, "slope_rms": retained_rms(model, shape)}
+    return Assets(textures=textures, facts={"wrinkles": facts})
 
 
 def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:

@@ -10,22 +10,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from rigsim.geometry.atlas import unwrap
-from rigsim.geometry.mesh import build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.viewer.holes import closing as hole_closing
 from skinrig.viewer.holes.closing import Patch
 from skinrig.viewer.scene import Texture, ViewerScene
-
-if TYPE_CHECKING:
-    from rigsim.geometry.mesh import Mesh
-
 
 GRID_CELLS: Final = 512
 """Side of the grid on which empty places are sought."""
@@ -96,26 +92,20 @@ class ClosedMesh:
 
     def summary(self) -> tuple[tuple[str, str], ...]:
         """Return what the page says of it."""
-        rows = []
+        rows = {}
         if self.charts:
             lengths = [chart.patch.length_mm for chart in self.charts]
-            rows.append(
-                (
-                    "surface in holes of the scan",
-                    f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
-                    f"{min(lengths):.0f} to {max(lengths):.0f} mm around "
-                    "could not be measured: smooth patches close them, colored from their rims",
-                )
+            rows["surface in holes of the scan"] = (
+                f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
+                f"{min(lengths):.0f} to {max(lengths):.0f} mm around "
+                "could not be measured: smooth patches close them, colored from their rims"
             )
         if self.left_open_mm:
-            rows.append(
-                (
-                    "holes that stay open",
-                    f"the texture has no room for {len(self.left_open_mm)} of up to "
-                    f"{max(self.left_open_mm):.0f} mm around",
-                )
+            rows["holes that stay open"] = (
+                f"the texture has no room for {len(self.left_open_mm)} of up to "
+                f"{max(self.left_open_mm):.0f} mm around"
             )
-        return tuple(rows)
+        return tuple(rows.items())
 
 
 def closed(mesh: Mesh) -> ClosedMesh:
@@ -190,26 +180,18 @@ def _paint(layer: Float32Array, chart: Chart) -> None:
         return
     rows = (1.0 - chart.rim_uv[:, 1]) * height - 0.5
     columns = chart.rim_uv[:, 0] * width - 0.5
-    rim = np.stack(
-        [
-            ndimage.map_coordinates(plane, [rows, columns], order=1, mode="nearest")
-            for plane in np.moveaxis(layer, -1, 0)
-        ],
-        axis=-1,
-    )
+    planes = np.moveaxis(layer, -1, 0)
+    at = [rows, columns]
+    drawn = [ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in planes]
+    rim = np.stack(drawn, axis=-1)
     values = chart.patch.continued(rim.astype(np.float64))
     reach = chart.radius + PATCH_MARGIN
     x0, y0 = chart.center
     j = np.arange(max(int((x0 - reach) * width), 0), min(int((x0 + reach) * width) + 1, width))
-    i = np.arange(
-        max(int((1 - y0 - reach) * height), 0), min(int((1 - y0 + reach) * height) + 1, height)
-    )
-    disc = np.stack(
-        np.broadcast_arrays(
-            ((j + 0.5) / width - x0)[None, :], (1.0 - (i + 0.5) / height - y0)[:, None]
-        ),
-        axis=-1,
-    )
+    top, bottom = int((1 - y0 - reach) * height), int((1 - y0 + reach) * height) + 1
+    i = np.arange(max(top, 0), min(bottom, height))
+    x, y = np.meshgrid((j + 0.5) / width - x0, 1.0 - (i + 0.5) / height - y0)
+    disc = np.stack([x, y], axis=-1)
     far = np.linalg.norm(disc, axis=-1) / chart.radius
     inside = far * chart.radius <= reach
     # beside the disc what its edge has, for filters

@@ -113,34 +113,27 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
     virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
     virtual = min(virtual, relief_growth.MAX_LATTICE_PX // 2)
     reach = reach_px(table, scale, virtual)
-    below, above = table.sigma_lines_um()
-    return Assets(
-        textures={"relief_patch": Texture(growth.patch[..., None], "u16", "nearest")},
-        tables={
-            "kernel_alpha_breaks": np.asarray([table.alpha_breaks], np.float32),
-            "kernel_alpha_lines": np.asarray(table.alpha_lines, np.float32),
-            "kernel_sigma_lines_mm": 1e-3 * np.asarray([below, above], np.float32),
-            "strained_variance": strained_variance(growth, table).astype(np.float32),
-        },
-        facts={
-            "microstructure": {
-                "pixel_um": growth.pixel_um,
-                "patch_px": growth.patch.shape[0],
-                "cell_px": growth.cell_px,
-                "choices": growth.choices,
-                "seed": growth.seed,
-                "virtual_px": virtual,
-                "levels": relief_growth.GROWN_LEVELS,
-                "reach_px": reach,
-                "stretch_range": list(table.stretch_range),
-                "alpha_limits": list(ALPHA_LIMITS),
-                "variance_stretch_range": list(STRETCH_RANGE),
-                "slope_rms": slope_rms(growth),
-                "source": relief.source,
-                "table": table.source,
-            }
-        },
-    )
+    facts = {
+        **{name: getattr(growth, name) for name in ("pixel_um", "cell_px", "choices", "seed")},
+        "patch_px": growth.patch.shape[0],
+        "virtual_px": virtual,
+        "levels": relief_growth.GROWN_LEVELS,
+        "reach_px": reach,
+        "stretch_range": list(table.stretch_range),
+        "alpha_limits": list(ALPHA_LIMITS),
+        "variance_stretch_range": list(STRETCH_RANGE),
+        "slope_rms": slope_rms(growth),
+        "source": relief.source,
+        "table": table.source,
+    }
+    tables = {
+        "kernel_alpha_breaks": np.asarray([table.alpha_breaks], np.float32),
+        "kernel_alpha_lines": np.asarray(table.alpha_lines, np.float32),
+        "kernel_sigma_lines_mm": 1e-3 * np.asarray(table.sigma_lines_um(), np.float32),
+        "strained_variance": strained_variance(growth, table).astype(np.float32),
+    }
+    patch = Texture(growth.patch[..., None], "u16", "nearest")
+    return Assets(textures={"relief_patch": patch}, tables=tables, facts={"microstructure": facts})
 
 
 def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:

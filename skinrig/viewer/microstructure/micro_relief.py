@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from model.microstructure import FOREHEAD, KernelTable
+from model.skin import SkinAppearance
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
 from skinrig.arrays import BoolArray, Float32Array
-
-if TYPE_CHECKING:
-    from model.skin import SkinAppearance
-
 
 PATCH_PX: Final = 256
 """Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
@@ -53,9 +50,8 @@ def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
     site, entry = sorted(part["sites"].items())[0]
     found = appearance.maps[entry["map"]]
     text = bytes(appearance.files[entry["table"]]).decode("utf-8")
-    valid = np.ones(found.values.shape[:2], bool) if found.valid is None else found.valid
     return MicroRelief(
-        largest_square(np.squeeze(found.values).astype(np.float32), valid),
+        largest_square(np.squeeze(found.values).astype(np.float32), found.mask),
         float(entry["pixel_um"]),
         KernelTable.from_json(text),
         f"{part['source']}: {site}",

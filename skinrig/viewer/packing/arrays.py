@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -80,9 +80,7 @@ def _quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Arr
         return values.astype(kind), np.zeros(shape, np.float32), np.ones(shape, np.float32)
     low, high = values.min(axis=(-3, -2)), values.max(axis=(-3, -2))
     top = 255.0 if storage == "u8" else 65535.0
-    spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
-    share = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
-    words = np.rint(np.clip(share, 0.0, 1.0) * top)
+    words = np.rint(np.clip(_shares(values, low, high), 0.0, 1.0) * top)
     return words.astype(np.uint8 if storage == "u8" else np.uint16), low, high
 
 
@@ -106,25 +104,14 @@ def stored(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
 
 def _unrounded(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
     """Return words of 0 to 255 before rounding, (L, H, W, C)."""
+    return _shares(values, low, high).reshape(-1, *values.shape[-3:]) * 255.0
+
+
+def _shares(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
+    """Return values as shares of the range of each layer and channel."""
     spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
-    share = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
-    return share.reshape(-1, *values.shape[-3:]) * 255.0
-
-
-def as_packed(scene: ViewerScene) -> ViewerScene:
-    """Return the scene as the page holds it: textures and blend shapes after quantization.
-
-    References in tests are computed from this, so that they compare shaders and not storage.
-    """
-    textures = {
-        name: replace(texture, values=dequantize(*stored(texture)))
-        for name, texture in scene.textures.items()
-    }
-    shapes = {
-        name: (words * np.float32(step)).astype(np.float32)
-        for name, (words, step) in _shape_words(scene.mesh).items()
-    }
-    return replace(scene, textures=textures, mesh=replace(scene.mesh, shapes=shapes))
+    shares = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
+    return np.asarray(shares)
 
 
 def pack(scene: ViewerScene) -> Packed:
@@ -136,12 +123,8 @@ def pack(scene: ViewerScene) -> Packed:
     def put(words: Words) -> dict[str, Any]:
         nonlocal offset
         predictor, data = _predicted(words)
-        entry = {
-            "offset": offset,
-            "shape": list(words.shape),
-            "type": words.dtype.str[1:],
-            "predictor": predictor,
-        }
+        kind = words.dtype.str[1:]
+        entry = {"offset": offset, "shape": list(words.shape), "type": kind, "predictor": predictor}
         # typed arrays want offsets in whole words of any size
         padded = data + b"\0" * (-len(data) % 4)
         chunks.append(padded)
@@ -159,13 +142,13 @@ def pack(scene: ViewerScene) -> Packed:
             "weld": put(welded(mesh.positions).astype(kind)[:, None]),
             "shapes": {
                 name: {"step": float(np.float32(step)), "deltas": put(words)}
-                for name, (words, step) in _shape_words(mesh).items()
+                for name, (words, step) in shape_words(mesh).items()
             },
         },
         "textures": {},
         "tables": {name: put(np.asarray(table)) for name, table in sorted(scene.tables.items())},
     }
-    for name, (_, step) in _shape_words(mesh).items():
+    for name, (_, step) in shape_words(mesh).items():
         errors[f"shape {name}"] = 0.5 * float(step)
     for name, texture in sorted(scene.textures.items()):
         words, low, high = stored(texture)
@@ -178,12 +161,8 @@ def pack(scene: ViewerScene) -> Packed:
             errors[f"{name} rms"] = float(np.sqrt(np.mean(off.astype(np.float64) ** 2)))
             turned = np.ascontiguousarray(_unrounded(texture.values, low, high)[:, ::-1])
             coarse, steps = octaves.split(turned, texture.fine)
-            data = {
-                "predictor": "octaves",
-                "fine": texture.fine,
-                "coarse": put(coarse),
-                "steps": put(steps),
-            }
+            data = {"predictor": "octaves", "fine": texture.fine}
+            data |= {"coarse": put(coarse), "steps": put(steps)}
         header["textures"][name] = _texture_entry(texture, low, high) | {"data": data}
     header |= {
         "params": scene.params,
@@ -220,7 +199,8 @@ def _texture_entry(texture: Texture, low: Float32Array, high: Float32Array) -> d
     }
 
 
-def _shape_words(mesh: ViewerMesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+def shape_words(mesh: ViewerMesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+    """Return the words of each blend shape's movement, (V, 3), and the step of one, mm."""
     out = {}
     for name, deltas in mesh.shapes.items():
         step = np.float32(max(float(np.abs(deltas).max()) / SHAPE_BITS, SHAPE_STEP_MM))
@@ -236,14 +216,8 @@ def _predicted(words: Words) -> tuple[str, bytes]:
     # floats as words: those beside each other share sign, exponent and first digits
     little = np.ascontiguousarray(little).view(np.dtype(f"<u{words.dtype.itemsize}"))
     flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
-    best = ("raw", little.tobytes())
-    least = -1
-    for predictor in PREDICTOR_NAMES:
-        data = _bytes_of(_differences(flat, predictor))
-        size = deflating.guessed_size(data)
-        if least < 0 or size < least:
-            least, best = size, (predictor, data)
-    return best
+    tried = {name: _bytes_of(_differences(flat, name)) for name in PREDICTOR_NAMES}
+    return min(tried.items(), key=lambda one: deflating.guessed_size(one[1]))
 
 
 def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:

@@ -13,7 +13,6 @@ from model.skin_reflectance import BASIS_FILE
 from reconstruction.pipeline.dome.lobes import _basis_bytes
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from skinrig.exporting.materials import obj
 from skinrig.exporting.materials.tangents import FramedMesh
 
 collect_ignore = ["materials/read_in_blender.py"]  # of Blender's Python
@@ -71,7 +70,7 @@ def face(**more):
     }
     files = {
         BASIS_FILE: _basis_bytes(materials, 2, {2: (mix, 0.0)}),
-        "mesh.obj": obj.text(FramedMesh.of(mesh), 1.0, "mm").encode(),
+        "mesh.obj": FramedMesh.of(mesh).obj(1.0, "mm").encode(),
     }
     fields = {"maps": maps, "source": "simulated", "files": files, "seed": 5, **more}
     return SkinAppearance(**fields)

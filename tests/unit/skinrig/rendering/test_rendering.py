@@ -11,10 +11,15 @@ from model.skin_reflectance import SkinReflectance, transmitted
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import camera as rendering_camera
-from skinrig.rendering.geometry import GeometryError, own_mesh, parse_mesh, read_mesh
-from skinrig.rendering.render import Light, RenderingError, render
+from skinrig.rendering.geometry import FittedSurface, GeometryError, own_mesh, parse_mesh, read_mesh
+from skinrig.rendering.render import Light, RenderingError
+from skinrig.rendering.render import render as render_laid
 
 FRONT = (0.0, 0.0, 700.0)
+
+
+def render(model, mesh, *shown, rest=None, **options):
+    return render_laid(FittedSurface.of(model, mesh, rest=rest), *shown, **options)
 
 
 def plane(half_mm=50.0, turned=None):
@@ -259,8 +264,6 @@ def test_stretched_skin_has_flatter_relief(matt):
     model = model_on(mesh, matt)
     tilted = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), model.normals.shape)
     model = dataclasses.replace(model, normals=tilted.copy())
-    from skinrig.rendering.geometry import FittedSurface
-
     laid = FittedSurface.of(model, wide, rest=mesh)
     normal = laid.normals[16, 16]
     # the slope 0.6 / 0.8 becomes half as steep; heights are kept, the smooth normal is not scaled

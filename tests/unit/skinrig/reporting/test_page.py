@@ -126,9 +126,8 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
     values = np.arange(100.0).reshape(10, 10)
     valid = np.ones((10, 10), bool)
     valid[:2] = False
-    shown = map_images.scalar_image(
-        "error", values, low=0.0, high=99.0, valid=valid, unit="um", of="height"
-    )
+    drawing = map_images.MapDrawing("height", "um", valid)
+    shown = drawing.scalar("error", values, 0.0, 99.0)
     assert shown.alt == (
         "height, error: median 59.5 um, 90 % of pixels within 23.95 to 95.05, 20 % without a "
         "value; color scale 0 to 99 um"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from fixtures.factored_lobes import factored
 
 from model import dipole, fresnel
 from model.brdf import tables as brdf_tables
@@ -32,8 +33,8 @@ def face() -> PageLobes:
 
 @pytest.fixture(scope="module")
 def forms(face):
-    """All forms of its lobes."""
-    return compact_brdf.measured(face.lobes)
+    """Its lobes as separable factors."""
+    return factored(face.lobes)
 
 
 @pytest.fixture(scope="module")
@@ -44,40 +45,41 @@ def traits(face):
     return found
 
 
-def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face, forms):
+def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face):
     found = compact_brdf.chosen(face.lobes)
     assert max(found.rms_error, found.strong_error) <= compact_brdf.MAX_FORM_ERROR
-    every = {(one.form, one.detail): max(one.rms_error, one.strong_error) for one in forms}
-    coarser = compact_brdf.TRIED_SLABS[compact_brdf.TRIED_SLABS.index(found.detail) - 1]
-    assert every["table", coarser] > compact_brdf.MAX_FORM_ERROR
+    coarser = compact_brdf.TRIED_SLABS[compact_brdf.TRIED_SLABS.index(found.slabs) - 1]
+    table = face.lobes.table[..., :3].astype(np.float64)
+    back = compact_brdf.in_slabs(table, coarser)
+    assert max(compact_brdf.errors(back, table)) > compact_brdf.MAX_FORM_ERROR
 
 
 def test_factors_as_good_as_the_table_need_more_look_ups(face, forms):
     found = compact_brdf.chosen(face.lobes)
-    factors = [one for one in forms if one.form != "table" and one.lookups <= found.lookups]
+    factors = [one for one in forms if one.lookups <= found.lookups]
     assert all(one.rms_error > found.rms_error for one in factors)
     more = [one for one in forms if one.form == "factors"]
     assert min(one.lookups for one in more) > found.lookups
 
 
 def test_errors_of_factors_fall_with_their_rank(forms):
-    by_rank = {one.detail: one.rms_error for one in forms if one.form == "factors"}
+    by_rank = {one.rank: one.rms_error for one in forms if one.form == "factors"}
     assert by_rank[8] < by_rank[2] < by_rank[1]
 
 
 def test_an_atlas_holds_each_lobe_at_its_place(face):
     found = compact_brdf.chosen(face.lobes)
     image = compact_brdf.atlas(found)
-    assert image.shape == (found.detail * 32, 90, 4)
+    assert image.shape == (found.slabs * 32, 90, 4)
     slab, d, h = 5, 17, 40
-    expected = face.lobes.table[d, slab * 12 // found.detail, h, :3]
+    expected = face.lobes.table[d, slab * 12 // found.slabs, h, :3]
     np.testing.assert_allclose(image[slab * 32 + d, h, :3], expected, rtol=1e-3)
     assert not image[..., 3].any()
 
 
 def test_lambertian_lobes_need_no_slabs():
     flat = brdf_tables.tabulate({"flat": lambda light, view: 0.25 + 0.0 * light[..., 2]})
-    assert compact_brdf.chosen(flat).detail == 1
+    assert compact_brdf.chosen(flat).slabs == 1
 
 
 def test_slabs_that_do_not_divide_the_nodes_are_refused(face):

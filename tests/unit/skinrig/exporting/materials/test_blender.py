@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinrig.exporting.images import srgb_curve
+from skinrig.drawing.png import srgb_curve
 from skinrig.exporting.materials import blender, gltf, usd
 from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from skinrig.blend_shapes import meshes as blend_shapes
+from skinrig.drawing.png import srgb_curve
 from skinrig.errors import UsageError
-from skinrig.exporting.images import srgb_curve
 from skinrig.exporting.materials import gltf
 from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import Delivery

@@ -90,8 +90,9 @@ def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, t
     paths = [tmp_path / "x", tmp_path / "y"]
     both = run_comparison.sides(paths)
     assert both is not None
-    assert [name for name, _, _ in image_comparison.pairs(*both)] == ["pictures-front"]
-    assert image_comparison.alone(*both) == [("pictures-side", "A: x")]
+    found = run_comparison.paired(*(run.pictures for run in both))
+    assert [name for name, _, _ in found] == ["pictures-front"]
+    assert run_comparison.alone(*both) == [("pictures-side", "A: x")]
     html = report.make(paths).html
     assert "0 of 1 pictures of both differ" in html
     assert "all that the records say, is the same" in html

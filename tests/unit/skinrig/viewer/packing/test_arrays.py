@@ -6,6 +6,7 @@ import gzip
 
 import numpy as np
 import pytest
+from fixtures.packed_scenes import as_packed
 
 from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.packing import page_text
@@ -76,7 +77,7 @@ def test_a_coarse_finest_octave_keeps_means_and_states_its_error(rng):
     smooth = np.add.outer(np.sin(np.arange(64) / 9.0), np.cos(np.arange(64) / 7.0))
     values = (smooth + 0.1 * rng.normal(size=(64, 64)))[..., None].astype(np.float32)
     step = float(np.ptp(values)) / 255.0
-    found = packing.as_packed(_scene(noise=Texture(values, fine=8))).textures["noise"].values
+    found = as_packed(_scene(noise=Texture(values, fine=8))).textures["noise"].values
     off = found - values
     assert np.abs(off).max() <= (0.5 * 8 + 1.0) * step
     # the error is in the finest octave: means over blocks are far better than texels
@@ -123,7 +124,7 @@ def test_arrays_lie_where_the_header_says(rng):
 
 
 def test_blend_shapes_are_kept_to_a_quarter_of_a_micrometer():
-    packed = packing.as_packed(_scene()).mesh.shapes["smile"]
+    packed = as_packed(_scene()).mesh.shapes["smile"]
     assert np.abs(packed - _scene().mesh.shapes["smile"]).max() <= 0.5 * packing.SHAPE_STEP_MM
 
 
