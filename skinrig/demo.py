@@ -16,7 +16,7 @@ from typing import Any
 
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, plain
-from skinrig.demo_rigs import RIGS, Findings
+from skinrig.demo_rigs import RIGS, Findings, Run
 from skinrig.next_steps import suggest
 from skinrig.waiting_threads import WAITING_ASLEEP
 from skinrig.workspace import scan
@@ -196,7 +196,7 @@ def _run_rig(
 ) -> tuple[Findings, Shares]:
     found = Findings()
     shares: Shares = {}
-    RIGS[rig](out, seed, lambda name: _share(name, shares, console), width_px, found)
+    RIGS[rig](Run(out, seed, lambda name: _share(name, shares, console), width_px, found))
     return found, shares
 
 

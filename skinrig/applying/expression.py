@@ -25,7 +25,8 @@ from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
-from skinrig.errors import UsageError
+from skinrig.capturing.option_values import parse_amounts
+from skinrig.errors import UsageError, one_of
 
 EXPRESSION_KIND = "expression"
 MIN_WEIGHT_SUM = 1e-6
@@ -126,20 +127,10 @@ def parse_weights(text: str) -> dict[str, float]:
     >>> parse_weights("smile=0.7, anger=0.3")
     {'smile': 0.7, 'anger': 0.3}
     """
-    found: dict[str, float] = {}
-    for part in text.split(","):
-        name, equals, number = (piece.strip() for piece in part.partition("="))
-        try:
-            weight = float(number)
-        except ValueError:
-            weight = float("nan")
-        if not (name and equals and np.isfinite(weight)):
-            raise WeightsError(
-                f"weights: got {part.strip()!r}, expected NAME=NUMBER, for example smile=0.7"
-            )
-        if name in found:
-            raise WeightsError(f"weights: {name!r} is given twice")
-        found[name] = weight
+    found = parse_amounts(text.split(","), "weights", error=WeightsError)
+    for name, weight in found.items():
+        if not np.isfinite(weight):
+            raise WeightsError(f"weights: got {name}={weight}, expected a finite number")
     return found
 
 
@@ -178,9 +169,8 @@ def apply_expression(
     ApplyError, FacialColorError, WrinkleError, DynamicAppearanceError, StoreError
         For weights that a part cannot take, or a folder that holds none of the parts.
     """
-    unknown = [name for name in parts if name not in DYNAMIC_PARTS]
-    if unknown:
-        raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(DYNAMIC_PARTS)}")
+    for name in parts:
+        one_of("parts", name, DYNAMIC_PARTS, ApplyError)
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
     expression = normalized(expression)

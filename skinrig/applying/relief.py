@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 import numpy as np
 from scipy import ndimage
@@ -28,6 +28,7 @@ from skinrig.applying.microstructure import apply_microstructure
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
+from skinrig.errors import one_of
 
 REGION_ATLAS_PX: Final = 256
 """Texels a side of the maps that say whose relief is where, and how large pixels are."""
@@ -50,22 +51,6 @@ RELIEF_SOURCES: Final = ("patches", "noise")
 EXTRAPOLATION_MODES: Final = ("hold", "formula")
 MAX_EXR_SIDE_PX: Final = 8192
 """Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
-
-Choice = TypeVar("Choice", bound=str)
-
-
-def one_of(option: str, value: str, choices: tuple[Choice, ...]) -> Choice:
-    """Return an option's value when it is one of the choices.
-
-    Raises
-    ------
-    ApplyError
-        It is none.
-    """
-    for choice in choices:
-        if value == choice:
-            return choice
-    raise ApplyError(f"{option}: got {value!r}, expected one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +123,11 @@ class Relief:
         mesh = blend_shapes.load(path)
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
         shaped, own = _with_states(mesh, list(used))
-        held = one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES)
+        held = one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES, ApplyError)
         kept: Literal["hold", "formula"] = "hold" if held == "hold" else "formula"
         moved = {n: w for n, w in used.items() if n in shaped.shapes}
         aside = out.with_name(f"{out.name}-large")
-        made_of = one_of("synthesize", source, RELIEF_SOURCES)
+        made_of = one_of("synthesize", source, RELIEF_SOURCES, ApplyError)
         return Relief(
             shaped, moved, own, size_px, site, made_of, kept, seed, aside, _sha256(path), progress
         )

@@ -19,13 +19,10 @@ from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float64Array
+from skinrig.calibrating.outcome import CalibratingError, Made, numbered, provenance
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
-
-
-class DomeCalibratingError(ValueError):
-    """Sessions that do not hold what a calibration of the dome needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +45,6 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
     return DomeTargets(board, sphere_radius_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class DomeCalibration:
-    """A calibration of the dome and what to say of it."""
-
-    calibration: store.Calibration
-    summary: tuple[tuple[str, str], ...]
-    findings: tuple[str, ...]
-    """What is wrong with the rig: a moved camera, a dead light, lights in the wrong order."""
-
-
 def calibrate_dome(
     kind: str,
     sessions: Sequence[Session],
@@ -65,7 +52,7 @@ def calibrate_dome(
     created: date,
     *,
     targets: DomeTargets | None = None,
-) -> DomeCalibration:
+) -> Made:
     """Make the calibration "geometry" or "lights" of a dome.
 
     Parameters
@@ -84,14 +71,14 @@ def calibrate_dome(
 
     Raises
     ------
-    DomeCalibratingError
+    CalibratingError
         When the frames that are needed are missing.
     """
     rigs = {session.rig.name for session in sessions}
     if len(rigs) != 1:
-        raise DomeCalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
+        raise CalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
     if "dome" not in sessions[0].rig.boxes:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
         )
     what = targets or DomeTargets()
@@ -106,9 +93,7 @@ def _frames(sessions: Sequence[Session], kind: str) -> Iterator[tuple[int, Sessi
             yield number, session, record
 
 
-def _geometry(
-    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
-) -> DomeCalibration:
+def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
     rig = sessions[0].rig
     sightings: dict[tuple[str, int], Sighting] = {}
     without = 0
@@ -121,7 +106,7 @@ def _geometry(
             pose = SESSION_STEP * number + int(record.index["pose"])
             sightings[record.camera, pose] = sighting
     if not sightings:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             f"sessions: the board was found in none of {without} frames of kind 'charuco'; capture"
             " it (`skinrig simulate dome --target charuco`), or say its squares"
         )
@@ -146,14 +131,9 @@ def _geometry(
             )
         )
     calibration = geometry.to_calibration(
-        found.cameras,
-        rig=rig.name,
-        source=sessions[0].source,
-        created=created,
-        reprojection_px=found.rms_px,
-        inputs={session.id: session.content_hash for session in sessions},
+        found.cameras, reprojection_px=found.rms_px, **provenance(sessions, created)
     )
-    return DomeCalibration(calibration, tuple(summary), findings)
+    return Made(calibration, tuple(summary), findings)
 
 
 def _moved(
@@ -167,9 +147,7 @@ def _moved(
         return ()
 
 
-def _lights(
-    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
-) -> DomeCalibration:
+def _lights(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
     rig = sessions[0].rig
     cameras = geometry.poses_from(store.load(folder, "geometry"), rig)
     table = LightTable.nominal(rig)
@@ -178,7 +156,7 @@ def _lights(
     notes = {}
     kinds = {record.kind for session in sessions for record in session.frames()}
     if not kinds & {"mirror", "white"}:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
             " simulate dome --target mirror`, `--target white`)"
         )
@@ -234,13 +212,9 @@ def _lights(
     else:
         notes["intensities"] = "nominal and relative: no session of the white plate was given"
     calibration = table.to_calibration(
-        rig=rig.name,
-        source=sessions[0].source,
-        created=created,
-        notes={**notes, **{f"finding {k}": text for k, text in enumerate(findings)}},
-        inputs={session.id: session.content_hash for session in sessions},
+        notes={**notes, **numbered(findings)}, **provenance(sessions, created)
     )
-    return DomeCalibration(calibration, tuple(summary), tuple(findings))
+    return Made(calibration, tuple(summary), tuple(findings))
 
 
 def _mirror(
@@ -263,7 +237,7 @@ def _mirror(
             sphere = SESSION_STEP * number + int(record.index["sphere"])
             outlines.setdefault(sphere, {})[record.camera] = edges
     if not outlines:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: no outline of a mirror sphere was found; its frames of the lit dome (index"
             " light = 'outline') must show it darker than what is behind it"
         )
@@ -313,7 +287,7 @@ def _white(
             if sighting is not None:
                 markers[record.camera, SESSION_STEP * number + int(record.index["pose"])] = sighting
     if not markers:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: the white plate's markers were found in no frame lit by several lights"
             " (index light = 'several')"
         )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, cast, get_args
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UnusableError, UsageError, one_of
 
 Labels = Annotated[
     Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
@@ -56,13 +56,12 @@ def analyse_brdf(
 
     Example: skinrig analyse brdf appearance-a appearance-b --labels labels.csv --out analysis
     """
+    from reconstruction.brdf_basis.space import Method
     from skinrig.analysing import brdf as analysing_brdf
 
-    if method not in ("shares", "brdf"):
-        raise UnusableError(f"--method: got {method!r}, expected shares or brdf")
+    how = one_of("--method", method, get_args(Method))
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more")
-    how = cast(Literal["shares", "brdf"], method)
     console = Console(json)
     if appearances:
         found = analysing_brdf.analyse_measured(
@@ -102,8 +101,8 @@ def analyse_brdf(
         ],
     )
     for document in documents:
-        for rank, why in document["left_out"]:
-            console.say(f"left out: {document['name']}, {rank} lobes and more: {why}")
+        left_out = document["left_out"]
+        console.left_out((f"{document['name']}, {r} lobes and more", why) for r, why in left_out)
         if document["points_lost"]:
             console.say(f"{document['name']}: {document['points_lost']} points show no lobe")
     console.say(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")

@@ -30,7 +30,7 @@ from skinrig.commands.options import (
     expand,
     target_of,
 )
-from skinrig.console import Console, counted
+from skinrig.console import Console, counted, picked
 
 if TYPE_CHECKING:
     from skinrig.capturing.acquisition import CaptureOrder
@@ -82,9 +82,7 @@ class CaptureOptions:
             boxes=addresses(self.port or (), "--port"),
             cameras=addresses(self.camera or (), "--camera"),
             subject=subject_of(self.subject, self.consent, self.consent_expires),
-            dry_run=self.dry_run,
-            plan_out=self.plan_out,
-            resume=self.resume,
+            **picked(self, "dry_run", "plan_out", "resume"),
             **more,
         )
 
@@ -266,16 +264,8 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    order = ServeOrder(
-        pty=common.pty,
-        tcp=common.tcp,
-        allow_remote=common.allow_remote,
-        subject=common.subject,
-        size=common.size,
-        seed=common.seed,
-        site=site,
-        resume=common.resume,
-    )
+    options = ("pty", "tcp", "allow_remote", "subject", "size", "seed", "resume")
+    order = ServeOrder(site=site, **picked(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
@@ -290,23 +280,13 @@ def verify(
 
     console = Console(json)
     found = check(session)
-    for text in found.warnings:
-        console.say(f"warning: {text}")
-    for text in found.problems:
-        console.say(f"damaged: {text}")
+    console.each("warning", found.warnings)
+    console.each("damaged", found.problems)
     console.say(
         f"{session}: {'sound' if found.ok else 'DAMAGED'}, {counted(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
-    console.document(
-        "skinrig.verify/1",
-        {
-            "ok": found.ok,
-            "problems": found.problems,
-            "warnings": found.warnings,
-            "frames": found.frames,
-            "bytes": found.bytes,
-        },
-    )
+    figures = picked(found, "ok", "problems", "warnings", "frames", "bytes")
+    console.document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.BAD_INPUT)

@@ -9,7 +9,7 @@ import typer
 
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out
-from skinrig.console import Console, counted
+from skinrig.console import Console, counted, picked
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
@@ -40,10 +40,8 @@ def import_photos(
     console = Console(json)
     person = subject_of(subject, consent, consent_expires)
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
-    for name in done.ignored:
-        console.say(f"ignored: {name}")
+    console.each("assumed", done.assumed)
+    console.each("ignored", done.ignored)
     console.say(
         f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
@@ -57,14 +55,7 @@ def import_photos(
         after = f"verify {place}"
     console.say(f"next: skinrig {after}")
     console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "assumed": done.assumed,
-            "states": done.states,
-            "ignored": done.ignored,
-        },
+        "skinrig.import/1", picked(done, "path", "frames", "assumed", "states", "ignored")
     )
 
 
@@ -95,14 +86,7 @@ def import_mesh(
     console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
     console.document(
         "skinrig.import/1",
-        {
-            "path": done.path,
-            "vertices": done.vertices,
-            "faces": done.faces,
-            "has_uv": done.has_uv,
-            "extent_mm": done.extent_mm,
-            "reopened": done.reopened,
-        },
+        picked(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
     )
 
 
@@ -138,20 +122,16 @@ def import_lp(
         encoding=encoding,  # type: ignore[arg-type]
         mm_per_px=mm_per_px,
     )
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
+    console.each("assumed", done.assumed)
     console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
     console.say(
         f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
     )
     console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "lights": done.lights,
-            "encoding": done.encoding,
-            "mask": done.mask,
-            "assumed": done.assumed,
-        },
+        "skinrig.import/1", picked(done, "path", "frames", "lights", "encoding", "mask", "assumed")
     )
+
+
+def _document(console: Console, done: object, *names: str) -> None:
+    """Print the document of an import: its path, and figures by their names."""
+    console.document("skinrig.import/1", picked(done, "path", *names))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -12,7 +12,7 @@ from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
 from skinrig.commands.options import Json
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.doctor import examine
 from skinrig.waiting_threads import wait_asleep
 
@@ -99,9 +99,7 @@ def doctor(json: Json = False) -> None:
         ("", "what", "state", "to mend"),
         [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
     )
-    rows: list[dict[str, Any]] = [
-        {"what": f.what, "state": f.state, "fine": f.fine, "mend": f.mend} for f in findings
-    ]
+    rows = [picked(f, "what", "state", "fine", "mend") for f in findings]
     console.document("skinrig.doctor/1", {"findings": rows})
     if not all(f.fine for f in findings):
         raise typer.Exit(errors.EXTRA_MISSING)

@@ -119,7 +119,7 @@ def _plan(
     most_lights: int | None = None,
 ) -> None:
     """Choose a plan, print it, and write it."""
-    from skinrig.planning.plans import choose, confirmed, lines
+    from skinrig.planning.plans import choose, lines
     from skinrig.simulating.subject_records import unused_subject_keys
 
     console = Console(common.json)
@@ -146,6 +146,8 @@ def _plan(
         document["subject_unused"] = list(unused)
     reached = choice.reached
     if common.confirm is not None:
+        from skinrig.planning.confirmation import confirmed
+
         found = confirmed(
             choice, common.confirm, subject=subject, seed=seed, progress=console.progress
         )

@@ -10,7 +10,7 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.options import Json, Out
-from skinrig.console import Console, counted
+from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 
@@ -47,21 +47,13 @@ def calibrate(
     console = Console(json)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
     console.rows(("quantity", "value"), done.summary)
-    for text in done.findings:
-        console.say(f"found: {text}")
+    console.each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
             console.say(f"drift: {change}")
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
-    console.document(
-        "skinrig.calibrate/1",
-        {
-            "path": done.path,
-            "values": dict(done.summary),
-            "findings": done.findings,
-            "drift": [str(d) for d in done.drift],
-        },
-    )
+    values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
+    console.document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
 
 def check_rank(rank: int | None, basis: Path | None) -> None:
@@ -159,22 +151,12 @@ def reconstruct(
             hold_out=hold_out,
             rank=rank,
         )
-        for text in done.assumed:
-            console.say(f"assumed: {text}")
+        console.each("assumed", done.assumed)
         console.say(f"run: {', '.join(done.ran) or 'nothing'}")
         console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
-        for what, why in done.left_out:
-            console.say(f"left out: {what} ({why})")
-        made.append(
-            {
-                "path": folder,
-                "ran": done.ran,
-                "reused": done.reused,
-                "left_out": done.left_out,
-                "assumed": done.assumed,
-                "work": [dict(w) for w in done.work],
-            }
-        )
+        console.each("left out", (f"{what} ({why})" for what, why in done.left_out))
+        written = picked(done, "ran", "reused", "left_out", "assumed", "work")
+        made.append({"path": folder, **written})
     console.say(f"next: skinrig report {shell_quote(out)}")
     console.document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}

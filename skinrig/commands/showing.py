@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import STDOUT_MARK, Json, Page, file_to_write
+from skinrig.commands.options import STDOUT_MARK, Json, Page, expand, file_to_write
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
@@ -62,19 +63,51 @@ def report(
     if not piped:
         talk.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
-    console.document(
-        "skinrig.report/1",
-        {
-            "path": out,
-            "bytes": size,
-            "checks": len(done.checks),
-            "missed": missed,
-            "compared": done.compared,
-        },
-    )
+    figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
+    console.document("skinrig.report/1", {**figures, "compared": done.compared})
 
 
+@dataclass(frozen=True, slots=True)
+class FaceOptions:
+    """Geometry and color of the face that is drawn."""
+
+    mesh: Annotated[
+        Path | None,
+        typer.Option(
+            help="The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
+            "blend shapes or without."
+        ),
+    ] = None
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
+            "a simulation has its own."
+        ),
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
+            "were made with, or what its session says of the sensor."
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class HeadOptions:
+    """The simulated head, and the size of all textures."""
+
+    preset: Annotated[
+        str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
+    ] = "III"
+    seed: Annotated[int, typer.Option(help="Seed of a simulated head.")] = 0
+    size: Annotated[int, typer.Option(help="Texels a side of the textures, 64 to 4096.")] = 2048
+
+
+@expand
 def view(
+    *,
     appearance: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -83,27 +116,7 @@ def view(
         ),
     ] = None,
     out: Page = Path("page.html"),
-    mesh: Annotated[
-        Path | None,
-        typer.Option(
-            help="The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
-            "blend shapes or without."
-        ),
-    ] = None,
-    landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            help="Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
-            "a simulation has its own."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
-            "were made with, or what its session says of the sensor."
-        ),
-    ] = None,
+    face: FaceOptions,
     port: Annotated[
         int | None,
         typer.Option(
@@ -118,11 +131,7 @@ def view(
             "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
         ),
     ] = None,
-    preset: Annotated[
-        str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
-    ] = "III",
-    seed: Annotated[int, typer.Option(help="Seed of a simulated head.")] = 0,
-    size: Annotated[int, typer.Option(help="Texels a side of the textures, 64 to 4096.")] = 2048,
+    head: HeadOptions,
     json: Json = False,
 ) -> None:
     """Write one self-contained page that draws a face live: expressions, blood, light, traits.
@@ -142,12 +151,12 @@ def view(
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
     scene = compose(
         appearance or [],
-        mesh=mesh,
-        landmarks=landmarks,
-        calibration=calibration,
-        preset=preset,
-        seed=seed,
-        size=size,
+        mesh=face.mesh,
+        landmarks=face.landmarks,
+        calibration=face.calibration,
+        preset=head.preset,
+        seed=head.seed,
+        size=head.size,
         progress=console.progress,
     )
     document: dict[str, Any]
@@ -157,8 +166,7 @@ def view(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
             f"{document['blend_shapes']} blend shapes; open it in a browser"
         )
-    for what, why in scene.left_out:
-        console.say(f"left out: {what}: {why}")
+    console.left_out(scene.left_out)
     if port is None:
         console.document("skinrig.view/1", document)
     else:

@@ -32,7 +32,7 @@ from skinrig.commands.options import (
     expand,
     target_of,
 )
-from skinrig.console import Console, counted
+from skinrig.console import Console, counted, picked
 from skinrig.next_steps import after_session
 
 if TYPE_CHECKING:
@@ -86,16 +86,9 @@ class SimulateOptions:
         if not self.resume or self.consent or self.consent_expires is not None:
             name = pseudonym(subject, self.seed)
             person = subject_of(name, self.consent or SIMULATED_USES, self.consent_expires)
-        return {
-            "out": self.out,
-            "size": self.size,
-            "seed": self.seed,
-            "subject": subject,
-            "plan": None if self.plan is None else read_plan(self.plan),
-            "resume": self.resume,
-            "person": person,
-            "progress": console.progress,
-        }
+        plan = None if self.plan is None else read_plan(self.plan)
+        order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
+        return order | picked(self, "out", "size", "seed", "resume")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +118,9 @@ class FaceOptions:
         """Return what orders of faces have, by name."""
         from skinrig.capturing.option_values import parse_names
 
-        return {
-            "width_px": self.width,
-            "mesh": self.mesh,
-            "movement": self.movement,
-            "leave_out": parse_names(self.leave_out) or (),
-        }
+        leave_out = parse_names(self.leave_out) or ()
+        order = {"width_px": self.width, "leave_out": leave_out}
+        return order | picked(self, "mesh", "movement")
 
 
 @simulate_app.command("flash", cls=RigCommand)
@@ -251,7 +241,7 @@ def simulate_dome(
         wrapped=wrapped,
         subsurface=subsurface,
         interreflections=interreflections,
-        conditions=parse_amounts(condition, "--condition"),
+        conditions=parse_amounts(condition or (), "--condition", default=1.0),
     )
     _simulate(order, console, target)
 

@@ -52,6 +52,11 @@ class Simulated:
     effects: tuple[Mapping[str, Any], ...] = ()
     """What the scene built and what not, with reasons, see `rigsim.needs.effects.Effect`."""
 
+    @property
+    def truth_name(self) -> str:
+        """Name of the truth's folder; empty without one."""
+        return self.truth.name if self.truth else ""
+
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
         return {one.name: getattr(self, one.name) for one in fields(self)}

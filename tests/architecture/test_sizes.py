@@ -56,9 +56,6 @@ LONG_FUNCTIONS = {
     "skinrig/benchmarks/probe/subsurface.py:batches": 90,
     "skinrig/benchmarks/probe/subsurface.py:tiers": 106,
     "skinrig/benchmarks/probe/translucency.py:sites": 84,
-    "skinrig/commands/export.py:export": 134,
-    "skinrig/commands/rendering.py:render": 157,
-    "skinrig/commands/showing.py:view": 81,
     "skinrig/exporting/sessions/stokes.py:_write": 92,
 }
 MANY_PARAMETERS = {
@@ -75,10 +72,6 @@ MANY_PARAMETERS = {
     "rigsim/scenes/dome/scene.py:__init__": 13,
     "rigsim/scenes/gradient/scene.py:__init__": 13,
     "rigsim/tissue/photon_lanes.py:body": 15,
-    "skinrig/commands/dynamic.py:apply_expression": 17,
-    "skinrig/commands/editing.py:edit": 13,
-    "skinrig/commands/export.py:export": 18,
-    "skinrig/commands/rendering.py:render": 26,
     "skinrig/rendering/render.py:render": 13,
 }
 """What a bound does not fit yet, with its present size, which may only fall."""
