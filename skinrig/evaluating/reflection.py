@@ -18,6 +18,7 @@ from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
 from reconstruction.pipeline.dome.lobes import weight_names
 from reconstruction.surface.estimates import transmitted
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
 from skinrig.evaluating.surface import MAX_MATCH_DISTANCE_MM
@@ -212,8 +213,7 @@ def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float6
 
     if "normals_refined" not in appearance.maps:
         return flat("normals")
-    valid = appearance.maps["normals_refined"].valid
-    good = np.ones(len(texels), bool) if valid is None else valid.reshape(-1)[texels]
+    good = jointly_valid(appearance.maps["normals_refined"]).reshape(-1)[texels]
     return np.where(good[:, None], flat("normals_refined"), flat("normals"))
 
 
@@ -258,11 +258,7 @@ def _texels_for(
     from scipy.spatial import cKDTree
 
     place = appearance.maps["position"]
-    known = np.logical_and.reduce(
-        [np.ones(place.values.shape[:2], bool)]
-        + [m.valid for m in (place, appearance.maps["r_d"]) if m.valid is not None]
-    )
-    texel = np.flatnonzero(known)
+    texel = np.flatnonzero(jointly_valid(place, appearance.maps["r_d"]))
     if not len(texel):
         return np.full(len(wanted), -1, np.intp)
     tree = cKDTree(place.values.reshape(-1, 3)[texel])
