@@ -28,7 +28,7 @@ from skinrig.commands import (
     simulating,
 )
 from skinrig.commands.help import Command, Commands
-from skinrig.commands.options import Json, Out, Seed
+from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console
 from skinrig.next_steps import welcome
 
@@ -58,7 +58,7 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which one.")
     ] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log details to stderr.")] = False,
+    verbose: Annotated[bool, option("Log details to stderr.", "--verbose")] = False,
 ) -> None:
     logging.basicConfig(
         stream=sys.stderr,
@@ -76,8 +76,8 @@ def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
         str,
-        typer.Option(
-            help="Rigs, joined by commas: flash, dome, gradient, probe; default all.",
+        option(
+            "Rigs, joined by commas: flash, dome, gradient, probe; default all.",
             autocompletion=completion.several_rigs,
         ),
     ] = "flash,dome,gradient,probe",

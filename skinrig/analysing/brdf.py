@@ -23,6 +23,7 @@ from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.appearances.face_textures import valid_of
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
@@ -316,9 +317,7 @@ def _measured(
             f"expected {materials.size} ({materials.names[0]}, ...); say --basis DIR where they "
             "were fitted with other files than the built-in ones"
         )
-    known = np.ones(weights[0].values.shape, np.bool_)
-    for one in weights:
-        known &= np.isfinite(one.values) & (True if one.valid is None else one.valid)
+    known = np.logical_and.reduce([valid_of(one) for one in weights])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
         raise AnalysisError(f"{folder}: none of its texels has valid lobes")

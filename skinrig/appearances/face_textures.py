@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -217,12 +216,6 @@ def size_for(side_mm: float, texel_mm: float) -> int:
     128
     """
     return int(2 ** np.clip(math.floor(math.log2(max(side_mm / texel_mm, 1.0))), 6, 10))
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _truth(path: Path, found: SkinAppearance) -> Path | None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, jointly_valid, source_of, versions
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
 from skinrig.errors import UsageError, one_of
@@ -196,12 +195,11 @@ def apply_expression(
     if not done.maps:
         reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
         raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
-    content = (path / store.DOCUMENT_FILE).read_bytes()
     store.write(
         out,
         SkinAppearance(
             maps=done.maps,
-            source=_source(appearance, expression),
+            source=source_of(*_faces(appearance, expression)),
             parameters={
                 "kind": EXPRESSION_KIND,
                 "weights": dict(expression.weights),
@@ -212,11 +210,11 @@ def apply_expression(
                 "figures": _without_times(done.figures),
             },
             inputs={
-                "appearance": hashlib.sha256(content).hexdigest(),
+                "appearance": document_digest(path),
                 **({} if expression.onto is None else expression.onto.hashes),
                 **done.inputs,
             },
-            versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+            versions=versions(),
             left_out=tuple(done.left_out),
             seed=appearance.seed,
         ),
@@ -254,11 +252,6 @@ def _faces(appearance: SkinAppearance, expression: Expression) -> tuple[SkinAppe
     return (appearance,) if other is None else (appearance, other.appearance)
 
 
-def _source(appearance: SkinAppearance, expression: Expression) -> str:
-    both = {one.source for one in _faces(appearance, expression)}
-    return "simulated" if "simulated" in both else "measured"
-
-
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
@@ -293,7 +286,7 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         done.left_out.append(("color", "there is no melanin map"))
         return
     melanin = maps["melanin"]
-    seen = good if melanin.valid is None else good & melanin.valid
+    seen = good & jointly_valid(melanin)
     done.maps["melanin"] = melanin
     done.maps["color"] = SkinMap(
         colors(melanin.values, held, seen),
@@ -337,16 +330,7 @@ def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
 def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     weights = wrinkle_weights(model, expression.weights)
-    if model.clamp != expression.clamp:
-        model = WrinkleModel(
-            model.base,
-            model.layers,
-            expression.clamp,
-            model.valid,
-            model.base_stderr,
-            model.weight_stderr,
-        )
-    shown = model.evaluate(weights)
+    shown = replace(model, clamp=expression.clamp).evaluate(weights)
     done.maps["normals"] = SkinMap(
         shown.normals.astype(np.float32),
         "1",

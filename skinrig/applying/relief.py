@@ -22,6 +22,7 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.subject.expressions import displacement_mm, moves
 from rigsim.subject.face_regions import on_mean_head, region_masks
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.appearances.contents import digest
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
@@ -135,8 +136,8 @@ class Relief:
     def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
         sites = dict(part["sites"])
-        if self.site is not None and self.site not in sites:
-            raise ApplyError(f"site: got {self.site!r}, expected one of {', '.join(sites)}")
+        if self.site is not None:
+            one_of("site", self.site, sites, ApplyError)
         names = [self.site] if self.site is not None else list(sites)
         scale = _scale(self.mesh)
         rng = np.random.default_rng(self.seed)
@@ -222,12 +223,11 @@ class Relief:
 
 def _sha256(path: Path) -> str:
     if path.is_dir():  # OBJ files of a folder
-        digest = hashlib.sha256()
+        total = hashlib.sha256()
         for each in sorted(path.iterdir()):
-            digest.update(each.name.encode() + bytes.fromhex(_sha256(each)))
-        return digest.hexdigest()
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+            total.update(each.name.encode() + bytes.fromhex(_sha256(each)))
+        return total.hexdigest()
+    return digest(path)
 
 
 def _with_states(
@@ -314,7 +314,6 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
         return None
-
     unknown = [name for name in names if name not in SITE_REGIONS]
     if unknown:
         raise ApplyError(
@@ -330,10 +329,8 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
 
 
 def _atlas(mesh: BlendShapeMesh) -> Any:
-
     return unwrap(_face(mesh), REGION_ATLAS_PX)
 
 
 def _face(mesh: BlendShapeMesh) -> Any:
-
     return build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv)

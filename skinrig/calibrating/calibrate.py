@@ -19,6 +19,7 @@ from skinrig.arrays import Float32Array
 from skinrig.calibrating import dome, gradient, probe, white_tile
 from skinrig.calibrating.outcome import CalibratingError, Made, photon_transfer, provenance
 from skinrig.console import picked
+from skinrig.errors import one_of
 
 CALIBRATION_KINDS = (
     "sensor",
@@ -73,10 +74,7 @@ def calibrate(
     NoTileError
         When the frames for "white" show something else than a white tile.
     """
-    if kind not in CALIBRATION_KINDS:
-        raise CalibratingError(
-            f"kind: got {kind!r}, expected one of {', '.join(CALIBRATION_KINDS)}"
-        )
+    one_of("kind", kind, CALIBRATION_KINDS, CalibratingError)
     opened = [Session.open(path) for path in sessions]
     if not opened:
         raise CalibratingError("sessions: got none, expected at least one folder")

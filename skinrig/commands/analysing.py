@@ -8,13 +8,11 @@ from typing import Annotated, cast, get_args
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out
+from skinrig.commands.options import Json, Out, argument, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError, one_of
 
-Labels = Annotated[
-    Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
-]
+Labels = Annotated[Path | None, option("Table name,TRAIT,... of 0 and 1, a line for each face.")]
 
 analyse_app = typer.Typer(cls=Subcommands, help="Analyse faces together.", no_args_is_help=True)
 
@@ -28,24 +26,23 @@ def analyse() -> None:
 def analyse_brdf(
     out: Out,
     appearances: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Maps of dome sessions, with lobes; none: simulated faces."),
+        list[Path] | None, argument("Maps of dome sessions, with lobes; none: simulated faces.")
     ] = None,
     labels: Labels = None,
     basis: Annotated[
-        Path | None, typer.Option(help="Folder of the MERL files the lobes were fitted with.")
+        Path | None, option("Folder of the MERL files the lobes were fitted with.")
     ] = None,
     points: Annotated[
         int | None,
-        typer.Option(
-            help="Texels of each face, default 2000; simulated: points of the one person and of "
+        option(
+            "Texels of each face, default 2000; simulated: points of the one person and of "
             "the seven conditions, default 5000, each of the 87 people having two fifths of it."
         ),
     ] = None,
     method: Annotated[
-        str, typer.Option(help="How lobes are joined: as shares of materials, or as brdf.")
+        str, option("How lobes are joined: as shares of materials, or as brdf.")
     ] = "shares",
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    seed: Annotated[int, option("Of everything random.")] = 0,
     json: Json = False,
 ) -> None:
     """Tell how many lobes the surfaces of faces need, and draw their mean reflection.

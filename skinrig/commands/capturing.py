@@ -27,7 +27,9 @@ from skinrig.commands.options import (
     Size,
     Steps,
     Subject,
+    argument,
     expand,
+    option,
     target_of,
 )
 from skinrig.console import Console, counted, picked
@@ -46,28 +48,26 @@ serve_app = typer.Typer(
     help="Serve a simulated rig, by its name or its TOML file, to any client.",
 )
 
-Eyes = Annotated[
-    str, typer.Option("--eyes", help="The subject's eyes among LEDs: open, closed or shielded.")
-]
+Eyes = Annotated[str, option("The subject's eyes among LEDs: open, closed or shielded.", "--eyes")]
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureOptions:
     """Options of every capture."""
 
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None
+    out: Annotated[Path | None, option("Folder of the session.", "--out")] = None
     port: Annotated[
         list[str] | None, typer.Option(metavar="NAME=URL", help="Address of a box; repeatable.")
     ] = None
     camera: Annotated[
         list[str] | None, typer.Option(metavar="VIEW=URL", help="Address of a camera; repeatable.")
     ] = None
-    plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous"
+    plan: Annotated[Path | None, option("Plan, JSON; default: the rig's own.")] = None
+    subject: Annotated[str, option("Pseudonym of the subject.")] = "anonymous"
     consent: Consent = None
     consent_expires: ConsentExpires = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False
-    plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None
+    dry_run: Annotated[bool, option("Only print the plan.", "--dry-run")] = False
+    plan_out: Annotated[Path | None, option("New file for the plan, JSON.")] = None
     resume: Resume = False
     json: Json = False
 
@@ -95,7 +95,7 @@ def capture_flash(
     sequence: SequenceOptions,
     target: Annotated[str | None, target_of("flash")] = None,
     state: Annotated[
-        list[str] | None, typer.Option(help="State of the face, such as smile; repeatable.")
+        list[str] | None, option("State of the face, such as smile; repeatable.")
     ] = None,
     repeats: Pairs = 1,
 ) -> None:
@@ -133,8 +133,7 @@ def capture_gradient(
     target: Annotated[str | None, target_of("gradient")] = None,
     eyes: Eyes = "open",
     force_limit: Annotated[
-        float | None,
-        typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
+        float | None, option("Greatest force of the caliper on this skin, newton; no default.")
     ] = None,
     angles: Angles = None,
     steps: Steps = None,
@@ -197,20 +196,18 @@ def _capture(
 class ServeOptions:
     """Options of every served rig."""
 
-    pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False
+    pty: Annotated[bool, option("Boxes on a pseudo terminal.", "--pty")] = False
     tcp: Annotated[
-        str, typer.Option(help="Address for cameras and, without --pty, boxes; port 0: a free one.")
+        str, option("Address for cameras and, without --pty, boxes; port 0: a free one.")
     ] = "127.0.0.1:0"
-    allow_remote: Annotated[
-        bool, typer.Option("--allow-remote", help="Let other machines connect.")
-    ] = False
+    allow_remote: Annotated[bool, option("Let other machines connect.", "--allow-remote")] = False
     subject: Subject = "III"
     size: Size = "small"
     seed: Seed = 0
     resume: Annotated[
         Path | None,
-        typer.Option(
-            help="Session that was captured from an earlier server of this rig and seed and is to "
+        option(
+            "Session that was captured from an earlier server of this rig and seed and is to "
             "be gone on with: noise of its shots does not come again."
         ),
     ] = None
@@ -269,9 +266,7 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
-def verify(
-    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")], json: Json = False
-) -> None:
+def verify(session: Annotated[Path, argument("SESSION/ folder.")], json: Json = False) -> None:
     """Check every byte of a session; exit code 3 names what is damaged.
 
     Example: skinrig verify session

@@ -12,7 +12,7 @@ import typer
 
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps, expand
+from skinrig.commands.options import Json, NewMaps, argument, expand, option
 from skinrig.console import Console, picked
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -29,16 +29,16 @@ apply_app = typer.Typer(
 
 @fit_app.command("facial-color", cls=Command)
 def fit_facial_color(
-    sessions: Annotated[list[Path], typer.Argument(help="Flash sessions of one subject.")],
+    sessions: Annotated[list[Path], argument("Flash sessions of one subject.")],
     out: NewMaps,
-    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
+    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(help="Folder with STATE.csv (name,x,y) for each state.")
+        Path | None, option("Folder with STATE.csv (name,x,y) for each state.")
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(help="Radius of the local statistics, px; default: side / 32.")
+        float | None, option("Radius of the local statistics, px; default: side / 32.")
     ] = None,
-    stored_size: Annotated[int, typer.Option(help="Cells a side of scale and bias maps.")] = 256,
+    stored_size: Annotated[int, option("Cells a side of scale and bias maps.")] = 256,
     json: Json = False,
 ) -> None:
     """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
@@ -77,16 +77,14 @@ def fit_facial_color(
 
 @fit_app.command("wrinkles", cls=Command)
 def fit_wrinkles(
-    appearances: Annotated[
-        list[Path], typer.Argument(help="Maps of dome sessions: neutral and expressions.")
-    ],
+    appearances: Annotated[list[Path], argument("Maps of dome sessions: neutral and expressions.")],
     out: NewMaps,
     mask: Annotated[
-        list[Path] | None, typer.Option(help="RGBA picture of four zones; twice for eight.")
+        list[Path] | None, option("RGBA picture of four zones; twice for eight.")
     ] = None,
-    size: Annotated[int, typer.Option(help="Texels a side of the wrinkle map.")] = 256,
-    mask_size: Annotated[int, typer.Option(help="Texels a side of masks that are found.")] = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the search for zones.")] = 0,
+    size: Annotated[int, option("Texels a side of the wrinkle map.")] = 256,
+    mask_size: Annotated[int, option("Texels a side of masks that are found.")] = 64,
+    seed: Annotated[int, option("Seed of the search for zones.")] = 0,
     json: Json = False,
 ) -> None:
     """Fit a wrinkle map, its zones and their weights to normals of expressions.
@@ -106,11 +104,11 @@ def fit_wrinkles(
 @fit_app.command("microstructure", cls=Command)
 def fit_microstructure(
     appearances: Annotated[
-        list[Path], typer.Argument(help="Maps of caliper sessions with heights and kernels.")
+        list[Path], argument("Maps of caliper sessions with heights and kernels.")
     ],
     out: NewMaps,
     paper_table: Annotated[
-        bool, typer.Option("--paper-table", help="The paper's forehead where kernels are too few.")
+        bool, option("The paper's forehead where kernels are too few.", "--paper-table")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -136,18 +134,15 @@ def fit_microstructure(
 class ReliefOptions:
     """Options of the relief that moves with a mesh."""
 
-    size: Annotated[int, typer.Option(help="Pixels a side of the displacement map.")] = 4096
-    site: Annotated[
-        str | None, typer.Option("--site", help="Whose microrelief; default: the first.")
-    ] = None
+    size: Annotated[int, option("Pixels a side of the displacement map.")] = 4096
+    site: Annotated[str | None, option("Whose microrelief; default: the first.", "--site")] = None
     synthesize: Annotated[
-        str,
-        typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space)."),
+        str, option("Neutral relief: patches (measured ones, grown) or noise (in space).")
     ] = "patches"
     extrapolate: Annotated[
-        str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
+        str, option("Beyond the table's stretch range: hold its ends, or formula.")
     ] = "hold"
-    seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0
+    seed: Annotated[int, option("Seed of the grown relief.")] = 0
 
     def relief(
         self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
@@ -173,25 +168,23 @@ class ExpressionOptions:
     """Options of blood, color and wrinkles of an expression."""
 
     parts: Annotated[
-        str | None, typer.Option(help="Of facial_color,wrinkles,microstructure; default: all.")
+        str | None, option("Of facial_color,wrinkles,microstructure; default: all.")
     ] = None
-    normalize: Annotated[
-        bool, typer.Option("--normalize", help="Divide the weights by their sum.")
-    ] = False
+    normalize: Annotated[bool, option("Divide the weights by their sum.", "--normalize")] = False
     clamp: Annotated[
-        str, typer.Option(help="Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
+        str, option("Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
     ] = "unit"
     emotional: Annotated[
-        bool, typer.Option("--emotional", help="Anger reddens, fear pales the whole face.")
+        bool, option("Anger reddens, fear pales the whole face.", "--emotional")
     ] = False
-    gain: Annotated[float, typer.Option(help="One more factor of all blood.")] = 1.0
+    gain: Annotated[float, option("One more factor of all blood.")] = 1.0
     onto: Annotated[
         Path | None,
-        typer.Option(help="Maps of another face (hemoglobin, melanin) that the rig is applied to."),
+        option("Maps of another face (hemoglobin, melanin) that the rig is applied to."),
     ] = None
     landmarks: Annotated[
         list[Path] | None,
-        typer.Option(help="Table name,x,y of the rig's face; a second one of the other face."),
+        option("Table name,x,y of the rig's face; a second one of the other face."),
     ] = None
 
     def expression(self, weights: Mapping[str, float]) -> Expression:
@@ -211,15 +204,14 @@ class ExpressionOptions:
 @apply_app.command("expression", cls=Command)
 @expand
 def apply_expression(
-    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
+    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
     weights: Annotated[
-        str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
+        str, option("States and their weights: smile=0.7,anger=0.3; they sum to one.")
     ],
     out: NewMaps,
     *,
     mesh: Annotated[
-        Path | None,
-        typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it."),
+        Path | None, option("Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it.")
     ] = None,
     chosen: ExpressionOptions,
     moving: ReliefOptions,
@@ -251,9 +243,9 @@ def apply_expression(
 @apply_app.command("microstructure", cls=Command)
 @expand
 def apply_microstructure(
-    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
-    mesh: Annotated[Path, typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF.")],
-    weights: Annotated[str, typer.Option(help="Blend shapes or states: jawOpen=0.5,smile=1.")],
+    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
+    mesh: Annotated[Path, option("Mesh with blend shapes: .npz, OBJ or glTF.")],
+    weights: Annotated[str, option("Blend shapes or states: jawOpen=0.5,smile=1.")],
     out: NewMaps,
     moving: ReliefOptions,
     json: Json = False,
@@ -314,10 +306,10 @@ def fitted(console: Console, model: str, out: Path, found: Mapping[str, Any]) ->
 
 @fit_app.command("reflectance", cls=Command)
 def fit_reflectance(
-    dome: Annotated[Path, typer.Argument(help="Maps of a dome session: normals, r_d, lobes.")],
+    dome: Annotated[Path, argument("Maps of a dome session: normals, r_d, lobes.")],
     out: NewMaps,
     probe: Annotated[
-        Path | None, typer.Argument(help="Maps of a fibre probe session on the same subject.")
+        Path | None, argument("Maps of a fibre probe session on the same subject.")
     ] = None,
     landmarks: Annotated[
         Path | None,

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
-import typer
-
 from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import fitted
-from skinrig.commands.options import Json, NewMaps, Out, Seed, expand
+from skinrig.commands.options import Json, NewMaps, Out, Seed, argument, expand, option
 from skinrig.console import Console, picked
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -19,14 +17,13 @@ if TYPE_CHECKING:
     from skinrig.editing.edit import EditRequest
 
 MerlFolder = Annotated[
-    Path | None, typer.Option(help="Folder of MERL tables that the lobes were fitted with.")
+    Path | None, option("Folder of MERL tables that the lobes were fitted with.")
 ]
 LandmarkFolder = Annotated[
-    Path | None,
-    typer.Option(help="Folder with NAME.csv of each face; default: a simulation's own."),
+    Path | None, option("Folder with NAME.csv of each face; default: a simulation's own.")
 ]
 CommonSize = Annotated[
-    int | None, typer.Option(help="Pixels a side of the common map; default: as the textures.")
+    int | None, option("Pixels a side of the common map; default: as the textures.")
 ]
 
 
@@ -35,37 +32,30 @@ class EditOptions:
     """What is done to a face."""
 
     trait: Annotated[
-        str | None,
-        typer.Option(help="Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait."),
+        str | None, option("Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait.")
     ] = None
     space: Annotated[
-        Path | None,
-        typer.Option(help="Traits that `skinrig fit traits` learned; default: the package's."),
+        Path | None, option("Traits that `skinrig fit traits` learned; default: the package's.")
     ] = None
-    region: Annotated[
-        str, typer.Option(help="Where: face, beard or no-beard; of spots also skin.")
-    ] = "face"
+    region: Annotated[str, option("Where: face, beard or no-beard; of spots also skin.")] = "face"
     mask: Annotated[
-        Path | None,
-        typer.Option(help="Where and how much: .png or .exr over the texture, 0 for nothing."),
+        Path | None, option("Where and how much: .png or .exr over the texture, 0 for nothing.")
     ] = None
     spots: Annotated[
         str | None,
-        typer.Option(
-            help="freckles, moles or follicles to add, KIND=PIGMENT[:NUMBER PER CM2], or with -1 "
+        option(
+            "freckles, moles or follicles to add, KIND=PIGMENT[:NUMBER PER CM2], or with -1 "
             "to take away: freckles=1:3,moles=-1."
         ),
     ] = None
     parts: Annotated[
-        str | None,
-        typer.Option(help="Of albedo,surface; default: those that a trait is known to change."),
+        str | None, option("Of albedo,surface; default: those that a trait is known to change.")
     ] = None
     landmarks: Annotated[
-        Path | None,
-        typer.Option(help="Table name,x,y (texels) or name,x,y,z (mm) of the face's points."),
+        Path | None, option("Table name,x,y (texels) or name,x,y,z (mm) of the face's points.")
     ] = None
     basis: MerlFolder = None
-    iterations: Annotated[int, typer.Option(help="Of matching the albedo's statistics.")] = 5
+    iterations: Annotated[int, option("Of matching the albedo's statistics.")] = 5
     seed: Seed = 0
 
     def request(self) -> EditRequest:
@@ -83,7 +73,7 @@ class EditOptions:
 
 @expand
 def edit(
-    appearance: Annotated[Path, typer.Argument(help="Fitted maps of the dome.")],
+    appearance: Annotated[Path, argument("Fitted maps of the dome.")],
     out: NewMaps,
     chosen: EditOptions,
     json: Json = False,
@@ -113,19 +103,17 @@ def edit(
 
 
 def fit_traits(
-    appearances: Annotated[
-        list[Path], typer.Argument(help="Fitted maps of the dome, a face each.")
-    ],
+    appearances: Annotated[list[Path], argument("Fitted maps of the dome, a face each.")],
     labels: Annotated[
-        Path, typer.Option(help="Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.")
+        Path, option("Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.")
     ],
-    out: Annotated[Path, typer.Option("--out", help="File to write, such as traits.npz.")],
+    out: Annotated[Path, option("File to write, such as traits.npz.", "--out")],
     landmarks: LandmarkFolder = None,
     vectors: Annotated[
-        str, typer.Option(help="What stands for an albedo: quantiles, or histograms as published.")
+        str, option("What stands for an albedo: quantiles, or histograms as published.")
     ] = "quantiles",
     contrast: Annotated[
-        str, typer.Option(help="means of faces with and without, or regression on all traits.")
+        str, option("means of faces with and without, or regression on all traits.")
     ] = "means",
     size: CommonSize = None,
     basis: MerlFolder = None,
@@ -174,12 +162,11 @@ def fit_traits(
 def analyse_albedo(
     out: Out,
     appearances: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Fitted maps of the dome, a face each; none: simulated faces."),
+        list[Path] | None, argument("Fitted maps of the dome, a face each; none: simulated faces.")
     ] = None,
     labels: Labels = None,
     landmarks: LandmarkFolder = None,
-    people: Annotated[int, typer.Option(help="Simulated faces, of 87.")] = 87,
+    people: Annotated[int, option("Simulated faces, of 87.")] = 87,
     size: CommonSize = None,
     seed: Seed = 0,
     json: Json = False,

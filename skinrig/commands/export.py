@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
-
-from skinrig.commands.options import Json, Out, expand
+from skinrig.commands.options import Json, Out, argument, expand, option
 from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError, one_of
 from skinrig.exporting.options import Delivery
@@ -31,34 +29,26 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 class DeliveryOptions:
     """How an appearance is delivered."""
 
-    unit: Annotated[
-        str | None, typer.Option(help="Scene unit: m (default), cm or mm (mtlx, usd).")
-    ] = None
-    normal_y: Annotated[
-        str, typer.Option(help="Green of normal maps: gl is +Y up, dx is -Y (Unreal).")
-    ] = "gl"
-    udim: Annotated[
-        str, typer.Option(help="Names of textures: none, dot (.1001) or underscore (_1001).")
-    ] = "none"
+    unit: Annotated[str | None, option("Scene unit: m (default), cm or mm (mtlx, usd).")] = None
+    normal_y: Annotated[str, option("Green of normal maps: gl is +Y up, dx is -Y (Unreal).")] = "gl"
+    udim: Annotated[str, option("Names of textures: none, dot (.1001) or underscore (_1001).")] = (
+        "none"
+    )
     with_errors: Annotated[
-        bool, typer.Option("--with-errors", help="Standard errors and masks beside the values.")
+        bool, option("Standard errors and masks beside the values.", "--with-errors")
     ] = False
     only: Annotated[
         str | None,
-        typer.Option(
-            help="Names of maps (maps), of up to three states (metahuman), of states (stokes)."
-        ),
+        option("Names of maps (maps), of up to three states (metahuman), of states (stokes)."),
     ] = None
     mesh: Annotated[
-        Path | None,
-        typer.Option(help="Mesh with the maps' texture coordinates and blend shapes, in mm."),
+        Path | None, option("Mesh with the maps' texture coordinates and blend shapes, in mm.")
     ] = None
     onto: Annotated[
-        Path | None, typer.Option(help="Dome's maps whose texture gets the colors (metahuman).")
+        Path | None, option("Dome's maps whose texture gets the colors (metahuman).")
     ] = None
     landmarks: Annotated[
-        list[Path] | None,
-        typer.Option(help="Tables name,x,y of the flash picture, then of that texture."),
+        list[Path] | None, option("Tables name,x,y of the flash picture, then of that texture.")
     ] = None
 
     @property
@@ -80,39 +70,35 @@ class PlaceOptions:
     """The place on the skin whose BRDF is exported."""
 
     at: Annotated[
-        str | None, typer.Option(help="Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
+        str | None, option("Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
     ] = None
-    radius: Annotated[float, typer.Option(help="Average around the place, mm.")] = 0.0
-    without_diffuse: Annotated[
-        bool, typer.Option("--without-diffuse", help="The place's surface alone.")
-    ] = False
+    radius: Annotated[float, option("Average around the place, mm.")] = 0.0
+    without_diffuse: Annotated[bool, option("The place's surface alone.", "--without-diffuse")] = (
+        False
+    )
 
 
 @expand
 def export(
-    source: Annotated[Path, typer.Argument(help="APPEARANCE/ or SESSION/ folder.")],
+    source: Annotated[Path, argument("APPEARANCE/ or SESSION/ folder.")],
     to: Annotated[
         str,
-        typer.Option(
-            help="Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
+        option(
+            "Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
             "Of a session: mhl, frames, lp, stokes, event-model."
         ),
     ],
     out: Out,
     *,
     use: Annotated[
-        str | None, typer.Option(help="What the copy is for; the subjects' consent must cover it.")
+        str | None, option("What the copy is for; the subjects' consent must cover it.")
     ] = None,
     how: DeliveryOptions,
     place: PlaceOptions,
-    camera: Annotated[
-        str | None, typer.Option(help="Whose pictures (lp); default: the one in front.")
-    ] = None,
+    camera: Annotated[str | None, option("Whose pictures (lp); default: the one in front.")] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            help="CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."
-        ),
+        option("CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."),
     ] = None,
     json: Json = False,
 ) -> None:

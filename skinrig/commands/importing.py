@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out, argument, option
 from skinrig.console import Console, counted, picked
 from skinrig.next_steps import shell_quote
 
@@ -19,12 +19,12 @@ import_app = typer.Typer(
 
 @import_app.command("photos", cls=Command)
 def import_photos(
-    directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
+    directory: Annotated[Path, argument("Folder of photographs, or one file.")],
     out: Out,
     rig: Annotated[
-        str | None, typer.Option(help="Rig whose camera took them, so that its calibrations hold.")
+        str | None, option("Rig whose camera took them, so that its calibrations hold.")
     ] = None,
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "unnamed",
+    subject: Annotated[str, option("Pseudonym of the subject.")] = "unnamed",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     json: Json = False,
@@ -61,12 +61,12 @@ def import_photos(
 
 @import_app.command("mesh", cls=Command)
 def import_mesh(
-    file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
-    session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
+    file: Annotated[Path, argument("Scanned mesh: .obj or .ply.")],
+    session: Annotated[Path, option("Session that gets the mesh.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="New folder for a copy, where it is closed.")
+        Path | None, option("New folder for a copy, where it is closed.", "--out")
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
+    unit: Annotated[str, option("Unit of the file: mm, cm, m or inch.")] = "mm",
     json: Json = False,
 ) -> None:
     """Attach a scanned mesh to a session.
@@ -92,18 +92,17 @@ def import_mesh(
 
 @import_app.command("lp", cls=Command)
 def import_lp(
-    directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
+    directory: Annotated[Path, argument("Folder of pictures, one a light.")],
     out: Out,
     lights: Annotated[
-        Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
+        Path | None, option(".lp, list of directions, or folder of a chrome ball.")
     ] = None,
-    mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
+    mask: Annotated[Path | None, option("Picture that is bright at the object.")] = None,
     encoding: Annotated[
-        str, typer.Option(help="How 8-bit and PNG values code light: auto, sRGB or linear.")
+        str, option("How 8-bit and PNG values code light: auto, sRGB or linear.")
     ] = "auto",
     mm_per_px: Annotated[
-        float | None,
-        typer.Option(help="Size of a pixel; then the list's rows are positions in mm."),
+        float | None, option("Size of a pixel; then the list's rows are positions in mm.")
     ] = None,
     json: Json = False,
 ) -> None:

@@ -11,7 +11,7 @@ import typer
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
-from skinrig.commands.options import Json
+from skinrig.commands.options import Json, option
 from skinrig.console import Console, picked
 from skinrig.doctor import examine
 from skinrig.waiting_threads import wait_asleep
@@ -31,19 +31,15 @@ def bench(
         ),
     ] = None,
     stage: Annotated[
-        list[str] | None,
-        typer.Option(help="Stage, or several; repeatable.", autocompletion=completion.stages),
+        list[str] | None, option("Stage, or several; repeatable.", autocompletion=completion.stages)
     ] = None,
     budget: Annotated[
-        float | None, typer.Option(help="Seconds to spend, about; default 600.", show_default=False)
+        float | None, option("Seconds to spend, about; default 600.", show_default=False)
     ] = None,
-    toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
-    extremes: Annotated[
-        bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
-    ] = False,
+    toy: Annotated[bool, option("Smallest sizes, no limits judged.", "--toy")] = False,
+    extremes: Annotated[bool, option("Try stiff and extreme cases instead.", "--extremes")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for bench.json, a table and plots; or extremes.json."),
+        Path | None, option("Folder for bench.json, a table and plots; or extremes.json.", "--out")
     ] = None,
     json: Json = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import Json, Out
+from skinrig.commands.options import Json, Out, argument, option
 from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
@@ -18,22 +18,18 @@ from skinrig.next_steps import shell_quote
 def calibrate(
     kind: Annotated[
         str,
-        typer.Argument(
-            help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
+        argument(
+            "Of the flash rig sensor, color, polarization, white; of the dome geometry, "
             "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
             autocompletion=completion.calibrations,
         ),
     ],
-    sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
+    sessions: Annotated[list[Path], argument("Sessions of the target.")],
     out: Out = Path("calibration"),
-    square_mm: Annotated[
-        float, typer.Option(help="Side of the squares of geometry's board, mm.")
-    ] = 36.0,
-    sphere_mm: Annotated[
-        float, typer.Option(help="Radius of the mirror sphere of lights, mm.")
-    ] = 50.0,
+    square_mm: Annotated[float, option("Side of the squares of geometry's board, mm.")] = 36.0,
+    sphere_mm: Annotated[float, option("Radius of the mirror sphere of lights, mm.")] = 50.0,
     phantom: Annotated[
-        Path | None, typer.Option(help="Certificate (JSON) of the block fibre was measured on.")
+        Path | None, option("Certificate (JSON) of the block fibre was measured on.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -91,31 +87,27 @@ def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="SESSION/ folder.")],
     want: Annotated[
         str,
-        typer.Option(
-            help="Maps, separated by commas; a wrong name lists those there are.",
+        option(
+            "Maps, separated by commas; a wrong name lists those there are.",
             autocompletion=completion.wants,
         ),
     ],
     out: Out,
-    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
-    state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
+    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
+    state: Annotated[str, option("State of the subject.")] = "neutral",
     scan: Annotated[
-        Path | None, typer.Option(help="Mesh of the face, PLY in mm, instead of a dome session's.")
+        Path | None, option("Mesh of the face, PLY in mm, instead of a dome session's.")
     ] = None,
     basis: Annotated[
-        Path | None, typer.Option(help="Folder of MERL tables to fit a dome's lobes with.")
+        Path | None, option("Folder of MERL tables to fit a dome's lobes with.")
     ] = None,
     landmarks: Annotated[
-        Path | None,
-        typer.Option(help="Table name,x,y of a probe's sites in pixels of its 256 x 256 map."),
+        Path | None, option("Table name,x,y of a probe's sites in pixels of its 256 x 256 map.")
     ] = None,
     hold_out: Annotated[
-        str | None,
-        typer.Option(help="A dome's frames that no fit sees: lights=L007,L023,views=C03."),
+        str | None, option("A dome's frames that no fit sees: lights=L007,L023,views=C03.")
     ] = None,
-    rank: Annotated[
-        int | None, typer.Option(help="Lobes that a dome's points share; default 4.")
-    ] = None,
+    rank: Annotated[int | None, option("Lobes that a dome's points share; default 4.")] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.

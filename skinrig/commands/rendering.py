@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, expand
+from skinrig.commands.options import Json, Out, argument, expand, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
@@ -22,59 +22,49 @@ class SceneOptions:
     """What is seen, from where, and under which light."""
 
     view: Annotated[
-        str,
-        typer.Option(help="View of the rig, such as C03, or the camera's place in mm: 0,0,700."),
+        str, option("View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
     ] = "0,0,700"
     light: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Light of the rig (L017), direction towards it (1,1,2) or place in mm "
+        option(
+            "Light of the rig (L017), direction towards it (1,1,2) or place in mm "
             "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
         ),
     ] = None
     environment: Annotated[
-        Path | None, typer.Option(help="Light from everywhere: latitude-longitude OpenEXR map.")
+        Path | None, option("Light from everywhere: latitude-longitude OpenEXR map.")
     ] = None
-    environment_lights: Annotated[
-        int, typer.Option(help="Lights that are drawn from the environment.")
-    ] = 64
+    environment_lights: Annotated[int, option("Lights that are drawn from the environment.")] = 64
     mesh: Annotated[
-        Path | None,
-        typer.Option(help="Another mesh with the maps' texture coordinates: OBJ, PLY or .npz."),
+        Path | None, option("Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.")
     ] = None
-    rig: Annotated[str, typer.Option(help="Rig whose views and lights are named.")] = "dome"
+    rig: Annotated[str, option("Rig whose views and lights are named.")] = "dome"
     calibration: Annotated[
-        Path | None, typer.Option(help="CALIBRATION/ folder; default: the rig as drawn.")
+        Path | None, option("CALIBRATION/ folder; default: the rig as drawn.")
     ] = None
-    size: Annotated[int, typer.Option(help="Columns of the picture.")] = 512
-    fov: Annotated[float, typer.Option(help="Of a camera given by its place: degrees across.")] = (
-        25.0
-    )
-    target: Annotated[str, typer.Option(help="What that camera looks at, mm.")] = "0,0,0"
+    size: Annotated[int, option("Columns of the picture.")] = 512
+    fov: Annotated[float, option("Of a camera given by its place: degrees across.")] = 25.0
+    target: Annotated[str, option("What that camera looks at, mm.")] = "0,0,0"
 
 
 @dataclass(frozen=True, slots=True)
 class EffortOptions:
     """How much is computed, and what light does in the skin."""
 
-    samples: Annotated[int, typer.Option(help="Rays a pixel: 1, 4, 9, 16 ...")] = 4
-    shadow_samples: Annotated[
-        int, typer.Option(help="Points of each light's disc that a ray looks for.")
-    ] = 4
+    samples: Annotated[int, option("Rays a pixel: 1, 4, 9, 16 ...")] = 4
+    shadow_samples: Annotated[int, option("Points of each light's disc that a ray looks for.")] = 4
     light_radius: Annotated[
-        float | None,
-        typer.Option(help="Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10."),
+        float | None, option("Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.")
     ] = None
     subsurface: Annotated[
         str,
-        typer.Option(
-            help="dipole: light spreads in skin; local: it leaves where it entered; none: the "
+        option(
+            "dipole: light spreads in skin; local: it leaves where it entered; none: the "
             "surface alone."
         ),
     ] = "dipole"
     translucency: Annotated[
-        str | None,
-        typer.Option(help="sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173."),
+        str | None, option("sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.")
     ] = None
 
 
@@ -83,11 +73,10 @@ class PictureOptions:
     """Which pictures are made."""
 
     components: Annotated[
-        bool, typer.Option("--components", help="Light from inside and surface apart, too.")
+        bool, option("Light from inside and surface apart, too.", "--components")
     ] = False
     bases: Annotated[
-        str | None,
-        typer.Option(help="Compare numbers of lobes: 1,2,4; more than were fitted cannot be had."),
+        str | None, option("Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.")
     ] = None
     shadow_boundary: Annotated[
         bool,
@@ -98,18 +87,18 @@ class PictureOptions:
         ),
     ] = False
     exposure: Annotated[
-        float | None, typer.Option(help="Factor of the PNGs; default: skin is shown well.")
+        float | None, option("Factor of the PNGs; default: skin is shown well.")
     ] = None
     against: Annotated[
         Path | None,
-        typer.Option(
-            help="Session whose photographs the model was not fitted to (reconstruct --hold-out): "
+        option(
+            "Session whose photographs the model was not fitted to (reconstruct --hold-out): "
             "render what they show, and compare; with --components take the photograph of --view "
             "and --light apart."
         ),
     ] = None
     photographs: Annotated[
-        int, typer.Option(help="With --against: most photographs, even over those held out.")
+        int, option("With --against: most photographs, even over those held out.")
     ] = 24
     ablation: Annotated[
         bool,
@@ -118,13 +107,13 @@ class PictureOptions:
             help="With --against: also compare without each part of the model.",
         ),
     ] = True
-    seed: Annotated[int, typer.Option(help="Of the environment's lights, and of --bases.")] = 0
+    seed: Annotated[int, option("Of the environment's lights, and of --bases.")] = 0
 
 
 @expand
 def render(
     appearance: Annotated[
-        list[Path], typer.Argument(help="Fitted maps of the dome, with lobes; several for --bases.")
+        list[Path], argument("Fitted maps of the dome, with lobes; several for --bases.")
     ],
     out: Out,
     scene: SceneOptions,

@@ -8,7 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import STDOUT_MARK, Json, Page, expand, file_to_write
+from skinrig.commands.options import (
+    STDOUT_MARK,
+    Json,
+    Page,
+    argument,
+    expand,
+    file_to_write,
+    option,
+)
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
@@ -16,7 +24,7 @@ MAX_PORT = 65_535
 
 
 def report(
-    paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
+    paths: Annotated[list[Path], argument("Folders that skinrig wrote.")],
     out: Annotated[
         Path,
         typer.Option(
@@ -73,22 +81,22 @@ class FaceOptions:
 
     mesh: Annotated[
         Path | None,
-        typer.Option(
-            help="The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
+        option(
+            "The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
             "blend shapes or without."
         ),
     ] = None
     landmarks: Annotated[
         Path | None,
-        typer.Option(
-            help="Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
+        option(
+            "Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
             "a simulation has its own."
         ),
     ] = None
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            help="CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
+        option(
+            "CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
             "were made with, or what its session says of the sensor."
         ),
     ] = None
@@ -98,11 +106,11 @@ class FaceOptions:
 class HeadOptions:
     """The simulated head, and the size of all textures."""
 
-    preset: Annotated[
-        str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
-    ] = "III"
-    seed: Annotated[int, typer.Option(help="Seed of a simulated head.")] = 0
-    size: Annotated[int, typer.Option(help="Texels a side of the textures, 64 to 4096.")] = 2048
+    preset: Annotated[str, option("Skin type of a simulated head: I to VI, palest or darkest.")] = (
+        "III"
+    )
+    seed: Annotated[int, option("Seed of a simulated head.")] = 0
+    size: Annotated[int, option("Texels a side of the textures, 64 to 4096.")] = 2048
 
 
 @expand
@@ -110,8 +118,8 @@ def view(
     *,
     appearance: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
+        argument(
+            "Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
             "simulated head."
         ),
     ] = None,
@@ -119,15 +127,15 @@ def view(
     face: FaceOptions,
     port: Annotated[
         int | None,
-        typer.Option(
-            help="Serve the page and its large displacement on this port of this machine alone, 0: "
+        option(
+            "Serve the page and its large displacement on this port of this machine alone, 0: "
             "any free one, in place of writing it."
         ),
     ] = None,
     displacement: Annotated[
         Path | None,
-        typer.Option(
-            help="With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
+        option(
+            "With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
             "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
         ),
     ] = None,

@@ -30,6 +30,7 @@ from skinrig.commands.options import (
     Subject,
     Width,
     expand,
+    option,
     target_of,
 )
 from skinrig.console import Console, counted, picked
@@ -46,16 +47,14 @@ simulate_app = typer.Typer(
 
 States = Annotated[
     list[str] | None,
-    typer.Option(
-        help="State of the face, such as smile or exercise; repeatable.",
+    option(
+        "State of the face, such as smile or exercise; repeatable.",
         autocompletion=completion.states,
     ),
 ]
 OneState = Annotated[
     list[str] | None,
-    typer.Option(
-        help="State of the face, such as smile or exercise; one.", autocompletion=completion.states
-    ),
+    option("State of the face, such as smile or exercise; one.", autocompletion=completion.states),
 ]
 
 
@@ -66,9 +65,9 @@ class SimulateOptions:
     out: Out
     size: Size = "small"
     seed: Seed = 0
-    plan: Annotated[
-        Path | None, typer.Option(help="What is captured of the subject, by `skinrig plan`.")
-    ] = None
+    plan: Annotated[Path | None, option("What is captured of the subject, by `skinrig plan`.")] = (
+        None
+    )
     consent: Consent = None
     consent_expires: ConsentExpires = None
     resume: Resume = False
@@ -95,10 +94,8 @@ class SimulateOptions:
 class FaceOptions:
     """Options of a simulated face."""
 
-    width: Annotated[int | None, typer.Option(help="Pixels across, instead of the size; even.")] = (
-        None
-    )
-    mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None
+    width: Annotated[int | None, option("Pixels across, instead of the size; even.")] = None
+    mesh: Annotated[Path | None, option("Face mesh, .npz or .obj.")] = None
     movement: Annotated[
         bool,
         typer.Option(
@@ -108,8 +105,8 @@ class FaceOptions:
     ] = True
     leave_out: Annotated[
         str | None,
-        typer.Option(
-            help="What of skin is not built although it changes pixels, joined by commas: lateral "
+        option(
+            "What of skin is not built although it changes pixels, joined by commas: lateral "
             "(or subsurface), interreflections, spectral, optics, relief_shadows."
         ),
     ] = None
@@ -143,9 +140,8 @@ def simulate_flash(
     ] = 0.0,
     relaxation: Annotated[
         float | None,
-        typer.Option(
-            help="Time constant of a sequence's blood, s; default 0.02, of exercise 40, of "
-            "alcohol 1200."
+        option(
+            "Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200."
         ),
     ] = None,
 ) -> None:
@@ -176,20 +172,16 @@ def simulate_dome(
     face: FaceOptions,
     subject: Annotated[
         str,
-        typer.Option(
-            help="Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
+        option(
+            "Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
             "simulated population.",
             autocompletion=completion.subjects,
         ),
     ] = "III",
     target: Annotated[str | None, target_of("dome")] = None,
-    lights: Annotated[
-        int | None, typer.Option(help="How many lights; default 48, full all 150.")
-    ] = None,
-    views: Annotated[
-        int | None, typer.Option(help="How many cameras; default 6, full all 16.")
-    ] = None,
-    move: Annotated[bool, typer.Option("--move", help="The face moves.")] = False,
+    lights: Annotated[int | None, option("How many lights; default 48, full all 150.")] = None,
+    views: Annotated[int | None, option("How many cameras; default 6, full all 16.")] = None,
+    move: Annotated[bool, option("The face moves.", "--move")] = False,
     state: OneState = None,
     wrapped: Annotated[
         bool,
@@ -258,8 +250,8 @@ def simulate_gradient(
     steps: Steps = None,
     leave_out: Annotated[
         str | None,
-        typer.Option(
-            help="What of skin is not built although it changes pixels, joined by commas: shadows, "
+        option(
+            "What of skin is not built although it changes pixels, joined by commas: shadows, "
             "lateral, interreflections, optics."
         ),
     ] = None,
@@ -290,8 +282,8 @@ def simulate_probe(
     common: SimulateOptions,
     subject: Annotated[
         str,
-        typer.Option(
-            help="Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
+        option(
+            "Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
             "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
             "sigma_s', 1/mm, and AXIS in degrees.",
             autocompletion=completion.subjects,

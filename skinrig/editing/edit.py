@@ -19,6 +19,7 @@ from model.traits.vectors import MAX_P_VALUE, TraitVector
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
+from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import albedo as editing_albedo
@@ -28,7 +29,7 @@ from skinrig.editing import surface as editing_surface
 from skinrig.editing.albedo import AlbedoEdit
 from skinrig.editing.spots import SpotOrder
 from skinrig.editing.surface_mixtures import SurfaceMixtures
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 
@@ -94,8 +95,7 @@ class EditRequest:
                     "beyond there are no faces that it was learned from"
                 )
         for part in self.parts or ():
-            if part not in EDITABLE_PARTS:
-                raise EditError(f"parts: got {part!r}, expected of {', '.join(EDITABLE_PARTS)}")
+            one_of("parts", part, EDITABLE_PARTS, EditError)
         if self.iterations < 1:
             raise EditError(
                 f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
@@ -174,11 +174,11 @@ def edit(
     face = face_textures.read(path, order.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
-        "appearance": face_textures.digest(path / store.DOCUMENT_FILE),
+        "appearance": document_digest(path),
     }
     for name, file in (("mask", order.mask), ("landmarks", order.landmarks)):
         if file is not None:
-            inputs[name] = face_textures.digest(file)
+            inputs[name] = digest(file)
     if library is not None and library_hash:
         inputs["traits"] = library_hash
     done = edited(face, order, library, progress=progress)

@@ -21,6 +21,7 @@ from model import color_table
 from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.errors import one_of
 
 DOME_CAMERA, DOME_ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
 """Of the dome's camera RGB."""
@@ -136,7 +137,7 @@ def draw(
     SpotError
         For another kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
     """
-    what = _kind(kind)
+    what = SPOT_KINDS[one_of("spots", kind, SPOT_KINDS, SpotError)]
     density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
     for name, value in (("amount", amount), ("density_per_cm2", density)):
         if not (np.isfinite(value) and value >= 0):
@@ -181,12 +182,6 @@ def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Arra
     area = np.linalg.norm(np.cross(both[0], both[1]), axis=-1)
     usual = float(np.median(area[whole])) if whole.any() else 1.0
     return np.where(surface, np.where(whole, np.minimum(area, 9.0 * usual), usual), 0.0)
-
-
-def _kind(kind: str) -> SpotKind:
-    if kind not in SPOT_KINDS:
-        raise SpotError(f"spots: got {kind!r}, expected one of {', '.join(SPOT_KINDS)}")
-    return SPOT_KINDS[kind]
 
 
 def _table() -> ColorTable:

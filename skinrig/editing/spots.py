@@ -17,6 +17,7 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import pigment_spots, spot_removal
+from skinrig.errors import one_of
 from skinrig.traits import albedo_vectors
 
 
@@ -44,10 +45,7 @@ class SpotOrder:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and more than all spots removed."""
-        if self.kind not in pigment_spots.SPOT_KINDS:
-            raise SpotOrderError(
-                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.SPOT_KINDS)}"
-            )
+        one_of("spots", self.kind, pigment_spots.SPOT_KINDS, SpotOrderError)
         if not np.isfinite(self.amount) or self.amount < -1.0:
             raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
 

@@ -9,6 +9,7 @@ import numpy as np
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.evaluating.bounds import cramer_rao
 
@@ -175,7 +176,7 @@ def _row(
     bound: Float64Array | None,
 ) -> MapError:
     chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
-    valid = chosen if estimate.valid is None else chosen & estimate.valid
+    valid = chosen & jointly_valid(estimate)
     pixels = int(np.count_nonzero(chosen))
     value = estimate.values[valid].astype(np.float64)
     true_value = true_values[valid].astype(np.float64)

@@ -13,13 +13,13 @@ import numpy as np
 from model import store
 from model.facial_color import FacialColorError
 from model.facial_color import document as facial_color_document
-from model.skin import SkinMap
 from reconstruction.correspondence import landmark_table
 from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from reconstruction.pipeline.flash import state_images
 from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBloodError
 from reconstruction.pipeline.flash.state_images import Landmarks, Subject
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import jointly_valid
 from skinrig.appearances.dynamic import FACIAL_COLOR, Part
 from skinrig.appearances.state_truth import truth_of_state
 
@@ -130,7 +130,7 @@ def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
     neutral = found.hemoglobin["neutral"]
     errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
     for state, change in found.changes.items():
-        both = _both(change, neutral)
+        both = jointly_valid(change, neutral)
         level = float(neutral.values[both].mean()) if both.any() else float("nan")
         mean = float(change.values[both].mean()) if both.any() else float("nan")
         scale = found.rig.states[state]
@@ -146,14 +146,6 @@ def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
             )
         )
     return rows
-
-
-def _both(a: SkinMap, b: SkinMap) -> Any:
-    good = np.ones(a.values.shape[:2], bool)
-    for one in (a, b):
-        if one.valid is not None:
-            good &= one.valid
-    return good
 
 
 def _landmarks(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, source_of
 from skinrig.appearances.dynamic import MICROSTRUCTURE, Part
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -106,9 +106,9 @@ def fit_microstructure(
     files = {
         f"kernel_table_{site}.json": fit.table.to_json().encode() for site, fit in fits.items()
     }
-    everything = [one for group in by_site.values() for one in group]
+    everything = [one for group in by_site.values() for _, one in group]
     inputs = {
-        f"{site} {number}": hashlib.sha256((path / store.DOCUMENT_FILE).read_bytes()).hexdigest()
+        f"{site} {number}": document_digest(path)
         for site, group in by_site.items()
         for number, (path, _) in enumerate(group)
     }
@@ -117,7 +117,6 @@ def fit_microstructure(
         for site, fit in fits.items()
         if fit.kernels == 0
     )
-    sources = {one.source for _, one in everything}
     dynamic_appearance.add(
         out,
         MICROSTRUCTURE,
@@ -126,12 +125,12 @@ def fit_microstructure(
             files=files,
             parameters={
                 "sites": {site: fit.document() for site, fit in fits.items()},
-                "consent": consent.merge_consent(*(one for _, one in everything)),
+                "consent": consent.merge_consent(*everything),
             },
             inputs=inputs,
-            source="simulated" if "simulated" in sources else "measured",
+            source=source_of(*everything),
             left_out=left_out,
-            seed=everything[0][1].seed,
+            seed=everything[0].seed,
         ),
     )
     if on_message is not None:

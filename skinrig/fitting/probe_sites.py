@@ -15,6 +15,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float32Array, Float64Array
 
 FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
@@ -115,7 +116,7 @@ def place(
     """
     measured = _measured(probe)
     height, width = position.values.shape[:2]
-    known = np.ones((height, width), bool) if position.valid is None else position.valid
+    known = jointly_valid(position)
     if not known.any():
         raise ProbeSiteError("position: got no valid texel, expected those of a face")
     given: dict[str, tuple[float, float]] = {}

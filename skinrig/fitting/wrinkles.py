@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from reconstruction.wrinkles.fit import WrinkleFit, fit
 from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, jointly_valid, source_of
 from skinrig.appearances.dynamic import WRINKLES, Part
 from skinrig.arrays import BoolArray, Float32Array
 
@@ -112,7 +112,6 @@ def fit_wrinkles(
     found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
     folders = [folder for folder, _ in read.values()]
-    sources = {one.source for _, one in read.values()}
     dynamic_appearance.add(
         out,
         WRINKLES,
@@ -133,11 +132,8 @@ def fit_wrinkles(
                     state: one.parameters.get("truth", "") for state, (_, one) in read.items()
                 },
             },
-            inputs={
-                state: hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
-                for state, (folder, _) in read.items()
-            },
-            source="simulated" if "simulated" in sources else "measured",
+            inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
+            source=source_of(*(one for _, one in read.values())),
             left_out=tuple(
                 (state, "whether its texture is that of the others: no mesh lies beside its maps")
                 for state in unchecked
@@ -198,9 +194,7 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
     maps = appearance.maps
     if "normals_tangent" in maps:
         tangent = maps["normals_tangent"]
-        shape = tangent.values.shape[:2]
-        valid = np.ones(shape, bool) if tangent.valid is None else tangent.valid
-        return _as_maps(tangent.values, tangent.stderr, valid)
+        return _as_maps(tangent.values, tangent.stderr, jointly_valid(tangent))
     name = next((name for name in NORMAL_MAPS if name in maps), None)
     if name is None or "position" not in maps:
         raise WrinkleInputError(
@@ -208,10 +202,7 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
             "with `skinrig reconstruct SESSION --want normals_refined`"
         )
     normals, position = maps[name], maps["position"]
-    valid = np.ones(normals.values.shape[:2], bool)
-    for each in (normals, position):
-        if each.valid is not None:
-            valid &= each.valid
+    valid = jointly_valid(normals, position)
     found = tangent_normals(
         normals.values, position.values, valid, stderr=normals.stderr, smoothing_mm=smoothing_mm
     )

@@ -24,7 +24,7 @@ from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import picked
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.written_units import written
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -181,9 +181,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     >>> read_wants("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
-    units = WANTED_UNITS.get(rig)
-    if units is None:
-        raise PlanningError(f"rig: got {rig!r}, expected one of {', '.join(WANTED_UNITS)}")
+    units = WANTED_UNITS[one_of("rig", rig, WANTED_UNITS, PlanningError)]
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):

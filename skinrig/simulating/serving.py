@@ -27,7 +27,7 @@ from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.orders import OptionsError, SimulationError, require_size
-from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.resumption import shots_made
 from skinrig.simulating.subject_records import unused_subject_keys
 
 if TYPE_CHECKING:
@@ -165,7 +165,6 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
-
     scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
     scene.radiance("crossed")
@@ -173,13 +172,11 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
-
     person = subject_file.load_subject(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
-
     try:
         tissue = subject_file.tissue(subject, seed=seed)
     except probe_tissue.TissueError as error:
