@@ -99,18 +99,11 @@ def run_demo(
         bench = run_stages(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
         )
-    document: dict[str, Any] = {
-        "schema": "skinrig.demo/1",
-        "title": "This demo",
-        "tables": [
-            {
-                "title": "Seconds" + (", rigs side by side" if at_once > 1 else ""),
-                "head": ["step", "seconds"],
-                "rows": [[name, round(seconds, 2)] for name, seconds in shares.items()],
-            },
-            *found.tables,
-        ],
-    }
+    spent = Findings()
+    title = "Seconds" + (", rigs side by side" if at_once > 1 else "")
+    spent.add_table(title, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
+    document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
+    document["tables"] = spent.tables + found.tables
     # seconds differ from run to run: they stand in a document of their own, not in the maps
     (out / "demo.json").write_text(json.dumps(plain(document), indent=1), encoding="utf-8")
     with _share("report", shares, console):
@@ -123,11 +116,11 @@ def run_demo(
         [[*row[:3], unit_sign(row[3]), *row[4:]] for row in found.errors],
     )
     console.say("")
-    by_rig = {rig: _sum_of(shares, f"{rig}: ") for rig in asked}
-    console.rows(
-        ("step", "seconds"),
-        [*shares.items(), *((f"all of {rig}", seconds) for rig, seconds in by_rig.items())],
-    )
+    by_rig = [
+        (f"all of {rig}", sum(s for name, s in shares.items() if name.startswith(f"{rig}: ")))
+        for rig in asked
+    ]
+    console.rows(("step", "seconds"), [*shares.items(), *by_rig])
     beside = f", {at_once} rigs side by side" if at_once > 1 else ""
     total_s = time.perf_counter() - began
     console.say(f"\nall of it: {total_s:.1f} s{beside}")
@@ -206,10 +199,6 @@ def _share(name: str, shares: Shares, console: Console) -> Iterator[None]:
     start = time.perf_counter()
     yield
     shares[name] = time.perf_counter() - start
-
-
-def _sum_of(shares: Mapping[str, float], prefix: str) -> float:
-    return sum(seconds for name, seconds in shares.items() if name.startswith(prefix))
 
 
 def _make_room(out: Path) -> None:

@@ -61,12 +61,7 @@ class UnusableError(ValueError):
 
 
 def one_of(
-    name: str,
-    value: str,
-    choices: Iterable[Choice],
-    error: type[Exception] = UnusableError,
-    *,
-    where: str = "",
+    name: str, value: str, choices: Iterable[Choice], error: type[Exception] = UnusableError
 ) -> Choice:
     """Return a value that is one of the choices, else raise an error that names them.
 
@@ -80,8 +75,6 @@ def one_of(
         What it may be.
     error
         Class of the error.
-    where
-        What follows the choices in the message.
 
     Examples
     --------
@@ -92,7 +85,7 @@ def one_of(
     for choice in known:
         if value == choice:
             return choice
-    raise error(f"{name}: got {value!r}, expected one of {', '.join(known)}{where}")
+    raise error(f"{name}: got {value!r}, expected one of {', '.join(known)}")
 
 
 def exit_code(error: BaseException) -> int:

@@ -83,31 +83,19 @@ def capture_session(
     if order.out is None and not order.dry_run:
         raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(plan.steps)} steps, about {seconds:.0f} s")
-    for line in sequence_lines(plan):
+    light: Mapping[str, Any] = {} if rig.leds is None else light_figures(plan, rig)
+    for line in (*sequence_lines(plan), *(light_lines(plan, rig) if light else ())):
         console.say(line)
-    light: Mapping[str, Any] = {}
-    if rig.leds is not None:
-        light = light_figures(plan, rig)
-        for line in light_lines(plan, rig):
-            console.say(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
         console.say(f"{file}: the plan; change it and hand it over with --plan {shell_quote(file)}")
     if order.out is None or order.dry_run:
-        console.rows(
-            ("step", "kind", "settings"),
-            [
-                (s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
-                for s in plan.steps
-            ],
-        )
-        return {
-            "steps": len(plan.steps),
-            "estimated_s": seconds,
-            "captured": 0,
-            "light": light,
-            "plan": plan.to_json(),
-        }
+        steps = plan.steps
+        told = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
+        rows = [(s.id, s.kind, text) for s, text in zip(steps, told, strict=True)]
+        console.rows(("step", "kind", "settings"), rows)
+        figures = {"steps": len(steps), "estimated_s": seconds, "captured": 0, "light": light}
+        return figures | {"plan": plan.to_json()}
     return _run(rig, plan, order.out, order, console)
 
 
@@ -156,8 +144,7 @@ def _run(
         left_out = dict(session.left_out())
     if done.dead_lights:
         console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
-    for reason in dict.fromkeys(left_out.values()):
-        console.say(f"left out: {reason}")
+    console.each("left out", dict.fromkeys(left_out.values()))
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {shell_quote(out)}")
     return {

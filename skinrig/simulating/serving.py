@@ -21,7 +21,7 @@ from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.world.serve import serve
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
@@ -66,9 +66,7 @@ class ServeOrder:
             raise UsageError(f"--tcp: got {self.tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
 
 
-def serve_rig(
-    rig_name: str, order: ServeOrder, console: Console, *, seconds: float | None = None
-) -> None:
+def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
 
     A dome is served with all its lights and cameras at either size: who captures from it uses the
@@ -84,23 +82,14 @@ def serve_rig(
         What is served.
     console
         With ``as_json`` the addresses are one JSON document, with the next step.
-    seconds
-        How long; None serves until Ctrl-C.
     """
     rig = load_rig(rig_name)
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
         raise OptionsError("site: only the gradient rig knows of it; leave it out")
     rig, scene = _served(rig, order)
-    with serve(
-        rig,
-        pty=order.pty,
-        tcp=order.tcp,
-        allow_remote=order.allow_remote,
-        seed=order.seed,
-        scene=scene,
-        shots_made=made,
-    ) as served:
+    asked = picked(order, "pty", "tcp", "allow_remote", "seed")
+    with serve(rig, scene=scene, shots_made=made, **asked) as served:
         after = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": after}
@@ -110,7 +99,7 @@ def serve_rig(
                 print(f"{name} {url}", flush=True)
         print(f"next: {after}\nCtrl-C ends it", file=sys.stderr)
         try:
-            served.wait(seconds)
+            served.wait()
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
             if console.as_json:  # its one document stands there already
