@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -96,10 +96,6 @@ class MicrostructureReport:
     convolution_s: float
     tiles: int
     tiles_before: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report as values for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,15 +219,22 @@ def apply_microstructure(
     if journal is not None:
         journal.close()
     convolution_s = time.perf_counter() - begin
-    report = _report(
-        found,
-        regions,
-        mesh,
-        size,
-        extrapolate,
-        (strain_s, convolution_s),
-        (len(tiles), len(before)),
-        _shares(found, mesh, regions, size, extrapolate),
+    covered, changed, unresolved = _shares(found, mesh, regions, size, extrapolate)
+    report = MicrostructureReport(
+        size_px=size,
+        fitted_range=regions.tables[0].stretch_range,
+        extrapolate=extrapolate,
+        degenerate_share=found.degenerate_share,
+        uv_degenerate_share=found.uv_degenerate_share,
+        uv_turned_share=found.uv_turned_share,
+        covered_share=covered,
+        changed_share=changed,
+        unresolved_share=unresolved,
+        strain_s=strain_s,
+        convolution_s=convolution_s,
+        tiles=len(tiles),
+        tiles_before=len(before),
+        **_stretches(found, regions, mesh, size, extrapolate),
     )
     return AppliedMicrostructure(target, found, report)
 
@@ -262,16 +265,14 @@ def _shares(
     )
 
 
-def _report(
+def _stretches(
     found: MeshStrain,
     regions: KernelRegions,
     mesh: BlendShapeMesh,
     size: tuple[int, int],
     extrapolate: str,
-    seconds: tuple[float, float],
-    tiles: tuple[int, int],
-    shares: tuple[float, float, float],
-) -> MicrostructureReport:
+) -> dict[str, Any]:
+    """Return what of a report is of the vertices: stretch, range, pixels."""
     good = found.valid
     if not good.any():
         raise ApplyMicrostructureError("mesh: no vertex has a triangle with an area and a texture")
@@ -293,29 +294,19 @@ def _report(
             )
         ]
     )
-    return MicrostructureReport(
-        size_px=size,
-        stretch_s=(float(both[0].min()), float(both[0].max())),
-        stretch_t=(float(both[1].min()), float(both[1].max())),
-        fitted_range=regions.tables[0].stretch_range,
-        outside_share=float((below | above).any(axis=0).mean()),
-        below_share=float(below.any(axis=0).mean()),
-        above_share=float(above.any(axis=0).mean()),
-        extrapolate=extrapolate,
-        clipped_share=float(clipped.any(axis=0).mean()),
-        invalid_share=float(1.0 - good.mean()),
-        degenerate_share=found.degenerate_share,
-        uv_degenerate_share=found.uv_degenerate_share,
-        uv_turned_share=found.uv_turned_share,
-        covered_share=float(shares[0]),
-        changed_share=float(shares[1]),
-        unresolved_share=float(shares[2]),
-        pixel_um=float(1e3 / np.median(pixels)),
-        strain_s=seconds[0],
-        convolution_s=seconds[1],
-        tiles=tiles[0],
-        tiles_before=tiles[1],
+    outside, low, high, limited = (
+        float(each.any(axis=0).mean()) for each in (below | above, below, above, clipped)
     )
+    return {
+        "stretch_s": (float(both[0].min()), float(both[0].max())),
+        "stretch_t": (float(both[1].min()), float(both[1].max())),
+        "outside_share": outside,
+        "below_share": low,
+        "above_share": high,
+        "clipped_share": limited,
+        "invalid_share": float(1.0 - good.mean()),
+        "pixel_um": float(1e3 / np.median(pixels)),
+    }
 
 
 def _job(

@@ -322,17 +322,15 @@ def _edit_albedo(work: _Work, parts: LibraryParts, amounts: Mapping[str, float])
     source = work.maps["r_d"]
     _say_unmarked(work)
 
+    region = common_regions.region(order.region, parts.frame)
+    share = masks.feathered(order.region, parts.frame)
+
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
+        rng = np.random.default_rng([order.seed, stream])
+        how: dict[str, Any] = {"iterations": order.iterations, "rng": rng}
+        valid = face_textures.valid_of(source)
         return editing_albedo.edit_albedo(
-            values,
-            face_textures.valid_of(source),
-            chart,
-            space,
-            given,
-            region=common_regions.region(order.region, parts.frame),
-            share=masks.feathered(order.region, parts.frame),
-            iterations=order.iterations,
-            rng=np.random.default_rng([order.seed, stream]),
+            values, valid, chart, space, given, region=region, share=share, **how
         )
 
     found = one(source.values, amounts, 0)

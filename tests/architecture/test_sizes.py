@@ -23,7 +23,6 @@ LONG_MODULES = {
     "rigsim/shading.py": 500,
     "rigsim/skin_patch/stretch.py": 458,
     "skinrig/benchmarks/gradient_rig/microstructure.py": 574,
-    "skinrig/editing/edit.py": 475,
     "skinrig/rendering/figures.py": 456,
 }
 LONG_FUNCTIONS = {
@@ -43,7 +42,6 @@ LONG_FUNCTIONS = {
     "rigsim/scenes/dome/scene.py:__init__": 94,
     "rigsim/tissue/photon_lanes.py:_run": 188,
     "rigsim/tissue/photon_lanes.py:body": 131,
-    "skinrig/applying/relief.py:__call__": 85,
     "skinrig/benchmarks/dome/brdf.py:surface": 83,
     "skinrig/benchmarks/dome/editing.py:editing": 85,
     "skinrig/benchmarks/dome/rendering.py:model": 99,
