@@ -34,29 +34,16 @@ FLASH_SUBJECTS = ("II", "IV")
 """Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
 FLASH_STATES = ("neutral", "anger")
 """States of the first face: what a hemoglobin rig is fitted to."""
+FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
+"""The calibration that each target makes, in the order that they are made."""
 FLASH_WANT = (
-    "melanin",
-    "hemoglobin",
-    "shading",
-    "residual",
-    "diffuse",
-    "picture",
-    "specular_picture",
-    "tsumura_melanin",
-    "tsumura_hemoglobin",
+    *("melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture"),
+    *("tsumura_melanin", "tsumura_hemoglobin"),
 )
 DOME_SUBJECT = "III"
 DOME_WANT = (
-    "half_vector_normals",
-    "normals",
-    "normals_refined",
-    "r_d",
-    "lobe_residual",
-    "samples",
-    "basis_weight_0",
-    "basis_weight_1",
-    "basis_weight_2",
-    "basis_weight_3",
+    *("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples"),
+    *(f"basis_weight_{lobe}" for lobe in range(4)),
 )
 DOME_HELD_OUT = "lights=16,23"
 """Lights, by number, whose photographs no fit sees: renderings are compared with them."""
@@ -146,15 +133,10 @@ def _flash(run: Run) -> None:
     """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
     found, width = run.found, run.width_px
     with run.share("flash: capture the calibration targets"):
-        for target in ("flat", "white", "chart", "malus"):
+        for target in FLASH_CALIBRATIONS:
             run.simulate("flash", target, target=target, width_px=width)
     with run.share("flash: calibrate"):
-        for kind, target in (
-            ("sensor", "flat"),
-            ("white", "white"),
-            ("color", "chart"),
-            ("polarization", "malus"),
-        ):
+        for target, kind in FLASH_CALIBRATIONS.items():
             run.calibrate("flash", kind, target)
     captures: list[Simulated] = []
     with run.share("flash: capture two faces"):

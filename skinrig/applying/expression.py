@@ -270,13 +270,8 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     )
     good = blend.valid
     held = np.where(good, blend.hemoglobin, 0.0).astype(np.float32)
-    done.maps["hemoglobin"] = SkinMap(
-        held,
-        MAP_UNITS["hemoglobin"],
-        np.where(good, blend.stderr, 0.0).astype(np.float32),
-        good,
-        "blend of measured states",
-    )
+    unit, stderr = MAP_UNITS["hemoglobin"], np.where(good, blend.stderr, 0.0).astype(np.float32)
+    done.maps["hemoglobin"] = SkinMap(held, unit, stderr, good, "blend of measured states")
     done.figures[FACIAL_COLOR] = {
         "clipped_fraction": blend.clipped_fraction,
         "valid_fraction": float(good.mean()),
@@ -288,13 +283,8 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     melanin = maps["melanin"]
     seen = good & jointly_valid(melanin)
     done.maps["melanin"] = melanin
-    done.maps["color"] = SkinMap(
-        colors(melanin.values, held, seen),
-        "1",
-        None,
-        seen,
-        f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1",
-    )
+    note = f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1"
+    done.maps["color"] = SkinMap(colors(melanin.values, held, seen), "1", None, seen, note)
 
 
 def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinRig:
@@ -331,13 +321,8 @@ def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied)
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     weights = wrinkle_weights(model, expression.weights)
     shown = replace(model, clamp=expression.clamp).evaluate(weights)
-    done.maps["normals"] = SkinMap(
-        shown.normals.astype(np.float32),
-        "1",
-        None,
-        shown.valid,
-        "tangent space of the texture, +X right, +Y up",
-    )
+    note = "tangent space of the texture, +X right, +Y up"
+    done.maps["normals"] = SkinMap(shown.normals, "1", None, shown.valid, note)
     done.figures[WRINKLES] = {
         "weights": weights,
         "zone_weights": [zones.tolist() for zones in shown.zone_weights],
@@ -359,19 +344,14 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
     rows = {name for layer in model.layers for name in layer.table.rows}  # type: ignore[union-attr]
     found: dict[str, float] = {}
     for state, weight in weights.items():
-        if state in rows:
-            row: str | None = state
-        elif state in ROW_OF_STATE:
-            row = ROW_OF_STATE[state]
-            if row is not None and row not in rows:
-                raise ApplyError(
-                    f"weights: wrinkles were not fitted to {state!r}, expected out of "
-                    f"{', '.join(sorted(rows))}; leave them out with --parts "
-                    "facial_color,microstructure"
-                )
-        else:
+        if state not in rows and state not in ROW_OF_STATE:
+            one_of("weights", state, sorted(rows), ApplyError)
+        row = state if state in rows else ROW_OF_STATE[state]
+        if row is not None and row not in rows:
             raise ApplyError(
-                f"weights: got state {state!r}, expected out of {', '.join(sorted(rows))}"
+                f"weights: wrinkles were not fitted to {state!r}, expected out of "
+                f"{', '.join(sorted(rows))}; leave them out with --parts "
+                "facial_color,microstructure"
             )
         if row is not None:
             found[row] = found.get(row, 0.0) + weight

@@ -309,14 +309,6 @@ def _white(
             continue
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
-        samples.append(
-            window.sample(
-                shot.rgb,
-                shot.variance,
-                shot.valid,
-                view=record.camera,
-                light=str(record.settings["light"]),
-                on_s=on_s,
-            )
-        )
+        light, seen = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
+        samples.append(window.sample(*seen, view=record.camera, light=light, on_s=on_s))
     return samples

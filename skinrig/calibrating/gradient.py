@@ -156,11 +156,9 @@ def _light_s(record: FrameRecord) -> float:
 
 def _reading_deg(record: FrameRecord) -> float:
     asked = record.settings.get("analyser_deg")
-    return (
-        float(asked)
-        if asked is not None
-        else ANALYZER_READING_DEG[str(record.settings["polarizer"])]
-    )
+    if asked is not None:
+        return float(asked)
+    return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
 
 
 def _flat_field(

@@ -147,15 +147,9 @@ def _run(
     console.each("left out", dict.fromkeys(left_out.values()))
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {shell_quote(out)}")
-    return {
-        "session": out,
-        "captured": done.frames,
-        "retakes": done.retakes,
-        "stale_frames": done.stale,
-        "steps": len(plan.steps),
-        "dead_lights": done.dead_lights,
-        "left_out": left_out,
-    }
+    figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
+    figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
+    return figures | {"dead_lights": done.dead_lights, "left_out": left_out}
 
 
 def _open_devices(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -61,26 +61,16 @@ def analyse_brdf(
         raise UnusableError(f"--points: got {points}, expected 20 or more")
     console = Console(json)
     if appearances:
-        found = analysing_brdf.analyse_measured(
-            out,
-            appearances,
-            labels=labels,
-            basis=basis,
-            points_each=points or analysing_brdf.N_POINTS_PER_FACE,
-            method=how,
-            seed=seed,
-        )
+        each = points or analysing_brdf.N_POINTS_PER_FACE
+        given: dict[str, Any] = {"labels": labels, "basis": basis, "method": how, "seed": seed}
+        found = analysing_brdf.analyse_measured(out, appearances, points_each=each, **given)
     elif labels is not None or basis is not None:
         raise UsageError("--labels, --basis: are of measured faces; name their folders")
     else:
         some = points or analysing_brdf.N_POINTS_PER_DATASET
+        each = max(1, round(0.4 * some))
         found = analysing_brdf.analyse_simulated(
-            out,
-            points=some,
-            points_each=max(1, round(0.4 * some)),
-            method=how,
-            seed=seed,
-            progress=console.progress,
+            out, points=some, points_each=each, method=how, seed=seed, progress=console.progress
         )
     documents = [one.document() for one in found]
     console.rows(

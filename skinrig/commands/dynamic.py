@@ -150,17 +150,9 @@ class ReliefOptions:
         """Return what evaluates the relief on a mesh under weights of its shapes."""
         from skinrig.applying.relief import Relief
 
-        return Relief.of(
-            mesh,
-            weights,
-            size_px=self.size,
-            site=self.site,
-            source=self.synthesize,
-            extrapolate=self.extrapolate,
-            seed=self.seed,
-            out=out,
-            progress=console.progress,
-        )
+        given = picked(self, "site", "extrapolate", "seed")
+        given |= {"size_px": self.size, "source": self.synthesize}
+        return Relief.of(mesh, weights, out=out, progress=console.progress, **given)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import typer
 from skinrig import errors
 from skinrig.commands.help import RigCommand, RigGroup
 from skinrig.commands.options import Json, Subject, expand, file_to_write, option
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.next_steps import shell_quote
 from skinrig.written_units import written
 
@@ -127,16 +127,8 @@ def _plan(
             f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
         )
     unused = unused_subject_keys(subject, rig, console.progress)
-    choice = choose(
-        rig,
-        want,
-        subject=subject,
-        seed=seed,
-        width_px=width,
-        most_lights=most_lights,
-        valid_share=common.valid_share,
-        forecast=common.forecast,
-    )
+    asked = picked(common, "subject", "seed", "valid_share", "forecast")
+    choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
     for line in lines(choice):
         console.say(line)
     document = choice.to_document()

@@ -17,7 +17,7 @@ from skinrig.commands.options import (
     file_to_write,
     option,
 )
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
 MAX_PORT = 65_535
@@ -157,16 +157,9 @@ def view(
         raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}")
     if displacement is not None and port is None:
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
-    scene = compose(
-        appearance or [],
-        mesh=face.mesh,
-        landmarks=face.landmarks,
-        calibration=face.calibration,
-        preset=head.preset,
-        seed=head.seed,
-        size=head.size,
-        progress=console.progress,
-    )
+    given = picked(face, "mesh", "landmarks", "calibration")
+    given |= picked(head, "preset", "seed", "size")
+    scene = compose(appearance or [], progress=console.progress, **given)
     document: dict[str, Any]
     if port is None:
         document = write(scene, out)

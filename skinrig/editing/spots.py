@@ -65,14 +65,14 @@ def added(
     face: Face, source: SkinMap, spot: SpotOrder, share: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots drawn in, and what was done, as JSON values."""
+    place, density = (face.position, face.surface), spot.density_per_cm2
     drawn = pigment_spots.draw(
         spot.kind,
         source.values,
-        face.position,
-        face.surface,
+        *place,
         share,
         amount=spot.amount,
-        density_per_cm2=spot.density_per_cm2,
+        density_per_cm2=density,
         rng=rng,
     )
     gain = _bled(drawn.gain, face.surface, share)
@@ -89,13 +89,8 @@ def removed(
     source: SkinMap, spot: SpotOrder, share: Float32Array, chart: Chart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots filled from around, and what was done, as JSON values."""
-    found = spot_removal.find(
-        source.values,
-        face_textures.valid_of(source),
-        chart,
-        pixel_mm=frame.pixel_mm,
-        range_mm=pigment_spots.SPOT_KINDS[spot.kind].range_mm,
-    )
+    valid, sizes = face_textures.valid_of(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
+    found = spot_removal.find(source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes)
     part = (np.float32(-spot.amount) * share * found.share)[..., None]
     wanted = source.values * (1 - part) + found.fill * part
     ratio = np.where(

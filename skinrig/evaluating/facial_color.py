@@ -144,15 +144,10 @@ def compare(
         both = seen & jointly_valid(change, rest)
         moved = true.values.astype(np.float64) - rest.values
         got = change.values.astype(np.float64)
-        changes.append(
-            ChangeError(
-                state,
-                float(moved[both].mean()),
-                float(got[both].mean()),
-                float(np.sqrt(np.mean((got - moved)[both] ** 2))),
-                metrics.coverage(got[both], change.stderr[both], moved[both]).share,
-            )
-        )
+        moved, got = moved[both], got[both]
+        rms = float(np.sqrt(np.mean((got - moved) ** 2)))
+        held = metrics.coverage(got, change.stderr[both], moved).share
+        changes.append(ChangeError(state, float(moved.mean()), float(got.mean()), rms, held))
     return states, changes
 
 
@@ -171,13 +166,5 @@ def _row(
     held = float("nan")
     if stderr is not None:
         held = metrics.coverage(found, stderr[seen].astype(np.float64), real).share
-    return StateError(
-        state,
-        way,
-        median,
-        interval,
-        float(np.sqrt(np.mean((found - real) ** 2))),
-        float(np.median(relative)),
-        held,
-        int(seen.sum()),
-    )
+    rms, bias = float(np.sqrt(np.mean((found - real) ** 2))), float(np.median(relative))
+    return StateError(state, way, median, interval, rms, bias, held, int(seen.sum()))

@@ -182,15 +182,9 @@ def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[S
         gradient = np.asarray(true[name]["gradient"], float)
         angle = math.radians(float(state["angle_deg"]))
         axis = np.array([math.cos(angle), math.sin(angle)])
-        rows.append(
-            StretchError(
-                name,
-                number(state["reading_ratio"]),
-                float(np.linalg.norm(gradient @ axis)),
-                number(state["stretch_s"]),
-                number(state["stretch_s_stderr"]),
-            )
-        )
+        reading, truth_s = number(state["reading_ratio"]), float(np.linalg.norm(gradient @ axis))
+        found, stderr = number(state["stretch_s"]), number(state["stretch_s_stderr"])
+        rows.append(StretchError(name, reading, truth_s, found, stderr))
     return rows
 
 
@@ -199,15 +193,11 @@ def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float
     fitted = document_of(appearance, KERNEL_FILE)
     if fitted is None:
         return []
+    fits = [fit for fit in fitted["fits"] if fit["valid"]]
+    distance = [(number(fit["distance_before"]), number(fit["distance"])) for fit in fits]
     return [
-        (
-            str(fit["name"]),
-            number(fit["stretch_s"]),
-            number(fit["distance_before"]),
-            number(fit["distance"]),
-        )
-        for fit in fitted["fits"]
-        if fit["valid"]
+        (str(fit["name"]), number(fit["stretch_s"]), *both)
+        for fit, both in zip(fits, distance, strict=True)
     ]
 
 
@@ -232,14 +222,9 @@ def variances(
         state = stretch.get(entry["name"])
         if state is None or entry["variance_s"] is None:
             continue
-        found.setdefault(float(state["angle_deg"]), []).append(
-            (
-                number(state["stretch_s"]),
-                number(state["stretch_s_stderr"]),
-                number(entry["variance_s"]),
-                number(entry["variance_s_stderr"]),
-            )
-        )
+        along = number(state["stretch_s"]), number(state["stretch_s_stderr"])
+        spread = number(entry["variance_s"]), number(entry["variance_s_stderr"])
+        found.setdefault(float(state["angle_deg"]), []).append((*along, *spread))
     return {angle: sorted(rows) for angle, rows in sorted(found.items())}
 
 

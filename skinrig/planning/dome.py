@@ -26,11 +26,10 @@ from skinrig.evaluating import surface as surface_evaluation
 from skinrig.planning.dome_observation import LIGHT_ERROR, Observation, simulate_observation
 from skinrig.planning.plans import (
     Choice,
-    Forecast,
     PlanningError,
     PlanRequest,
     Rehearsal,
-    interval_of,
+    forecasts_of,
     left_out_of,
 )
 
@@ -153,15 +152,10 @@ def _choice(
     unlit = [light.name for k, light in enumerate(rig.lights) if k not in lights]
     unseen = [view.name for k, view in enumerate(rig.views) if k not in views]
     medians = {
-        "normals": ("deg", math.degrees(prediction.median_rad)),
-        "r_d": ("%", 100.0 * _r_d_error(prediction, observation)),
+        "normals": math.degrees(prediction.median_rad),
+        "r_d": 100.0 * _r_d_error(prediction, observation),
     }
-    forecasts = tuple(
-        Forecast(
-            name, unit, value, interval_of(value, FORECAST_RELATIVE_SD[name]), asked.wants.get(name)
-        )
-        for name, (unit, value) in medians.items()
-    )
+    forecasts = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "dome")
     left_out = left_out_of(
         (
             bool(unlit),

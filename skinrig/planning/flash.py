@@ -29,11 +29,10 @@ from skinrig.planning.flash_observation import (
 )
 from skinrig.planning.plans import (
     Choice,
-    Forecast,
     PlanningError,
     PlanRequest,
     Rehearsal,
-    interval_of,
+    forecasts_of,
     left_out_of,
     median_of_normals,
     why_less,
@@ -242,12 +241,7 @@ def _choice(
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(observation, **own)
     medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
-    forecasts = tuple(
-        Forecast(
-            name, "%", value, interval_of(value, FORECAST_RELATIVE_SD[name]), asked.wants.get(name)
-        )
-        for name, value in medians.items()
-    )
+    forecasts = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
     left_out = left_out_of(
         (
             not parallel,

@@ -29,11 +29,10 @@ from skinrig.arrays import Float32Array
 from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
 from skinrig.planning.plans import (
     Choice,
-    Forecast,
     PlanningError,
     PlanRequest,
     Rehearsal,
-    interval_of,
+    forecasts_of,
     left_out_of,
     why_less,
 )
@@ -52,7 +51,7 @@ MAX_SIGNAL_FRACTION = 0.98
 UNMODELED_TILT_RAD = math.radians(0.2)
 """Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
 is assumed; see docs/planning.md."""
-FORECAST_RELATIVE_SD = 0.2
+FORECAST_RELATIVE_SD = {"normals": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
@@ -110,11 +109,8 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
-    return Prediction(
-        median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD)),
-        median_of_rayleigh(tilt),
-        float(valid.mean()),
-    )
+    median_rad = median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD))
+    return Prediction(median_rad, median_of_rayleigh(tilt), float(valid.mean()))
 
 
 def choose(rig: Rig, asked: PlanRequest) -> Choice:
@@ -290,9 +286,8 @@ def _choice(
 ) -> Choice:
     found = predict(observation, setting) if found is None else found
     full = gradient_plan(rig)
-    value = math.degrees(found.median_rad)
-    interval = interval_of(value, FORECAST_RELATIVE_SD)
-    predicted = Forecast("normals", "deg", value, interval, asked.wants.get("normals"))
+    medians = {"normals": math.degrees(found.median_rad)}
+    predicted = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
     states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
     left_out = left_out_of(
@@ -332,7 +327,7 @@ def _choice(
         "level": setting.level,
         "valid_share": found.valid_share,
     }
-    return Choice(rig, plan, (predicted,), full.estimated_s(rig), knobs, left_out, path, reasons)
+    return Choice(rig, plan, predicted, full.estimated_s(rig), knobs, left_out, path, reasons)
 
 
 def _why(best: Prediction, observation: Observation) -> str:

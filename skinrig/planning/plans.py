@@ -212,6 +212,22 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     return wants
 
 
+def forecasts_of(
+    medians: Mapping[str, float], spread: Mapping[str, float], asked: PlanRequest, rig: str
+) -> tuple[Forecast, ...]:
+    """Return the forecasts of medians by name, each off by a relative spread."""
+    return tuple(
+        Forecast(
+            name,
+            WANTED_UNITS[rig][name],
+            value,
+            interval_of(value, spread[name]),
+            asked.wants.get(name),
+        )
+        for name, value in medians.items()
+    )
+
+
 def left_out_of(*rows: tuple[bool, str, str]) -> tuple[tuple[str, str], ...]:
     """Return what is left out and why, of rows that say first whether it is."""
     return tuple((what, why) for left, what, why in rows if left)

@@ -164,15 +164,8 @@ def _write_truth(
         met = flashes.get(str(actual.get("token")))
         if met is None:
             continue
-        frames.append(
-            {
-                "step": record.step_id,
-                "time_s": actual.get("time_s"),
-                "phase_s": actual.get("phase_s"),
-                "level": met["level"],
-                "pose": met["pose"],
-            }
-        )
+        times = {"time_s": actual.get("time_s"), "phase_s": actual.get("phase_s")}
+        frames.append({"step": record.step_id, **times, "level": met["level"], "pose": met["pose"]})
     for pose in poses:
         chosen = [frame for frame in frames if frame["pose"] == pose]
         maps = scene.hemoglobin(pose, [float(frame["level"]) for frame in chosen])
