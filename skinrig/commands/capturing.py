@@ -9,29 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skinrig import errors
+from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import (
-    AllBrackets,
-    Angles,
-    Consent,
-    ConsentExpires,
-    Directions,
-    Json,
-    Pairs,
-    Placements,
-    Resume,
-    Seed,
-    SequenceOptions,
-    Site,
-    Sites,
-    Size,
-    Steps,
-    Subject,
-    argument,
-    expand,
-    option,
-    target_of,
-)
+from skinrig.commands.options import argument, expand, option, target_of
 from skinrig.console import Console, counted, picked
 
 if TYPE_CHECKING:
@@ -64,12 +44,12 @@ class CaptureOptions:
     ] = None
     plan: Annotated[Path | None, option("Plan, JSON; default: the rig's own.")] = None
     subject: Annotated[str, option("Pseudonym of the subject.")] = "anonymous"
-    consent: Consent = None
-    consent_expires: ConsentExpires = None
+    consent: options.Consent = None
+    consent_expires: options.ConsentExpires = None
     dry_run: Annotated[bool, option("Only print the plan.", "--dry-run")] = False
     plan_out: Annotated[Path | None, option("New file for the plan, JSON.")] = None
-    resume: Resume = False
-    json: Json = False
+    resume: options.Resume = False
+    json: options.Json = False
 
     def order(self, **more: Any) -> CaptureOrder:
         """Return the order of a capture, with what only some rigs have."""
@@ -92,12 +72,12 @@ class CaptureOptions:
 def capture_flash(
     context: typer.Context,
     common: CaptureOptions,
-    sequence: SequenceOptions,
+    sequence: options.SequenceOptions,
     target: Annotated[str | None, target_of("flash")] = None,
     state: Annotated[
         list[str] | None, option("State of the face, such as smile; repeatable.")
     ] = None,
-    repeats: Pairs = 1,
+    repeats: options.Pairs = 1,
 ) -> None:
     """Run a plan on a flash rig: states of a face, a sequence in time, or a target.
 
@@ -135,8 +115,8 @@ def capture_gradient(
     force_limit: Annotated[
         float | None, option("Greatest force of the caliper on this skin, newton; no default.")
     ] = None,
-    angles: Angles = None,
-    steps: Steps = None,
+    angles: options.Angles = None,
+    steps: options.Steps = None,
 ) -> None:
     """Run a plan on a gradient sphere: a patch of skin in a caliper, or a target.
 
@@ -155,10 +135,10 @@ def capture_probe(
     context: typer.Context,
     common: CaptureOptions,
     target: Annotated[str | None, target_of("probe")] = None,
-    sites: Sites = None,
-    repeats: Placements = 1,
-    angles: Directions = None,
-    all_brackets: AllBrackets = False,
+    sites: options.Sites = None,
+    repeats: options.Placements = 1,
+    angles: options.Directions = None,
+    all_brackets: options.AllBrackets = False,
 ) -> None:
     """Run a plan on a fibre probe: skin at some sites, or a target.
 
@@ -201,9 +181,9 @@ class ServeOptions:
         str, option("Address for cameras and, without --pty, boxes; port 0: a free one.")
     ] = "127.0.0.1:0"
     allow_remote: Annotated[bool, option("Let other machines connect.", "--allow-remote")] = False
-    subject: Subject = "III"
-    size: Size = "small"
-    seed: Seed = 0
+    subject: options.Subject = "III"
+    size: options.Size = "small"
+    seed: options.Seed = 0
     resume: Annotated[
         Path | None,
         option(
@@ -211,7 +191,7 @@ class ServeOptions:
             "be gone on with: noise of its shots does not come again."
         ),
     ] = None
-    json: Json = False
+    json: options.Json = False
 
 
 @serve_app.command("flash", cls=RigCommand)
@@ -239,7 +219,7 @@ def serve_dome(context: typer.Context, common: ServeOptions) -> None:
 
 @serve_app.command("gradient", cls=RigCommand)
 @expand
-def serve_gradient(context: typer.Context, common: ServeOptions, site: Site = None) -> None:
+def serve_gradient(context: typer.Context, common: ServeOptions, site: options.Site = None) -> None:
     """Serve a simulated gradient sphere, small only; the first lines are the addresses.
 
     Example: skinrig serve gradient --site cheek
@@ -266,7 +246,9 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
-def verify(session: Annotated[Path, argument("SESSION/ folder.")], json: Json = False) -> None:
+def verify(
+    session: Annotated[Path, argument("SESSION/ folder.")], json: options.Json = False
+) -> None:
     """Check every byte of a session; exit code 3 names what is damaged.
 
     Example: skinrig verify session

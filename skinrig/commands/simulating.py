@@ -8,31 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skinrig.commands import completion
+from skinrig.commands import completion, options
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import (
-    AllBrackets,
-    Angles,
-    Consent,
-    ConsentExpires,
-    Directions,
-    Json,
-    Out,
-    Pairs,
-    Placements,
-    Resume,
-    Seed,
-    SequenceOptions,
-    Site,
-    Sites,
-    Size,
-    Steps,
-    Subject,
-    Width,
-    expand,
-    option,
-    target_of,
-)
+from skinrig.commands.options import expand, option, target_of
 from skinrig.console import Console, counted, picked
 from skinrig.next_steps import after_session
 
@@ -62,16 +40,16 @@ OneState = Annotated[
 class SimulateOptions:
     """Options of every simulation."""
 
-    out: Out
-    size: Size = "small"
-    seed: Seed = 0
+    out: options.Out
+    size: options.Size = "small"
+    seed: options.Seed = 0
     plan: Annotated[Path | None, option("What is captured of the subject, by `skinrig plan`.")] = (
         None
     )
-    consent: Consent = None
-    consent_expires: ConsentExpires = None
-    resume: Resume = False
-    json: Json = False
+    consent: options.Consent = None
+    consent_expires: options.ConsentExpires = None
+    resume: options.Resume = False
+    json: options.Json = False
 
     def ordered(self, subject: str, console: Console) -> dict[str, Any]:
         """Return what every order has, by name."""
@@ -125,10 +103,10 @@ class FaceOptions:
 def simulate_flash(
     common: SimulateOptions,
     face: FaceOptions,
-    sequence: SequenceOptions,
-    subject: Subject = "III",
+    sequence: options.SequenceOptions,
+    subject: options.Subject = "III",
     target: Annotated[str | None, target_of("flash")] = None,
-    repeats: Pairs = 1,
+    repeats: options.Pairs = 1,
     state: States = None,
     nearer: Annotated[
         float,
@@ -242,12 +220,12 @@ def simulate_dome(
 @expand
 def simulate_gradient(
     common: SimulateOptions,
-    subject: Subject = "III",
+    subject: options.Subject = "III",
     target: Annotated[str | None, target_of("gradient")] = None,
-    width: Width = None,
-    site: Site = None,
-    angles: Angles = None,
-    steps: Steps = None,
+    width: options.Width = None,
+    site: options.Site = None,
+    angles: options.Angles = None,
+    steps: options.Steps = None,
     leave_out: Annotated[
         str | None,
         option(
@@ -290,10 +268,10 @@ def simulate_probe(
         ),
     ] = "III",
     target: Annotated[str | None, target_of("probe")] = None,
-    sites: Sites = None,
-    repeats: Placements = 1,
-    angles: Directions = None,
-    all_brackets: AllBrackets = False,
+    sites: options.Sites = None,
+    repeats: options.Placements = 1,
+    angles: options.Directions = None,
+    all_brackets: options.AllBrackets = False,
 ) -> None:
     """Simulate the fibre probe: tissue at some sites, or a target.
 

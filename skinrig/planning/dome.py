@@ -23,15 +23,9 @@ from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from skinrig.arrays import Float64Array
 from skinrig.evaluating import surface as surface_evaluation
+from skinrig.planning import plans
 from skinrig.planning.dome_observation import LIGHT_ERROR, Observation, simulate_observation
-from skinrig.planning.plans import (
-    Choice,
-    PlanningError,
-    PlanRequest,
-    Rehearsal,
-    forecasts_of,
-    left_out_of,
-)
+from skinrig.planning.plans import Choice, PlanRequest
 
 FORECAST_RELATIVE_SD = {"normals": 0.2, "r_d": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
@@ -56,7 +50,7 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
     """
     least = surface_estimates.MIN_LIGHTS
     if len(rig.lights) < least or len(rig.views) < surface_estimates.MIN_VIEWS:
-        raise PlanningError(
+        raise plans.PlanningError(
             f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
             f"{least} and {surface_estimates.MIN_VIEWS}"
         )
@@ -100,7 +94,7 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     lights = [k for k, light in enumerate(rig.lights) if light.name in lit]
     views = [k for k, view in enumerate(rig.views) if view.name in seen]
     if len(lights) < surface_estimates.MIN_LIGHTS or len(views) < surface_estimates.MIN_VIEWS:
-        raise PlanningError(
+        raise plans.PlanningError(
             f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
             f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
@@ -110,10 +104,10 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     return _choice(rig, observation, (lights, views), prediction, asked, plan=plan)
 
 
-def rehearsal(choice: Choice) -> Rehearsal:
+def rehearsal(choice: Choice) -> plans.Rehearsal:
     """Return the dome's targets, under the lights and cameras of a choice."""
     width = {"width_px": choice.rig.views[0].width_px}
-    return Rehearsal(
+    return plans.Rehearsal(
         dict.fromkeys(("charuco", "mirror", "white"), width | {"plan": choice.plan}),
         (("geometry", ("charuco",)), ("lights", ("mirror", "white"))),
         ("normals", "r_d"),
@@ -155,8 +149,8 @@ def _choice(
         "normals": math.degrees(prediction.median_rad),
         "r_d": 100.0 * _r_d_error(prediction, observation),
     }
-    forecasts = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "dome")
-    left_out = left_out_of(
+    forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "dome")
+    left_out = plans.left_out_of(
         (
             bool(unlit),
             f"{len(unlit)} of {len(rig.lights)} lights: {', '.join(unlit)}",

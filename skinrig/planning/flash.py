@@ -21,22 +21,14 @@ from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
 from skinrig.evaluating.bounds import relative_bounds
+from skinrig.planning import plans
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
     CONFIRM_PX,
     Observation,
     simulate_observation,
 )
-from skinrig.planning.plans import (
-    Choice,
-    PlanningError,
-    PlanRequest,
-    Rehearsal,
-    forecasts_of,
-    left_out_of,
-    median_of_normals,
-    why_less,
-)
+from skinrig.planning.plans import Choice, PlanRequest
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
 """Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
@@ -63,7 +55,7 @@ class Prediction:
 
     def median(self, name: str) -> float:
         """Return the predicted median relative error."""
-        return median_of_normals(self.sigma[name][self.valid[name]])
+        return plans.median_of_normals(self.sigma[name][self.valid[name]])
 
     def valid_share(self, name: str) -> float:
         """Return the share of the skin that keeps an estimate."""
@@ -155,7 +147,7 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     shots = [step for step in plan.steps if step.kind == "subject"]
     crossed = [step for step in shots if step.index.get("polarizer") == "crossed"]
     if not crossed:
-        raise PlanningError("plan: got no crossed frame of a subject, expected at least one")
+        raise plans.PlanningError("plan: got no crossed frame of a subject, expected at least one")
     own = [step for step in crossed if step.index.get("state") == crossed[0].index.get("state")]
     powers = [float(step.settings.get("power", 1.0)) for step in own]
     settings = {
@@ -168,13 +160,13 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     return _choice(rig, observation, plan, settings, asked)
 
 
-def rehearsal(choice: Choice) -> Rehearsal:
+def rehearsal(choice: Choice) -> plans.Rehearsal:
     """Return the flash rig's targets, at the forecast's pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, CONFIRM_PX)}
     target_of = {"sensor": "flat", "white": "white", "polarization": "malus"}
     calibrations = tuple((kind, (target,)) for kind, target in target_of.items())
     targets = dict.fromkeys(target_of.values(), width)
-    return Rehearsal(targets, calibrations, CHROMOPHORE_NAMES, width)
+    return plans.Rehearsal(targets, calibrations, CHROMOPHORE_NAMES, width)
 
 
 def measured(
@@ -241,8 +233,8 @@ def _choice(
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(observation, **own)
     medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
-    forecasts = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
-    left_out = left_out_of(
+    forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
+    left_out = plans.left_out_of(
         (
             not parallel,
             f"{own['repeats']} parallel frames",
@@ -257,7 +249,7 @@ def _choice(
         (
             own["power"] < 1.0,
             f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
-            why_less(reasons),
+            plans.why_less(reasons),
         ),
     )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]

@@ -26,16 +26,9 @@ from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
 from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float32Array
+from skinrig.planning import plans
 from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
-from skinrig.planning.plans import (
-    Choice,
-    PlanningError,
-    PlanRequest,
-    Rehearsal,
-    forecasts_of,
-    left_out_of,
-    why_less,
-)
+from skinrig.planning.plans import Choice, PlanRequest
 
 PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
@@ -136,7 +129,7 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
         if found.median_rad <= target and found.valid_share >= asked.valid_share:
             break
     if not tried:
-        raise PlanningError("rig: got limits that no pattern keeps to")
+        raise plans.PlanningError("rig: got limits that no pattern keeps to")
     best = min((found for _, _, found in tried), key=lambda found: found.median_rad)
     path = tuple(
         {
@@ -166,12 +159,12 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     return _choice(rig, observation, plan, setting_of(plan), asked)
 
 
-def rehearsal(choice: Choice) -> Rehearsal:
+def rehearsal(choice: Choice) -> plans.Rehearsal:
     """Return the gradient sphere's targets, skin and flat field on few pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, 128)}
     of_ball = tuple((kind, ("ball",)) for kind in ("lights", "polarization"))
     calibrations = (("sensor", ("flat",)), *of_ball)
-    return Rehearsal({"flat": width, "ball": {}}, calibrations, ("normals",), width)
+    return plans.Rehearsal({"flat": width, "ball": {}}, calibrations, ("normals",), width)
 
 
 def measured(
@@ -231,13 +224,13 @@ def setting_of(plan: Plan) -> Setting:
 
     Raises
     ------
-    PlanningError
+    plans.PlanningError
         Where its pictures do not tell light and three gradients, in both polarizations.
     """
     shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
     if not neutral:
-        raise PlanningError("plan: got no neutral state of skin, expected one")
+        raise plans.PlanningError("plan: got no neutral state of skin, expected one")
     state = state_of(neutral[0])
     own = [step for step in neutral if state_of(step) == state]
     sets = [
@@ -249,7 +242,7 @@ def setting_of(plan: Plan) -> Setting:
             lit = dict.fromkeys(names - {"dark"})
             require(lit, polarizer=polarizer, purpose="normals")
     except MissingPatterns as error:
-        raise PlanningError(f"plan: {error}") from error
+        raise plans.PlanningError(f"plan: {error}") from error
     both = sets[0] & sets[1]
     darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
     first = own[0].settings
@@ -263,7 +256,7 @@ def setting_of(plan: Plan) -> Setting:
 
 def _angles(rig: Rig) -> Sequence[float]:
     if rig.caliper is None:
-        raise PlanningError(
+        raise plans.PlanningError(
             f"rig: got {rig.name!r} without a caliper, expected one that holds skin"
         )
     return rig.caliper.angles_deg
@@ -287,10 +280,10 @@ def _choice(
     found = predict(observation, setting) if found is None else found
     full = gradient_plan(rig)
     medians = {"normals": math.degrees(found.median_rad)}
-    predicted = forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
+    predicted = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
     states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
-    left_out = left_out_of(
+    left_out = plans.left_out_of(
         (
             bool(missing),
             f"patterns {', '.join(missing)}",
@@ -304,7 +297,7 @@ def _choice(
         (
             setting.exposure_s < EXPOSURE_S,
             f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
-            why_less(reasons),
+            plans.why_less(reasons),
         ),
         (
             not setting.darks,

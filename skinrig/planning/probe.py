@@ -19,16 +19,8 @@ from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.evaluating import subsurface
-from skinrig.planning.plans import (
-    PERCENT_BY_SITE,
-    Choice,
-    Forecast,
-    PlanningError,
-    PlanRequest,
-    Rehearsal,
-    left_out_of,
-    median_of_normals,
-)
+from skinrig.planning import plans
+from skinrig.planning.plans import Choice, PlanRequest
 from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
 from skinrig.planning.probe_observation import Observation, simulate_observation
 
@@ -69,7 +61,7 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             found.valid_share >= valid_share * whole.valid_share
             and found.median <= target
             # a site that is left out must be told by the others as well as is wanted
-            and (not left.size or median_of_normals(left) <= target)
+            and (not left.size or plans.median_of_normals(left) <= target)
         )
 
     tried: list[tuple[Setting, Plan, Prediction]] = []
@@ -110,9 +102,9 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     return _choice(rig, observation, plan, setting, predict(observation, setting), asked.wants)
 
 
-def rehearsal(_: Choice) -> Rehearsal:
+def rehearsal(_: Choice) -> plans.Rehearsal:
     """Return the probe's phantom."""
-    return Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
+    return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
 
 
 def measured(
@@ -188,15 +180,17 @@ def setting_of(plan: Plan) -> Setting:
 
     Raises
     ------
-    PlanningError
+    plans.PlanningError
         Where nothing is measured on skin, or no dark frame is there.
     """
     shots = [step for step in plan.steps if step.kind == "fibres"]
     darks = [step for step in plan.steps if step.kind == "dark"]
     if not shots:
-        raise PlanningError("plan: got no series on skin, expected at least one")
+        raise plans.PlanningError("plan: got no series on skin, expected at least one")
     if not darks:
-        raise PlanningError("plan: got no frame without light, expected some: the dark current")
+        raise plans.PlanningError(
+            "plan: got no frame without light, expected some: the dark current"
+        )
     placements = list(dict.fromkeys(placement_of(step) for step in shots))
     sites = tuple(dict.fromkeys(str(step.index["site"]) for step in shots))
     first = [step for step in shots if placement_of(step) == placements[0]]
@@ -223,11 +217,13 @@ def _choice(
 ) -> Choice:
     value = 100.0 * found.median
     low, high = found.interval()
-    predicted = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
+    predicted = plans.Forecast(
+        "sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr")
+    )
     fewer = N_BRACKETS - len(setting.exposures_s)
     unmeasured = [(k, site) for k, site in enumerate(observation.sites) if not found.measured[k]]
     turned = {name for step in plan.steps for name in step.index if step.index[name]}
-    left_out = left_out_of(
+    left_out = plans.left_out_of(
         (
             fewer > 0,
             f"{fewer} of {N_BRACKETS} exposures of a series",
@@ -260,7 +256,7 @@ def _choice(
         "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
         "darks": setting.darks,
         "valid_share": found.valid_share,
-        PERCENT_BY_SITE: {
+        plans.PERCENT_BY_SITE: {
             site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
             for k, site in enumerate(observation.sites)
         },
@@ -271,8 +267,8 @@ def _choice(
 
 def _why(observation: Observation, whole: Prediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
-    stays = 100.0 * median_of_normals(whole.misfit)
-    calibration = 100.0 * median_of_normals(whole.common)
+    stays = 100.0 * plans.median_of_normals(whole.misfit)
+    calibration = 100.0 * plans.median_of_normals(whole.common)
     return (
         f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
         f"layers unlike any homogeneous medium and the calibration (the phantom's certificate, far "

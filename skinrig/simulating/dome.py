@@ -30,15 +30,7 @@ from rigsim.targets import make_target
 from skinrig.console import picked
 from skinrig.errors import one_of
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
-from skinrig.simulating.driving import (
-    announce_light,
-    asked_of,
-    drive,
-    finish,
-    open_session,
-    released_on_error,
-    write_truth,
-)
+from skinrig.simulating import driving
 from skinrig.simulating.orders import (
     DomeOrder,
     OptionsError,
@@ -74,11 +66,11 @@ def simulate_dome(order: DomeOrder) -> Simulated:
     rig = _rig(order)
     planned = order.plan if order.target is None else None
     plan = planned or _plan(rig, order.target, order.size)
-    light = announce_light(plan, rig, order)
+    light = driving.announce_light(plan, rig, order)
     asked = _asked(order, rig, conditions)
     scene = _scene(rig, order, plan)
-    session = open_session(order, plan, rig, asked, scene)
-    with released_on_error(session):
+    session = driving.open_session(order, plan, rig, asked, scene)
+    with driving.released_on_error(session):
         scan = _attach_scan(session, scene, order) if order.target is None else {}
 
     def prompt(world: Any, text: str) -> None:
@@ -87,13 +79,15 @@ def simulate_dome(order: DomeOrder) -> Simulated:
 
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or light["open_eyes"] != "allowed"
-    rig_seconds = drive(order, session, rig, scene, prompt, eyes="closed" if safe else "open")
+    rig_seconds = driving.drive(
+        order, session, rig, scene, prompt, eyes="closed" if safe else "open"
+    )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
         appearance = scene.truth_appearance()
         parameters = appearance.parameters | scan | {"landmarks_mm": _landmarks(scene.subject)}
-        write_truth(
+        driving.write_truth(
             truth,
             order,
             session,
@@ -102,7 +96,7 @@ def simulate_dome(order: DomeOrder) -> Simulated:
             **picked(order, "state", "movement"),
             **picked(scene, "subsurface", "interreflections"),
         )
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _asked(order: DomeOrder, rig: Rig, conditions: Mapping[str, float]) -> dict[str, Any]:
@@ -119,7 +113,7 @@ def _asked(order: DomeOrder, rig: Rig, conditions: Mapping[str, float]) -> dict[
         asked |= picked(order, "subsurface", "interreflections")
     if conditions:
         asked["conditions"] = conditions
-    return asked_of(order, **asked)
+    return driving.asked_of(order, **asked)
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:

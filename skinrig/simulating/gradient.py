@@ -24,14 +24,7 @@ from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.motion import PatchMotion
 from rigsim.skin_patch.stretch import size_for
 from rigsim.world.taped_skin import GripState
-from skinrig.simulating.driving import (
-    announce_light,
-    asked_of,
-    drive,
-    finish,
-    open_logged,
-    write_truth,
-)
+from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import GradientOrder, Simulated, truth_folder
 
@@ -52,8 +45,8 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
     plan = _plan(rig, order)
-    light = announce_light(plan, rig, order)
-    asked = asked_of(
+    light = driving.announce_light(plan, rig, order)
+    asked = driving.asked_of(
         order,
         width_px=rig.views[0].width_px,
         site=order.site or DEFAULT_SITE,
@@ -69,16 +62,16 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
         plan=plan,
         without=order.scene_switches(),
     )
-    session, log = open_logged(order, plan, rig, asked, scene, GripLog)
-    rig_seconds = drive(
+    session, log = driving.open_logged(order, plan, rig, asked, scene, GripLog)
+    rig_seconds = driving.drive(
         order, session, rig, log, eyes="closed", force_limit_n=FORCE_LIMIT_N, run_id=log.run_id
     )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
+        driving.write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
     log.remove()
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _plan(rig: Rig, order: GradientOrder) -> Plan:

@@ -23,14 +23,7 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import ProbeScene, Probing
 from rigsim.scenes.probe.truth import appearance as ground_truth
 from skinrig.capturing.plan_choice import directions_of
-from skinrig.simulating.driving import (
-    announce_light,
-    asked_of,
-    drive,
-    finish,
-    open_logged,
-    write_truth,
-)
+from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
 
@@ -46,7 +39,7 @@ def simulate_probe(order: ProbeOrder) -> Simulated:
     """
     rig = load_rig("probe")
     plan = _plan(rig, order)
-    asked = asked_of(
+    asked = driving.asked_of(
         order,
         size=order.size,
         sites=",".join(order.sites or PROBE_SITES),
@@ -57,19 +50,19 @@ def simulate_probe(order: ProbeOrder) -> Simulated:
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
-    light = announce_light(plan, rig, order)
-    session, log = open_logged(order, plan, rig, asked, scene, HeadLog)
+    light = driving.announce_light(plan, rig, order)
+    session, log = driving.open_logged(order, plan, rig, asked, scene, HeadLog)
     # nobody has to place the head: the box is told where it is, and with it the world
-    rig_seconds = drive(
+    rig_seconds = driving.drive(
         order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
     )
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
         appearance = ground_truth(scene, log.probings(session))
-        write_truth(truth, order, session, appearance, subject=order.subject)
+        driving.write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
