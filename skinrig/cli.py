@@ -60,11 +60,9 @@ def _root(
     ] = False,
     verbose: Annotated[bool, option("Log details to stderr.", "--verbose")] = False,
 ) -> None:
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO if verbose else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
-    )
+    level = logging.INFO if verbose else logging.WARNING
+    form = "%(levelname)s %(name)s: %(message)s"
+    logging.basicConfig(stream=sys.stderr, level=level, format=form)
     if context.invoked_subcommand is None:
         from importlib.metadata import version as version_of
 

@@ -254,37 +254,23 @@ def analyse_measured(
         lost = sum(s.lost for s in sets)
         sets.append(Dataset("all", every, label, tuple(names), np.nan, lost))
     groups = None if table is None else dict(table.binary)
+    how: dict[str, Any] = {"method": method, "rng": rng}
     done = tuple(
-        _up_to(
-            analyse(
-                data,
-                materials,
-                by_label=False,
-                method=method,
-                rng=rng,
-                ranks=[rank for rank in brdf_space.CURVE_RANKS if rank <= kept],
-            ),
-            kept,
-        )
-        for data, kept in zip(sets, lobes, strict=False)
+        _of_face(data, materials, kept, **how) for data, kept in zip(sets, lobes, strict=False)
     )
     for data in sets[len(lobes) :]:
-        done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
+        done += (analyse(data, materials, by_label=True, groups=groups, **how),)
     told = [store.read_document(folder) for folder in folders]
-    _write(
-        out,
-        done,
-        materials,
-        spheres=done[-1],
-        method=method,
-        source="measured" if any(one.source == "measured" for one in told) else "simulated",
-        agreed=consent.merge_consent(*told),
-    )
+    source = "measured" if any(one.source == "measured" for one in told) else "simulated"
+    agreed = consent.merge_consent(*told)
+    _write(out, done, materials, spheres=done[-1], method=method, source=source, agreed=agreed)
     return done
 
 
-def _up_to(one: Analysis, lobes: int) -> Analysis:
-    """Say of a face's own curve why it ends where the lobes that it was reconstructed with do."""
+def _of_face(data: Dataset, materials: BrdfBasis, lobes: int, **how: Any) -> Analysis:
+    """Analyse one face up to the lobes it was reconstructed with, and say why no further."""
+    ranks = [rank for rank in brdf_space.CURVE_RANKS if rank <= lobes]
+    one = analyse(data, materials, by_label=False, ranks=ranks, **how)
     why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
     beyond = tuple((rank, why) for rank in brdf_space.CURVE_RANKS if rank > lobes)
     curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))

@@ -186,29 +186,22 @@ def apply_microstructure(
     def valid_at(window: Window) -> BoolArray:
         return np.asarray(valid[window.rows, window.columns], bool)
 
-    tiles = tiles_of(size, tile)
-    journal = None
     if out is None:
-        target: Float32Array = np.empty(size, np.float32)
+        journal = _Tiles(np.empty(size, np.float32), [])
     else:
         job = _job(moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile)))
         journal = _Journal.open(Path(out), job, size)
-        target = journal.target
-    before = [] if journal is None else list(journal.finished)
-    done = len(before)
+    before = list(journal.finished)
 
     def finished(number: int, count: int) -> None:
-        nonlocal done
-        done += 1
-        if journal is not None:
-            journal.add(number)
+        journal.add(number)
         if progress is not None:
-            progress(done, count)
+            progress(len(journal.finished), count)
 
     begin = time.perf_counter()
     convolve_tiled(
         neutral_height,
-        target,
+        journal.target,
         fields_at,
         tile=tile,
         sampling=sampling,
@@ -216,8 +209,7 @@ def apply_microstructure(
         finished=before,
         progress=finished,
     )
-    if journal is not None:
-        journal.close()
+    journal.close()
     convolution_s = time.perf_counter() - begin
     covered, changed, unresolved = _shares(found, mesh, regions, size, extrapolate)
     report = MicrostructureReport(
@@ -232,11 +224,11 @@ def apply_microstructure(
         unresolved_share=unresolved,
         strain_s=strain_s,
         convolution_s=convolution_s,
-        tiles=len(tiles),
+        tiles=len(tiles_of(size, tile)),
         tiles_before=len(before),
         **_stretches(found, regions, mesh, size, extrapolate),
     )
-    return AppliedMicrostructure(target, found, report)
+    return AppliedMicrostructure(journal.target, found, report)
 
 
 def _shares(
@@ -331,13 +323,25 @@ def _job(
 
 
 @dataclass(slots=True, eq=False)
-class _Journal:
-    """Which tiles of a file are done."""
+class _Tiles:
+    """A map, and which tiles of it are done."""
+
+    target: Any
+    finished: list[int]
+
+    def add(self, number: int) -> None:
+        self.finished.append(number)
+
+    def close(self) -> None:
+        """Nothing is left to be done with a map in memory."""
+
+
+@dataclass(slots=True, eq=False)
+class _Journal(_Tiles):
+    """Which tiles of a file are done, kept beside it."""
 
     path: Path
     job: str
-    target: Any
-    finished: list[int]
 
     @classmethod
     def open(cls, out: Path, job: str, size: tuple[int, int]) -> _Journal:
@@ -359,10 +363,10 @@ class _Journal:
             target = np.load(out, mmap_mode="r+")
             if target.shape != size or target.dtype != np.float32:
                 raise ApplyMicrostructureError(f"{out}: got {target.dtype} {target.shape}")
-            return cls(path, job, target, done)
+            return cls(target, done, path, job)
         out.parent.mkdir(parents=True, exist_ok=True)
         target = np.lib.format.open_memmap(out, "w+", np.float32, size)
-        journal = cls(path, job, target, [])
+        journal = cls(target, [], path, job)
         journal._write()
         return journal
 

@@ -145,11 +145,8 @@ class _Gltf:
         entry = self.document["accessors"][number]
         if entry["type"] != kind:
             raise self.wrong(f"accessor {number}: got {entry['type']}, expected {kind}")
-        component, count, width = (
-            int(entry["componentType"]),
-            int(entry["count"]),
-            ACCESSOR_WIDTHS[kind],
-        )
+        component, count = int(entry["componentType"]), int(entry["count"])
+        width = ACCESSOR_WIDTHS[kind]
         if component not in COMPONENT_DTYPES:
             raise self.wrong(f"accessor {number}: got component type {component}")
         if "bufferView" in entry:
@@ -244,9 +241,8 @@ def _read(
         count += len(points)
     if len({len(targets) for targets in moved}) != 1:
         raise gltf.wrong("primitives of the mesh differ in their number of targets")
-    names = mesh.get("extras", {}).get("targetNames") or [
-        f"shape_{i}" for i in range(len(moved[0]))
-    ]
+    unnamed = [f"shape_{i}" for i in range(len(moved[0]))]
+    names = mesh.get("extras", {}).get("targetNames") or unnamed
     if len(names) != len(moved[0]) or len(set(names)) != len(names):
         raise gltf.wrong(f"got {len(names)} names of targets, expected {len(moved[0])} distinct")
     shapes = {

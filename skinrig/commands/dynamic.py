@@ -121,7 +121,11 @@ def fit_microstructure(
     from skinrig.fitting.microstructure import fit_microstructure as fit
 
     console = Console(json)
-    found = fit(appearances, out=out, paper_table=paper_table, on_message=console.say)
+    found = fit(appearances, out=out, paper_table=paper_table)
+    for site, one in found.items():
+        low, high = one.table.stretch_range
+        how = f"{one.kernels} kernels" if one.kernels else "the paper's forehead table"
+        console.say(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
     console.say(
         f"next: skinrig apply microstructure {shell_quote(out)} --mesh MESH --weights SHAPE=1 "
         "--out DIR"

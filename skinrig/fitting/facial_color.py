@@ -22,6 +22,7 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import jointly_valid
 from skinrig.appearances.dynamic import FACIAL_COLOR, Part
 from skinrig.appearances.state_truth import truth_of_state
+from skinrig.console import picked
 
 
 class FacialColorInputError(ValueError):
@@ -71,13 +72,8 @@ def fit_facial_color(
     subject = state_images.read(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
     try:
-        found = facial_color_fit.fit(
-            subject,
-            radius_px=radius_px,
-            landmarks=marks,
-            stored_size=stored_size,
-            progress=progress,
-        )
+        how: dict[str, Any] = {"radius_px": radius_px, "stored_size": stored_size}
+        found = facial_color_fit.fit(subject, landmarks=marks, progress=progress, **how)
     except (FacialColorError, UnknownBloodError) as error:
         if subject.has_white:
             raise
@@ -90,11 +86,7 @@ def fit_facial_color(
     for state, change in found.changes.items():
         maps[f"change_{state}"] = change
         maps[f"hemoglobin_{state}"] = found.hemoglobin[state]
-    truths = {
-        state: folder.name
-        for state, folder in _truths(subject, sessions).items()
-        if folder is not None
-    }
+    truths = {state: at.name for state, at in _truths(subject, sessions).items() if at is not None}
     dynamic_appearance.add(
         out,
         FACIAL_COLOR,
@@ -109,16 +101,13 @@ def fit_facial_color(
                 "alignment": facial_color_fit.alignment_document(found),
                 "repeatability": facial_color_fit.repeats_document(found),
                 "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
-                "camera": subject.camera,
-                "illuminant": subject.illuminant,
+                **picked(subject, "camera", "illuminant"),
                 "assumed": list(subject.assumed),
                 "consent": [dict(one) for one in subject.consent],
                 "truth": truths,
             },
-            inputs=subject.inputs,
-            source=subject.source,
             left_out=(*found.left_out, *unmarked),
-            seed=subject.seed,
+            **picked(subject, "inputs", "source", "seed"),
         ),
     )
     return found
@@ -136,15 +125,8 @@ def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
         scale = found.rig.states[state]
         alignment = errors.get(state)
         error = "" if alignment is None else f"{np.median(alignment.error_px[alignment.valid]):.2f}"
-        rows.append(
-            (
-                state,
-                f"{100 * mean:+.3f}",
-                f"{100 * mean / level:+.1f}",
-                f"{np.median(scale.scale[scale.valid]):.3f}",
-                error,
-            )
-        )
+        by = f"{np.median(scale.scale[scale.valid]):.3f}"
+        rows.append((state, f"{100 * mean:+.3f}", f"{100 * mean / level:+.1f}", by, error))
     return rows
 
 

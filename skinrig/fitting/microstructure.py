@@ -72,7 +72,7 @@ class SiteFit:
 
 
 def fit_microstructure(
-    appearances: Sequence[Path], *, out: Path, paper_table: bool = False, on_message: Any = None
+    appearances: Sequence[Path], *, out: Path, paper_table: bool = False
 ) -> dict[str, SiteFit]:
     """Fit the microstructure part of a dynamic appearance.
 
@@ -86,8 +86,6 @@ def fit_microstructure(
     paper_table
         Take the paper's forehead table where fewer kernels were fitted than a table needs,
         instead of refusing.
-    on_message
-        Called with lines of text.
 
     Raises
     ------
@@ -133,11 +131,6 @@ def fit_microstructure(
             seed=everything[0].seed,
         ),
     )
-    if on_message is not None:
-        for site, fit in fits.items():
-            low, high = fit.table.stretch_range
-            how = f"{fit.kernels} kernels" if fit.kernels else "the paper's forehead table"
-            on_message(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
     return fits
 
 

@@ -51,7 +51,6 @@ def fit_wrinkles(
     masks: Sequence[Path] | None = None,
     size: int = 256,
     mask_size: int = 64,
-    smoothing_mm: float = SMOOTHING_MM,
     seed: int = 0,
 ) -> FittedWrinkles:
     """Fit the wrinkle part of a dynamic appearance.
@@ -68,8 +67,6 @@ def fit_wrinkles(
         Two RGBA pictures of the zones; None: zones are found in the data.
     size, mask_size
         Texels a side of wrinkle map and masks.
-    smoothing_mm
-        Of the shape that wrinkles are seen against.
     seed
         Of the search for zones.
 
@@ -90,23 +87,23 @@ def fit_wrinkles(
             f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
         )
     unchecked = _check_textures({state: one for state, (_, one) in read.items()})
-    measured = {state: _normals(folder, one, smoothing_mm) for state, (folder, one) in read.items()}
+    measured = {state: _normals(folder, one) for state, (folder, one) in read.items()}
     shapes = {state: one.normals.shape for state, one in measured.items()}
     if len(set(shapes.values())) > 1:
         told = ", ".join(f"{state} {shape[:2]}" for state, shape in shapes.items())
         raise WrinkleInputError(f"appearances: textures of sizes {told}, expected one size")
     neutral = measured.pop("neutral")
     side = min(neutral.normals.shape[:2])
-    found_zones = None
+    zones = None
     stack: Any
     if masks is None:
         small = min(mask_size, side)
-        found_zones = fit_zones(
+        rng, height = (
+            np.random.default_rng(seed),
             amplitudes(neutral, measured, size=(small, small)),
-            zones=N_ZONES,
-            rng=np.random.default_rng(seed),
         )
-        stack = found_zones.masks
+        zones = fit_zones(height, zones=N_ZONES, rng=rng)
+        stack = zones.masks
     else:
         stack = _read_masks(masks)
     found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
@@ -123,10 +120,10 @@ def fit_wrinkles(
                 "appearances": [folder.name for folder in folders],
                 "explained": found.explained,
                 "rounds": found.rounds,
-                "zones": "given" if found_zones is None else "found in the data",
-                "rank_one_share": None if found_zones is None else found_zones.rank_one_share,
-                "distinct_zones": None if found_zones is None else found_zones.distinct,
-                "smoothing_mm": smoothing_mm,
+                "zones": "given" if zones is None else "found in the data",
+                "rank_one_share": None if zones is None else zones.rank_one_share,
+                "distinct_zones": None if zones is None else zones.distinct,
+                "smoothing_mm": SMOOTHING_MM,
                 "consent": consent.merge_consent(*(one for _, one in read.values())),
                 "truth": {
                     state: one.parameters.get("truth", "") for state, (_, one) in read.items()
@@ -141,7 +138,7 @@ def fit_wrinkles(
             seed=read["neutral"][1].seed,
         ),
     )
-    return FittedWrinkles(found, found_zones)
+    return FittedWrinkles(found, zones)
 
 
 def _state_of(given: Path) -> tuple[str, Path]:
@@ -189,7 +186,7 @@ def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:
     return found
 
 
-def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> NormalMaps:
+def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     """Return normals in the texture's frame."""
     maps = appearance.maps
     if "normals_tangent" in maps:
@@ -203,9 +200,7 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
         )
     normals, position = maps[name], maps["position"]
     valid = jointly_valid(normals, position)
-    found = tangent_normals(
-        normals.values, position.values, valid, stderr=normals.stderr, smoothing_mm=smoothing_mm
-    )
+    found = tangent_normals(normals.values, position.values, valid, stderr=normals.stderr)
     return _as_maps(found.normals, found.stderr, found.valid)
 
 
