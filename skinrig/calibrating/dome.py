@@ -81,29 +81,29 @@ def calibrate_dome(
         raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
         )
-    what = targets or DomeTargets()
-    if kind == "geometry":
-        return _geometry(sessions, Path(folder), created, what)
-    return _lights(sessions, Path(folder), created, what)
+    make = _geometry if kind == "geometry" else _lights
+    return make(sessions, Path(folder), created, targets or DomeTargets())
 
 
-def _frames(sessions: Sequence[Session], kind: str) -> Iterator[tuple[int, Session, FrameRecord]]:
+def _frames(
+    sessions: Sequence[Session], kind: str, place: str
+) -> Iterator[tuple[int, Session, FrameRecord]]:
+    """Yield frames with the number of their place, over all sessions."""
     for number, session in enumerate(sessions):
         for record in session.frames(kind):
-            yield number, session, record
+            yield SESSION_STEP * number + int(record.index[place]), session, record
 
 
 def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
     rig = sessions[0].rig
     sightings: dict[tuple[str, int], Sighting] = {}
     without = 0
-    for number, session, record in _frames(sessions, "charuco"):
+    for pose, session, record in _frames(sessions, "charuco", "pose"):
         image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
         sighting = find_board(image, what.board)
         if sighting is None:
             without += 1
         else:
-            pose = SESSION_STEP * number + int(record.index["pose"])
             sightings[record.camera, pose] = sighting
     if not sightings:
         raise CalibratingError(
@@ -123,13 +123,8 @@ def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: Do
         center, error = camera.center_mm, np.sqrt(np.diag(found.center_covariance_mm2[name]))
         place = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
         focal, focal_error = camera.matrix[0, 0], camera.matrix_stderr[0, 0]
-        summary.append(
-            (
-                f"{name} ({camera.serial})",
-                f"{found.rms_px[name]:.3f} px; centre {place} mm; "
-                f"f {focal:.1f} ± {focal_error:.1f} px",
-            )
-        )
+        told = f"centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px"
+        summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {told}"))
     calibration = geometry.to_calibration(
         found.cameras, reprojection_px=found.rms_px, **provenance(sessions, created)
     )
@@ -188,17 +183,11 @@ def _lights(sessions: Sequence[Session], folder: Path, created: date, what: Dome
         table = fit.table
         lit = table.intensity[table.valid]
         relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
+        count = int((table.intensity > 0).all(axis=1).sum())
+        shared = f"{100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance"
         summary += [
-            (
-                "lights measured",
-                f"{int((table.intensity > 0).all(axis=1).sum())} of"
-                f" {len(rig.lights)}, in {fit.frames} frames",
-            ),
-            (
-                "standard error of an intensity",
-                f"{100 * np.median(relative):.2f} % (and"
-                f" {100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance)",
-            ),
+            ("lights measured", f"{count} of {len(rig.lights)}, in {fit.frames} frames"),
+            ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and {shared})"),
             ("residual of the plate's parts", f"{100 * fit.residual:.2f} %"),
         ]
         for serial, response in table.cameras.items():
@@ -226,7 +215,7 @@ def _mirror(
     """Return the lights' places from the frames of mirror spheres."""
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}
-    for number, session, record in _frames(sessions, "mirror"):
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         if record.index.get("light") != "outline":
             continue
         frame = session.read(record)
@@ -234,7 +223,6 @@ def _mirror(
         image = neutral_mosaic(frame, colors[record.camera])
         edges = mirror_sphere.find_outline(image, cameras[record.camera], what.sphere_radius_mm)
         if edges is not None:
-            sphere = SESSION_STEP * number + int(record.index["sphere"])
             outlines.setdefault(sphere, {})[record.camera] = edges
     if not outlines:
         raise CalibratingError(
@@ -247,8 +235,7 @@ def _mirror(
     }
     windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
     seen = []
-    for number, session, record in _frames(sessions, "mirror"):
-        sphere = SESSION_STEP * number + int(record.index["sphere"])
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         if record.index.get("light") == "outline" or sphere not in spheres:
             continue
         if record.camera not in colors:
@@ -280,12 +267,12 @@ def _white(
 ) -> list[PlateSamples]:
     """Return the parts of the white plate in all frames lit by one light."""
     markers: dict[tuple[str, int], Sighting] = {}
-    for number, session, record in _frames(sessions, "white"):
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several":
             image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
             sighting = what.plate.find(image)
             if sighting is not None:
-                markers[record.camera, SESSION_STEP * number + int(record.index["pose"])] = sighting
+                markers[record.camera, pose] = sighting
     if not markers:
         raise CalibratingError(
             "sessions: the white plate's markers were found in no frame lit by several lights"
@@ -297,8 +284,7 @@ def _white(
     }
     windows: dict[tuple[str, int], PlateWindow | None] = {}
     samples = []
-    for number, session, record in _frames(sessions, "white"):
-        pose = SESSION_STEP * number + int(record.index["pose"])
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several" or pose not in places:
             continue
         key = (record.camera, pose)

@@ -231,27 +231,19 @@ def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     films = survey.films
     zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
     leaked, glass = films.leakage, films.glass_leakage[films.valid]
-    return (
-        ("analyser's misalignment", f"{zero:+.3f}° ± {error:.3f}°"),
-        (
-            "extinction of the lights' films",
-            f"{1 / films.light_leak:.0f} : 1 (leak"
-            f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})",
-        ),
-        (
-            "extinction of the analyser",
-            f"{1 / films.analyser_leak:.0f} : 1 (leak"
-            f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})",
-        ),
-        ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f}°"),
-        (
-            "glass leaks crossed",
-            f"median {100 * np.median(glass):.2f} %, most {100 * glass.max():.1f} % of parallel",
-        ),
-        (
-            f"skin (eta {films.eta:g}) will leak",
-            f"median {100 * np.median(leaked):.3f} %, 9 of 10"
-            f" lights below {100 * np.quantile(leaked, 0.9):.2f} %",
-        ),
-        ("readings of the analyser", ", ".join(f"{r:g}" for r in survey.readings_deg)),
-    )
+    low = f"9 of 10 lights below {100 * np.quantile(leaked, 0.9):.2f} %"
+    rows = {
+        "analyser's misalignment": f"{zero:+.3f}° ± {error:.3f}°",
+        "extinction of the lights' films": _extinction(films.light_leak, films.light_leak_stderr),
+        "extinction of the analyser": _extinction(films.analyser_leak, films.analyser_leak_stderr),
+        "lights' polarizers off their axes": f"{np.degrees(survey.turn_scatter_rad):.2f}°",
+        "glass leaks crossed": f"median {100 * np.median(glass):.2f} %,"
+        f" most {100 * glass.max():.1f} % of parallel",
+        f"skin (eta {films.eta:g}) will leak": f"median {100 * np.median(leaked):.3f} %, {low}",
+        "readings of the analyser": ", ".join(f"{r:g}" for r in survey.readings_deg),
+    }
+    return tuple(rows.items())
+
+
+def _extinction(leak: float, stderr: float) -> str:
+    return f"{1 / leak:.0f} : 1 (leak {leak:.2e} ± {stderr:.0e})"

@@ -240,12 +240,8 @@ def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
 
 
 def _worn(fibres: FiberCalibration) -> tuple[str, ...]:
-    usual = np.array(
-        [
-            np.median(g[v]) if v.any() else 1.0
-            for g, v in zip(fibres.gain.T, fibres.valid.T, strict=True)
-        ]
-    )
+    both = zip(fibres.gain.T, fibres.valid.T, strict=True)
+    usual = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in both])
     found = []
     for i, name in enumerate(fibres.names):
         if fibres.dead[i]:
@@ -263,73 +259,52 @@ def _summary(
     fibres: FiberCalibration, series: _Series, paper: PhantomCertificate
 ) -> tuple[tuple[str, str], ...]:
     spots, mixed = fibres.spots, fibres.crosstalk
-    count = len(fibres.names)
-    rows = [
-        (
-            "spots found",
-            f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
-            f" {spots.shift_px[1]:+.2f} px off their places, row turned"
-            f" {np.degrees(spots.rotation_rad):+.2f}°",
-        ),
-        ("standard error of a place", f"worst {spots.center_stderr_px[spots.found].max():.3f} px"),
-        (
-            "radius of spots, of apertures",
-            f"{spots.radius_px[spots.found].mean():.2f}, {spots.aperture_px:.2f} px",
-        ),
-    ]
+    darks, phantom, mask = series.counts
+    across, down = spots.shift_px
+    rows = {
+        "spots found": f"{int(spots.found.sum())} of {len(fibres.names)}, {across:+.2f},"
+        f" {down:+.2f} px off their places, row turned {np.degrees(spots.rotation_rad):+.2f}°",
+        "standard error of a place": f"worst {spots.center_stderr_px[spots.found].max():.3f} px",
+        "radius of spots, of apertures": f"{spots.radius_px[spots.found].mean():.2f},"
+        f" {spots.aperture_px:.2f} px",
+    }
     for c, color in enumerate(("red", "green", "blue")[: fibres.gain.shape[1]]):
-        good = fibres.valid[:, c]
-        if not good.any():
-            rows.append((f"gain {color}", "no fibre calibrated"))
-            continue
-        gain, error = (
-            fibres.gain[good, c],
-            (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c],
-        )
-        shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
-        worst = int(np.flatnonzero(good)[np.argmax(error)])
-        rows.append(
-            (
-                f"gain {color}",
-                f"{gain.min() / np.median(gain):.2f} to"
-                f" {gain.max() / np.median(gain):.2f} of the usual, {int(good.sum())} fibres;"
-                f" standard error median {100 * np.median(error):.2f} %,"
-                f" worst {100 * error.max():.2f} %"
-                f" ({fibres.names[worst]}); in common up to {100 * shape:.1f} %",
-            )
-        )
+        rows[f"gain {color}"] = _gain_text(fibres, c)
     if mixed.measured:
         first, second = (np.diagonal(mixed.matrix, k) for k in (1, 2))
-        error = np.diagonal(mixed.stderr, 1)
-        rows.append(
-            (
-                "cross-talk",
-                f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
-                f" {first.max():.1e}, standard error {np.median(error):.0e}), next"
-                f" {np.median(second):.1e}",
-            )
-        )
+        error = np.median(np.diagonal(mixed.stderr, 1))
         strays = np.abs(mixed.offset).max()
         strays_error = np.hypot(mixed.offset_stderr, mixed.offset_common).max()
-        rows.append(
-            ("stray light", f"at most {strays:.1e} ± {strays_error:.0e} full scales per second")
-        )
-        rows.append(
-            ("covers let through", f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}")
-        )
-    darks, phantom, mask = series.counts
-    rows += [
-        (
-            "dark current",
-            f"{series.darks.mean_rate_dn_per_s:.3g} ±"
-            f" {series.darks.mean_rate_stderr:.1g} DN/s, {int(series.darks.hot.sum())} hot pixels",
-        ),
-        ("dead fibres", ", ".join(np.array(fibres.names)[fibres.dead]) or "none"),
-        ("frames", f"{darks} dark, {phantom} phantom, {mask} mask"),
-        (
-            "phantom",
-            f"{paper.name or 'not named'}: uncertain by {100 * paper.uncertainty.sigma_a:g}"
-            f" % of sigma_a, {100 * paper.uncertainty.sigma_s_prime:g} % of sigma_s'",
-        ),
-    ]
-    return tuple(rows)
+        rows |= {
+            "cross-talk": f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
+            f" {first.max():.1e}, standard error {error:.0e}), next {np.median(second):.1e}",
+            "stray light": f"at most {strays:.1e} ± {strays_error:.0e} full scales per second",
+            "covers let through": f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}",
+        }
+    dark, unsure = series.darks, paper.uncertainty
+    rows |= {
+        "dark current": f"{dark.mean_rate_dn_per_s:.3g} ± {dark.mean_rate_stderr:.1g} DN/s,"
+        f" {int(dark.hot.sum())} hot pixels",
+        "dead fibres": ", ".join(np.array(fibres.names)[fibres.dead]) or "none",
+        "frames": f"{darks} dark, {phantom} phantom, {mask} mask",
+        "phantom": f"{paper.name or 'not named'}: uncertain by {100 * unsure.sigma_a:g}"
+        f" % of sigma_a, {100 * unsure.sigma_s_prime:g} % of sigma_s'",
+    }
+    return tuple(rows.items())
+
+
+def _gain_text(fibres: FiberCalibration, c: int) -> str:
+    """Return what is to be said of the gains of a channel."""
+    good = fibres.valid[:, c]
+    if not good.any():
+        return "no fibre calibrated"
+    gain = fibres.gain[good, c]
+    error = (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c]
+    shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
+    worst = fibres.names[int(np.flatnonzero(good)[np.argmax(error)])]
+    low, high = np.array([gain.min(), gain.max()]) / np.median(gain)
+    return (
+        f"{low:.2f} to {high:.2f} of the usual, {int(good.sum())} fibres;"
+        f" standard error median {100 * np.median(error):.2f} %, worst {100 * error.max():.2f} %"
+        f" ({worst}); in common up to {100 * shape:.1f} %"
+    )

@@ -164,16 +164,9 @@ def by_method(rows: Sequence[FitError]) -> list[MethodError]:
         if not chosen:
             continue
         error = np.array([row.relative for row in chosen])
-        found.append(
-            MethodError(
-                method,
-                len(chosen),
-                float(np.median(np.abs(error))),
-                float(np.abs(error).max()),
-                float(error.mean()),
-                float(np.mean([row.covered for row in chosen])),
-            )
-        )
+        median, worst = float(np.median(np.abs(error))), float(np.abs(error).max())
+        bias, held = float(error.mean()), float(np.mean([row.covered for row in chosen]))
+        found.append(MethodError(method, len(chosen), median, worst, bias, held))
     return found
 
 
