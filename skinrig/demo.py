@@ -86,8 +86,11 @@ def run_demo(
     began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
-    done = _side_by_side if at_once > 1 else _one_by_one
-    parts = done(asked, (out, seed, width_px, console), at_once)
+    order = (out, seed, width_px, console)
+    if at_once > 1:
+        parts = _side_by_side(asked, order, at_once)
+    else:
+        parts = {rig: _run_rig(rig, *order) for rig in asked}
     found = Findings()
     shares: Shares = {}
     for rig in asked:
@@ -138,10 +141,6 @@ def run_demo(
 
 _Order = tuple[Path, int, int | None, Console]
 _Parts = dict[str, tuple[Findings, Shares]]
-
-
-def _one_by_one(rigs: Sequence[str], order: _Order, _: int) -> _Parts:
-    return {rig: _run_rig(rig, *order) for rig in rigs}
 
 
 def _side_by_side(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:

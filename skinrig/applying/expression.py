@@ -207,7 +207,11 @@ def apply_expression(
                 "emotional": expression.emotional,
                 "gain": expression.gain,
                 consent.CONSENT_KEY: consent.merge_consent(*_faces(appearance, expression)),
-                "figures": _without_times(done.figures),
+                # seconds differ from run to run: the same input gives the same bytes
+                "figures": {
+                    name: {key: value for key, value in part.items() if "seconds" not in key}
+                    for name, part in done.figures.items()
+                },
             },
             inputs={
                 "appearance": document_digest(path),
@@ -356,11 +360,3 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
         if row is not None:
             found[row] = found.get(row, 0.0) + weight
     return found
-
-
-def _without_times(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop seconds, which differ from run to run: the same input gives the same bytes."""
-    return {
-        name: {key: value for key, value in part.items() if "seconds" not in key}
-        for name, part in figures.items()
-    }

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from capture.acquire import run_plan
 from capture.devices.box import Box
@@ -113,7 +113,7 @@ def _run(
             session = Session.resume(out)
             plan = session.plan
         else:
-            fresh = not out.exists()
+            fresh, maker = not out.exists(), next(iter(boxes.values())).identify()
             session = Session.create(
                 out,
                 plan=plan,
@@ -121,7 +121,7 @@ def _run(
                 devices={name: order.boxes[name] for name in boxes}
                 | {name: camera.info.serial for name, camera in cameras.items()},
                 subject=order.subject,
-                source=_source(next(iter(boxes.values())).identify()),
+                source="simulated" if maker.upper().startswith("RIGSIM") else "measured",
             )
             stack.enter_context(_unless_used(session, fresh, console))
         stack.callback(session.release)
@@ -211,11 +211,6 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
         (path / "orphans").rmdir()
         if with_folder:
             path.rmdir()
-
-
-def _source(identity: str) -> Literal["measured", "simulated"]:
-    """Say where frames come from, by how the box names its maker."""
-    return "simulated" if identity.upper().startswith("RIGSIM") else "measured"
 
 
 @contextlib.contextmanager

@@ -146,13 +146,12 @@ def parse_sequence(
                 "--sequence STATE"
             )
         return None
-    for option, text in (
-        ("--prompt-period", prompt_period),
-        ("--shot-period", shot_period),
-        ("--duration", duration),
-    ):
-        if text is not None:
-            _seconds(text, option)
+    seconds = {"prompt-period": prompt_period, "shot-period": shot_period, "duration": duration}
+    for option, text in seconds.items():
+        try:  # the plan keeps the digits as they were given
+            float(text or 0)
+        except ValueError as exc:
+            raise UsageError(f"--{option}: got {text!r}, expected seconds, such as 5.5") from exc
     order = SequenceOrder(
         state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
     )
@@ -161,11 +160,3 @@ def parse_sequence(
     if not order.prompted and (prompt_period is not None or captures is not None):
         raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)
-
-
-def _seconds(text: str, option: str) -> None:
-    """Refuse what is no number; the plan keeps the digits as they were given."""
-    try:
-        float(text)
-    except ValueError as exc:
-        raise UsageError(f"{option}: got {text!r}, expected seconds, such as 5.5") from exc

@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from model import color_table
@@ -146,9 +147,10 @@ def draw(
     share = np.where(np.asarray(surface, np.bool_), np.asarray(mask, np.float64), 0.0)
     if not share.any():
         raise SpotError(f"mask of {kind}: no texel of the surface lies in it")
-    transmitted = _transmitted(
-        np.asarray(r_d, np.float64)[share > 0], what.melanin, amount, table or _table()
-    )
+    if table is None:
+        table = color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+    colors = np.asarray(r_d, np.float64)[share > 0]
+    transmitted = _transmitted(colors, what.melanin, amount, table)
     area = texel_area_mm2(place, np.asarray(surface, np.bool_))
     wanted = float((area * share).sum()) / 100.0 * density
     if wanted > MAX_SPOTS:
@@ -166,26 +168,12 @@ def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Arra
 
     Rims of islands, where a neighbor is missing, take the median.
     """
-    both = []
-    for axis in (0, 1):
-        step = np.zeros_like(position_mm)
-        along = np.moveaxis(step, axis, 0)
-        at = np.moveaxis(position_mm, axis, 0)
-        along[1:-1] = 0.5 * (at[2:] - at[:-2])
-        both.append(step)
-    whole = surface.copy()
-    for axis in (0, 1):
-        for shift in (-1, 1):
-            whole &= np.roll(surface, shift, axis)
-    whole[[0, -1]] = False
-    whole[:, [0, -1]] = False
+    both = [np.gradient(position_mm, axis=axis) for axis in (0, 1)]
+    cross = ndimage.generate_binary_structure(2, 1)
+    whole = ndimage.binary_erosion(surface, cross)
     area = np.linalg.norm(np.cross(both[0], both[1]), axis=-1)
     usual = float(np.median(area[whole])) if whole.any() else 1.0
     return np.where(surface, np.where(whole, np.minimum(area, 9.0 * usual), usual), 0.0)
-
-
-def _table() -> ColorTable:
-    return color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
 def _transmitted(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,23 +231,17 @@ def spheres(
     own = _texels_for(texels, appearance, truth)
     out: list[tuple[str, Float64Array, Float64Array | None]] = []
     for name, texel, image in zip(names, own, images, strict=True):
-        drawn = None
+        at, drawn = np.array([texel]), None
+
+        def reflect(
+            light: Float64Array, view: Float64Array, at: NDArray[np.intp] = at
+        ) -> Float64Array:
+            return predict(appearance, basis, at, light[None], view[None])[0]
+
         if texel >= 0:
-            at = np.array([texel])
-            estimate = partial(_reflected, appearance, basis, at)
-            drawn, _ = sphere(estimate, normal_at(appearance, at)[0])
+            drawn, _ = sphere(reflect, normal_at(appearance, at)[0])
         out.append((str(name), np.asarray(image, np.float64), drawn))
     return out
-
-
-def _reflected(
-    appearance: SkinAppearance,
-    basis: BrdfBasis,
-    at: NDArray[np.intp],
-    to_light: Float64Array,
-    to_camera: Float64Array,
-) -> Float64Array:
-    return predict(appearance, basis, at, to_light[None], to_camera[None])[0]
 
 
 def _texels_for(
