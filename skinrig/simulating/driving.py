@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 from capture.acquire import run_plan
 from capture.devices.camera import open_camera
-from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
@@ -181,12 +180,9 @@ def drive(
     scene: Any,
     prompt: Callable[[Any, str], None] | None = None,
     *,
-    eyes: Eyes = "open",
-    force_limit_n: float | None = None,
-    run_id: str = "",
-    all_brackets: bool = False,
     signal: Callable[[Any, str], None] | None = None,
     begun_s: float | None = None,
+    **run: Any,
 ) -> float:
     """Run a session's plan through the drivers, on a world registered under its id, and close it.
 
@@ -200,19 +196,14 @@ def drive(
         What the cameras see first.
     prompt
         Called with the world and what the operator is asked for; None: nobody is needed.
-    eyes
-        What is said of the subject's eyes.
-    force_limit_n
-        Of a caliper, N.
-    run_id
-        Begins the tokens of this run.
-    all_brackets
-        Of a probe.
     signal
         Called with the world and what the subject of a sequence is asked for, at the time.
     begun_s
         The host's time at which the world begins, s since 1970; None: the host's clock is not the
         world's, but this computer's.
+    run
+        Further arguments of `capture.acquire.run_plan`: ``eyes``, ``force_limit_n``, ``run_id``,
+        ``all_brackets``.
 
     Returns
     -------
@@ -239,13 +230,10 @@ def drive(
             session=session,
             progress=order.progress,
             prompt=lambda text: None if prompt is None else prompt(world, text),
-            eyes=eyes,
-            force_limit_n=force_limit_n,
-            run_id=run_id,
-            all_brackets=all_brackets,
             signal=hear,
             timer=world.clock,
             clock=time.time if begun_s is None else lambda: begun_s + world.now,
+            **run,
         )
         session.close()
         return float(world.now)
