@@ -203,12 +203,9 @@ def _share(name: str, shares: Shares, console: Console) -> Iterator[None]:
 def _make_room(out: Path) -> None:
     """Empty a folder that an earlier demo wrote; refuse any other that holds something."""
     mark = out / ".skinrig-demo"
-    if not out.exists():
-        out.mkdir(parents=True)
-        mark.touch()
-        return
-    if not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise DemoError(f"{out}: is a file, expected a folder; name another with --out")
+    out.mkdir(parents=True, exist_ok=True)
     inside = list(out.iterdir())
     if inside and not mark.exists():
         raise DemoError(

@@ -150,8 +150,7 @@ def _landmarks(
         words = "tables"
     elif subject.source == "simulated":
         for state, place in _truths(subject, sessions).items():
-            told = {} if place is None else store.read_document(place).parameters
-            points = told.get("landmarks_px")
+            points = place and store.read_document(place).parameters.get("landmarks_px")
             if place is not None and isinstance(points, dict):
                 found[state] = {n: _point(place, n, value) for n, value in points.items()}
         words = "the simulation's own"

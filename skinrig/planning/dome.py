@@ -8,7 +8,7 @@ reconstruction itself states: samples misplaced by part of a pixel, and relief t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -64,10 +64,6 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
     selected = light_selection.select(
         told, median_rad=_target_rad(asked), valid_share=share, least=least, most=asked.most_lights
     )
-    path = tuple(
-        {"lights": float(n), "normals_deg": math.degrees(error), "valid_share": share_now}
-        for n, error, share_now in selected.path
-    )
     lights, prediction = list(selected.lights), selected.prediction
     while not _r_d_reached(prediction, observation, asked) and len(lights) < len(rig.lights):
         selected = light_selection.select(
@@ -83,7 +79,12 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             break
     views, prediction = _fewer_views(observation, lights, prediction, asked, share)
     reasons = _out_of_reach(best, observation, asked)
-    return _choice(rig, observation, (lights, views), prediction, asked, path=path, reasons=reasons)
+    path = tuple(
+        {"lights": float(n), "normals_deg": math.degrees(error), "valid_share": share_now}
+        for n, error, share_now in selected.path
+    )
+    choice = _choice(rig, observation, (lights, views), prediction, asked)
+    return replace(choice, path=path, reasons=reasons)
 
 
 def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
@@ -134,8 +135,6 @@ def _choice(
     prediction: Prediction,
     asked: PlanRequest,
     *,
-    path: tuple[Mapping[str, float], ...] = (),
-    reasons: tuple[str, ...] = (),
     plan: Plan | None = None,
 ) -> Choice:
     """Return the choice of some lights and cameras, by their numbers."""
@@ -170,7 +169,7 @@ def _choice(
     }
     full_s = dome_plan(rig).estimated_s(rig)
     plan = dome_plan(small) if plan is None else plan
-    return Choice(small, plan, forecasts, full_s, knobs, left_out, path, reasons)
+    return Choice(small, plan, forecasts, full_s, knobs, left_out)
 
 
 def _target_rad(asked: PlanRequest) -> float:

@@ -92,7 +92,8 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             one for one in tried if one[2].median <= 1.05 * best and one[2].valid_share >= least
         )
     found = predict(observation, setting, memory=memory)
-    return _choice(rig, observation, plan, setting, found, wants, path=path, reasons=reasons)
+    choice = _choice(rig, observation, plan, setting, found, wants)
+    return replace(choice, path=path, reasons=reasons)
 
 
 def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
@@ -211,9 +212,6 @@ def _choice(
     setting: Setting,
     found: Prediction,
     wants: Mapping[str, float],
-    *,
-    path: tuple[Mapping[str, float], ...] = (),
-    reasons: tuple[str, ...] = (),
 ) -> Choice:
     value = 100.0 * found.median
     low, high = found.interval()
@@ -262,7 +260,7 @@ def _choice(
         },
     }
     full_s = probe_plan(rig, repeats=setting.repeats).estimated_s(rig)
-    return Choice(rig, plan, (predicted,), full_s, knobs, left_out, path, reasons)
+    return Choice(rig, plan, (predicted,), full_s, knobs, left_out)
 
 
 def _why(observation: Observation, whole: Prediction, target: float) -> str:
