@@ -264,7 +264,7 @@ def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | 
                 "`skinrig fit traits` learns others"
             )
     if order.region != "face":
-        one_of("region", order.region, ("face", *parts.albedo), EditError)
+        one_of("region", order.region, dict.fromkeys(("face", *parts.albedo)), EditError)
     return parts
 
 
