@@ -191,14 +191,13 @@ def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tup
         Skin that must not be saturated; None: any.
     """
     angle = _angles(rig)[0]
+    rates = {} if observation is None else observation.rates
+    brightest = max((float(np.quantile(rate, 0.999)) for rate in rates.values()), default=0.0)
     found: list[tuple[float, int, Setting, Plan]] = []
     for patterns in PATTERN_SETS:
         for share in EXPOSURE_CHOICES:
             exposure_s = share * EXPOSURE_S
-            if (
-                observation is not None
-                and _brightest(observation, exposure_s) > MAX_SIGNAL_FRACTION
-            ):
+            if exposure_s * brightest > MAX_SIGNAL_FRACTION:
                 continue
             for darks in (0, 2):
                 try:
@@ -260,10 +259,6 @@ def _angles(rig: Rig) -> Sequence[float]:
             f"rig: got {rig.name!r} without a caliper, expected one that holds skin"
         )
     return rig.caliper.angles_deg
-
-
-def _brightest(observation: Observation, exposure_s: float) -> float:
-    return exposure_s * max(float(np.quantile(rate, 0.999)) for rate in observation.rates.values())
 
 
 def _choice(
