@@ -28,7 +28,7 @@ from skinrig.commands import (
     simulating,
 )
 from skinrig.commands.help import Command, Commands
-from skinrig.commands.options import Json, Out, Seed
+from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console
 from skinrig.next_steps import welcome
 
@@ -58,13 +58,11 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which one.")
     ] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log details to stderr.")] = False,
+    verbose: Annotated[bool, option("Log details to stderr.", "--verbose")] = False,
 ) -> None:
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO if verbose else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
-    )
+    level = logging.INFO if verbose else logging.WARNING
+    form = "%(levelname)s %(name)s: %(message)s"
+    logging.basicConfig(stream=sys.stderr, level=level, format=form)
     if context.invoked_subcommand is None:
         from importlib.metadata import version as version_of
 
@@ -76,8 +74,8 @@ def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
         str,
-        typer.Option(
-            help="Rigs, joined by commas: flash, dome, gradient, probe; default all.",
+        option(
+            "Rigs, joined by commas: flash, dome, gradient, probe; default all.",
             autocompletion=completion.several_rigs,
         ),
     ] = "flash,dome,gradient,probe",

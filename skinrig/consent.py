@@ -76,10 +76,8 @@ def recorded(appearance: Traced) -> list[dict[str, Any]]:
     >>> recorded(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
     True
     """
-    found: list[dict[str, Any]] = []
-    for source in _sources(appearance):
-        found += [dict(one) for one in source.get(CONSENT_KEY) or () if dict(one) not in found]
-    return found
+    found = [dict(one) for part in _sources(appearance) for one in part.get(CONSENT_KEY) or ()]
+    return [one for k, one in enumerate(found) if one not in found[:k]]
 
 
 def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:

@@ -34,6 +34,17 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def picked(source: object, *names: str) -> dict[str, Any]:
+    """Return some attributes of an object by their names.
+
+    Examples
+    --------
+    >>> picked(3 + 4j, "real", "imag")
+    {'real': 3.0, 'imag': 4.0}
+    """
+    return {name: getattr(source, name) for name in names}
+
+
 def counted(number: int, noun: str) -> str:
     """Return how many there are of what a noun with a plural in s names.
 
@@ -78,6 +89,28 @@ class Console:
         for row in cells:
             line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True))
             self.say(line.rstrip())
+
+    def figures(
+        self, parts: Mapping[str, Mapping[str, object]], *kinds: type[int | float | str]
+    ) -> None:
+        """Print the figures of each part that are of some kinds; nothing without any."""
+        rows = [
+            (part, name, value)
+            for part, figures in parts.items()
+            for name, value in figures.items()
+            if isinstance(value, kinds)
+        ]
+        if rows:
+            self.rows(("part", "figure", "value"), rows)
+
+    def each(self, label: str, texts: Iterable[object]) -> None:
+        """Print texts for a person, a line each after a label."""
+        for text in texts:
+            self.say(f"{label}: {text}")
+
+    def left_out(self, rows: Iterable[tuple[object, object]]) -> None:
+        """Print what was left out, and why."""
+        self.each("left out", (f"{what}: {why}" for what, why in rows))
 
     def document(self, schema: str, content: Mapping[str, Any]) -> None:
         """Print the one JSON document of the command, when it was asked for."""

@@ -16,7 +16,7 @@ from typing import Any
 
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, plain
-from skinrig.demo_rigs import RIGS, Findings
+from skinrig.demo_rigs import RIGS, Findings, Run
 from skinrig.next_steps import suggest
 from skinrig.waiting_threads import WAITING_ASLEEP
 from skinrig.workspace import scan
@@ -86,8 +86,11 @@ def run_demo(
     began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
-    done = _side_by_side if at_once > 1 else _one_by_one
-    parts = done(asked, (out, seed, width_px, console), at_once)
+    order = (out, seed, width_px, console)
+    if at_once > 1:
+        parts = _side_by_side(asked, order, at_once)
+    else:
+        parts = {rig: _run_rig(rig, *order) for rig in asked}
     found = Findings()
     shares: Shares = {}
     for rig in asked:
@@ -99,18 +102,11 @@ def run_demo(
         bench = run_stages(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
         )
-    document: dict[str, Any] = {
-        "schema": "skinrig.demo/1",
-        "title": "This demo",
-        "tables": [
-            {
-                "title": "Seconds" + (", rigs side by side" if at_once > 1 else ""),
-                "head": ["step", "seconds"],
-                "rows": [[name, round(seconds, 2)] for name, seconds in shares.items()],
-            },
-            *found.tables,
-        ],
-    }
+    spent = Findings()
+    title = "Seconds" + (", rigs side by side" if at_once > 1 else "")
+    spent.add_table(title, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
+    document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
+    document["tables"] = spent.tables + found.tables
     # seconds differ from run to run: they stand in a document of their own, not in the maps
     (out / "demo.json").write_text(json.dumps(plain(document), indent=1), encoding="utf-8")
     with _share("report", shares, console):
@@ -123,11 +119,11 @@ def run_demo(
         [[*row[:3], unit_sign(row[3]), *row[4:]] for row in found.errors],
     )
     console.say("")
-    by_rig = {rig: _sum_of(shares, f"{rig}: ") for rig in asked}
-    console.rows(
-        ("step", "seconds"),
-        [*shares.items(), *((f"all of {rig}", seconds) for rig, seconds in by_rig.items())],
-    )
+    by_rig = [
+        (f"all of {rig}", sum(s for name, s in shares.items() if name.startswith(f"{rig}: ")))
+        for rig in asked
+    ]
+    console.rows(("step", "seconds"), [*shares.items(), *by_rig])
     beside = f", {at_once} rigs side by side" if at_once > 1 else ""
     total_s = time.perf_counter() - began
     console.say(f"\nall of it: {total_s:.1f} s{beside}")
@@ -145,10 +141,6 @@ def run_demo(
 
 _Order = tuple[Path, int, int | None, Console]
 _Parts = dict[str, tuple[Findings, Shares]]
-
-
-def _one_by_one(rigs: Sequence[str], order: _Order, _: int) -> _Parts:
-    return {rig: _run_rig(rig, *order) for rig in rigs}
 
 
 def _side_by_side(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
@@ -196,7 +188,7 @@ def _run_rig(
 ) -> tuple[Findings, Shares]:
     found = Findings()
     shares: Shares = {}
-    RIGS[rig](out, seed, lambda name: _share(name, shares, console), width_px, found)
+    RIGS[rig](Run(out, seed, lambda name: _share(name, shares, console), width_px, found))
     return found, shares
 
 
@@ -208,19 +200,12 @@ def _share(name: str, shares: Shares, console: Console) -> Iterator[None]:
     shares[name] = time.perf_counter() - start
 
 
-def _sum_of(shares: Mapping[str, float], prefix: str) -> float:
-    return sum(seconds for name, seconds in shares.items() if name.startswith(prefix))
-
-
 def _make_room(out: Path) -> None:
     """Empty a folder that an earlier demo wrote; refuse any other that holds something."""
     mark = out / ".skinrig-demo"
-    if not out.exists():
-        out.mkdir(parents=True)
-        mark.touch()
-        return
-    if not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise DemoError(f"{out}: is a file, expected a folder; name another with --out")
+    out.mkdir(parents=True, exist_ok=True)
     inside = list(out.iterdir())
     if inside and not mark.exists():
         raise DemoError(

@@ -6,7 +6,7 @@ one rig is imported in its function.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from model import store
+from model.skin import SkinAppearance
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
@@ -34,29 +35,16 @@ FLASH_SUBJECTS = ("II", "IV")
 """Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
 FLASH_STATES = ("neutral", "anger")
 """States of the first face: what a hemoglobin rig is fitted to."""
+FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
+"""The calibration that each target makes, in the order that they are made."""
 FLASH_WANT = (
-    "melanin",
-    "hemoglobin",
-    "shading",
-    "residual",
-    "diffuse",
-    "picture",
-    "specular_picture",
-    "tsumura_melanin",
-    "tsumura_hemoglobin",
+    *("melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture"),
+    *("tsumura_melanin", "tsumura_hemoglobin"),
 )
 DOME_SUBJECT = "III"
 DOME_WANT = (
-    "half_vector_normals",
-    "normals",
-    "normals_refined",
-    "r_d",
-    "lobe_residual",
-    "samples",
-    "basis_weight_0",
-    "basis_weight_1",
-    "basis_weight_2",
-    "basis_weight_3",
+    *("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples"),
+    *(f"basis_weight_{lobe}" for lobe in range(4)),
 )
 DOME_HELD_OUT = "lights=16,23"
 """Lights, by number, whose photographs no fit sees: renderings are compared with them."""
@@ -83,344 +71,213 @@ class Findings:
     """Subject, map, error, coverage, share masked."""
     tables: list[dict[str, Any]] = field(default_factory=list)
 
+    def add(
+        self, name: str, what: str, error: float, unit: str, coverage: float, masked: float
+    ) -> None:
+        """Add the error of a map; coverage and the share masked as shares of 1."""
+        self.errors.append([name, what, error, unit, 100 * coverage, 100 * masked])
+
+    def add_table(self, title: str, head: list[str], rows: Iterable[Iterable[Any]]) -> None:
+        """Add a table."""
+        self.tables.append({"title": title, "head": head, "rows": [list(row) for row in rows]})
+
+    def add_light(self, title: str, capture: Simulated) -> None:
+        """Add a table of the light that a capture took."""
+        self.add_table(title, ["figure", "value"], light_rows(capture.light))
+
+    def add_left_out(self, rig: str, capture: Simulated) -> None:
+        """Add a table of what a capture's simulator did not build."""
+        title = f"Left out by the simulator of the {rig}"
+        self.add_table(title, ["what", "why"], capture.left_out)
+
 
 Share = Callable[[str], AbstractContextManager[None]]
 
 
-def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A demo of one rig: where it writes, with which seed, and how it tells its steps."""
+
+    out: Path
+    seed: int
+    share: Share
+    width_px: int | None
+    found: Findings
+
+    def simulate(self, rig: str, name: str, **options: Any) -> Simulated:
+        """Simulate a capture into ``session-RIG-NAME``."""
+        return simulate_session(rig, self.out / f"session-{rig}-{name}", seed=self.seed, **options)
+
+    def calibrate(self, rig: str, kind: str, *targets: str) -> None:
+        """Make a calibration from sessions of targets."""
+        sessions = [self.out / f"session-{rig}-{target}" for target in targets]
+        calibrate(kind, sessions, self.out / f"calibration-{rig}")
+
+    def reconstruct(
+        self, rig: str, capture: Simulated, want: tuple[str, ...], hold_out: str | None = None
+    ) -> tuple[str, Path, SkinAppearance, SkinAppearance]:
+        """Make the maps of a capture; return their name, folder, and maps and truth."""
+        folder = self.out / capture.session.name.replace("session", "appearance")
+        pipeline.reconstruct(
+            capture.session,
+            want=want,
+            out=folder,
+            calibration=self.out / f"calibration-{rig}",
+            truth=capture.truth_name,
+            dome=DomeOptions(hold_out=hold_out),
+        )
+        truth = store.read(self.out / capture.truth_name)
+        return folder.name.removeprefix("appearance-"), folder, store.read(folder), truth
+
+
+def _flash(run: Run) -> None:
     """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
-    calibration = out / "calibration-flash"
-    with share("flash: capture the calibration targets"):
-        for target in ("flat", "white", "chart", "malus"):
-            simulate_session(
-                "flash",
-                out / f"session-flash-{target}",
-                target=target,
-                seed=seed,
-                width_px=width_px,
-            )
-    with share("flash: calibrate"):
-        for kind, target in (
-            ("sensor", "flat"),
-            ("white", "white"),
-            ("color", "chart"),
-            ("polarization", "malus"),
-        ):
-            calibrate(kind, [out / f"session-flash-{target}"], calibration)
+    found, width = run.found, run.width_px
+    with run.share("flash: capture the calibration targets"):
+        for target in FLASH_CALIBRATIONS:
+            run.simulate("flash", target, target=target, width_px=width)
+    with run.share("flash: calibrate"):
+        for target, kind in FLASH_CALIBRATIONS.items():
+            run.calibrate("flash", kind, target)
     captures: list[Simulated] = []
-    with share("flash: capture two faces"):
+    with run.share("flash: capture two faces"):
         for number, subject in enumerate(FLASH_SUBJECTS):
+            states = FLASH_STATES if number == 0 else ("neutral",)
             captures.append(
-                simulate_session(
-                    "flash",
-                    out / f"session-flash-{subject}",
-                    subject=subject,
-                    seed=seed,
-                    width_px=width_px,
-                    states=FLASH_STATES if number == 0 else ("neutral",),
-                )
+                run.simulate("flash", subject, subject=subject, width_px=width, states=states)
             )
-    with share("flash: reconstruct melanin and hemoglobin"):
+    with run.share("flash: reconstruct melanin and hemoglobin"):
         for capture in captures:
-            name = capture.session.name.removeprefix("session-")
-            truth = capture.truth
-            pipeline.reconstruct(
-                capture.session,
-                want=FLASH_WANT,
-                out=out / f"appearance-{name}",
-                calibration=calibration,
-                truth=truth.name if truth else "",
-            )
-            found.errors += _chromophore_rows(out / f"appearance-{name}", truth)
-    with share("flash: fit the blood of a moving face"):
-        moving = out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
+            name, _, maps, truth = run.reconstruct("flash", capture, FLASH_WANT)
+            for row in flash.compare(maps, truth, rng=np.random.default_rng(0)):
+                if row.band is None and row.against == "blurred":
+                    error = 100 * row.median_relative
+                    found.add(name, row.name, error, "%", row.coverage.share, row.masked)
+    with run.share("flash: fit the blood of a moving face"):
+        moving = run.out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
+        calibration = run.out / "calibration-flash"
         fit_facial_color([captures[0].session], out=moving, calibration=calibration)
-        found.errors += _moving_rows(moving, out)
-    found.tables.append(
-        {
-            "title": "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
-            "head": ["subject", "red", "green", "blue"],
-            "rows": [[c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures],
-        }
+        _judge_moving(moving, found)
+    found.add_table(
+        "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
+        ["subject", "red", "green", "blue"],
+        ([c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures),
     )
-    found.tables.append(_left_out("flash rig", captures[0]))
+    found.add_left_out("flash rig", captures[0])
 
 
-def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+def _judge_moving(appearance: Path, found: Findings) -> None:
+    maps = store.read(appearance)
+    named = parts_of(maps)[FACIAL_COLOR]["truth"]
+    truths = {state: store.read(appearance.parent / folder) for state, folder in named.items()}
+    rng = np.random.default_rng(0)
+    states, _ = facial_color.compare(maps, hemoglobin_rig(maps), truths, rng=rng)
+    name = appearance.name.removeprefix("appearance-")
+    for row in states:
+        if row.way in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3]):
+            what = f"blood of {row.state}, {row.way}"
+            found.add(name, what, 100 * row.median_relative, "%", row.coverage, 0.0)
+
+
+def _dome(run: Run) -> None:
     """Capture targets and a face with the light dome, down to normals, albedo and lobes."""
-    calibration = out / "calibration-dome"
-    width = DOME_WIDTH_PX if width_px is None else min(width_px, DOME_WIDTH_PX)
-    sessions = {name: out / f"session-dome-{name}" for name in ("charuco", "mirror", "white")}
-    with share("dome: capture the calibration targets"):
-        for target, session in sessions.items():
-            simulate_session("dome", session, target=target, seed=seed, width_px=width)
-    with share("dome: calibrate cameras and lights"):
-        calibrate("geometry", [sessions["charuco"]], calibration)
-        calibrate("lights", [sessions["mirror"], sessions["white"]], calibration)
-    with share("dome: scan and capture a face"):
-        capture = simulate_session(
-            "dome",
-            out / f"session-dome-{DOME_SUBJECT}",
-            subject=DOME_SUBJECT,
-            seed=seed,
-            leave_out=DOME_LEFT_OUT,
-            width_px=width,
-        )
-    with share("dome: reconstruct normals, albedo and lobes"):
-        appearance = out / f"appearance-dome-{DOME_SUBJECT}"
-        pipeline.reconstruct(
-            capture.session,
-            want=DOME_WANT,
-            out=appearance,
-            calibration=calibration,
-            truth=capture.truth.name if capture.truth else "",
-            dome=DomeOptions(hold_out=DOME_HELD_OUT),
-        )
-        found.errors += _surface_rows(appearance, capture.truth)
-    with share("dome: render photographs that no fit has seen"):
-        from skinrig.rendering.photographs.evaluation import evaluate_folders
+    from skinrig.evaluating import reflection
+    from skinrig.rendering.photographs.evaluation import evaluate_folders
 
+    found = run.found
+    width = DOME_WIDTH_PX if run.width_px is None else min(run.width_px, DOME_WIDTH_PX)
+    with run.share("dome: capture the calibration targets"):
+        for target in ("charuco", "mirror", "white"):
+            run.simulate("dome", target, target=target, width_px=width)
+    with run.share("dome: calibrate cameras and lights"):
+        run.calibrate("dome", "geometry", "charuco")
+        run.calibrate("dome", "lights", "mirror", "white")
+    with run.share("dome: scan and capture a face"):
+        capture = run.simulate(
+            "dome", DOME_SUBJECT, subject=DOME_SUBJECT, leave_out=DOME_LEFT_OUT, width_px=width
+        )
+    with run.share("dome: reconstruct normals, albedo and lobes"):
+        name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HELD_OUT)
+        for row in surface_evaluation.compare(maps, truth, rng=np.random.default_rng(0)):
+            found.add(name, row.name, row.judged[1], row.unit, row.coverage.share, row.masked)
+        held_out = reflection.compare(maps, truth, rng=np.random.default_rng(0))
+        if held_out is not None:
+            error = 100 * held_out.median
+            found.add(name, "reflection, held out", error, "%", float("nan"), 0.0)
+    with run.share("dome: render photographs that no fit has seen"):
         compared = evaluate_folders(
-            appearance,
+            folder,
             capture.session,
-            out / f"pictures-dome-{DOME_SUBJECT}",
-            calibration=calibration,
+            run.out / f"pictures-{name}",
+            calibration=run.out / "calibration-dome",
             count=DOME_COMPARED,
-            seed=seed,
+            seed=run.seed,
         )
-    found.tables.append(
-        {
-            "title": "Luminance of photographs that no fit has seen, on lit pixels",
-            "head": ["model", "median error, %", "all skin, %"],
-            "rows": [
-                [name, 100 * row["median"], 100 * row["total_error"]]
-                for name, row in ((FULL_MODEL, compared[FULL_MODEL]), *compared["ablation"].items())
-            ],
-        }
+    models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
+    found.add_table(
+        "Luminance of photographs that no fit has seen, on lit pixels",
+        ["model", "median error, %", "all skin, %"],
+        ([name, 100 * row["median"], 100 * row["total_error"]] for name, row in models.items()),
     )
-    found.tables.append(
-        {
-            "title": "Light of the dome's capture",
-            "head": ["figure", "value"],
-            "rows": [list(row) for row in light_rows(capture.light)],
-        }
-    )
-    found.tables.append(_left_out("dome", capture))
+    found.add_light("Light of the dome's capture", capture)
+    found.add_left_out("dome", capture)
 
 
-def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+def _gradient(run: Run) -> None:
     """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
-    calibration = out / "calibration-gradient"
-    ball = out / "session-gradient-ball"
-    with share("gradient: capture a ball of black glass"):
-        simulate_session("gradient", ball, target="ball", seed=seed)
-    with share("gradient: calibrate lights and films"):
+    found = run.found
+    with run.share("gradient: capture a ball of black glass"):
+        run.simulate("gradient", "ball", target="ball")
+    with run.share("gradient: calibrate lights and films"):
         for kind in ("lights", "polarization"):
-            calibrate(kind, [ball], calibration)
-    with share("gradient: stretch and capture a patch of skin"):
-        capture = simulate_session(
-            "gradient",
-            out / f"session-gradient-{GRADIENT_SITE}",
-            site=GRADIENT_SITE,
-            seed=seed,
-            width_px=None if width_px is None else max(128, min(width_px, 256)),
-        )
-    with share("gradient: reconstruct normals, heights and kernels"):
-        appearance = out / f"appearance-gradient-{GRADIENT_SITE}"
-        pipeline.reconstruct(
-            capture.session,
-            want=GRADIENT_WANT,
-            out=appearance,
-            calibration=calibration,
-            truth=capture.truth.name if capture.truth else "",
-        )
-        fit_microstructure(
-            [appearance], out=out / f"appearance-gradient-moving-{GRADIENT_SITE}", paper_table=True
-        )
-        found.errors += _microrelief_rows(appearance, capture.truth)
-    found.tables.append(
-        {
-            "title": "Light of a state's scan in the gradient sphere",
-            "head": ["figure", "value"],
-            "rows": [list(row) for row in light_rows(capture.light)],
-        }
-    )
-    found.tables.append(_left_out("gradient sphere", capture))
+            run.calibrate("gradient", kind, "ball")
+    with run.share("gradient: stretch and capture a patch of skin"):
+        width = None if run.width_px is None else max(128, min(run.width_px, 256))
+        capture = run.simulate("gradient", GRADIENT_SITE, site=GRADIENT_SITE, width_px=width)
+    with run.share("gradient: reconstruct normals, heights and kernels"):
+        name, folder, maps, truth = run.reconstruct("gradient", capture, GRADIENT_WANT)
+        moving = run.out / f"appearance-gradient-moving-{GRADIENT_SITE}"
+        fit_microstructure([folder], out=moving, paper_table=True)
+        for row in microrelief.compare(maps, truth, rng=np.random.default_rng(0)):
+            if row.state.endswith("_n0"):
+                found.add(name, "normals, neutral", row.mean_deg, "deg", row.coverage, row.masked)
+                error, held = 100 * row.height_relative, row.height_coverage
+                found.add(name, "height, neutral", error, "%", held, row.masked)
+        strain = microrelief.compare_stretch(maps, truth)
+        if strain:
+            worst = max(strain, key=lambda row: abs(row.error))
+            what, error = f"stretch, {state_words(worst.state)}", 100 * abs(worst.error)
+            found.add(name, what, error, "%", float("nan"), 0.0)
+    found.add_light("Light of a state's scan in the gradient sphere", capture)
+    found.add_left_out("gradient sphere", capture)
 
 
-def _probe(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+def _probe(run: Run) -> None:
     """Calibrate a fibre probe, and measure a medium and three sites of a face."""
-    del width_px  # its camera looks at the ends of fibres
-    calibration, phantom = out / "calibration-probe", out / "session-probe-phantom"
-    with share("probe: capture a phantom"):
-        simulate_session("probe", phantom, target="phantom", seed=seed)
-    with share("probe: calibrate its fibres"):
-        calibrate("fibre", [phantom], calibration)
-    with share("probe: capture a medium and three sites of a face"):
+    with run.share("probe: capture a phantom"):
+        run.simulate("probe", "phantom", target="phantom")
+    with run.share("probe: calibrate its fibres"):
+        run.calibrate("probe", "fibre", "phantom")
+    with run.share("probe: capture a medium and three sites of a face"):
         captures = [
-            simulate_session(
-                "probe",
-                out / "session-probe-medium",
-                subject=PROBE_MEDIUM,
-                sites=("cheek",),
-                seed=seed,
-            ),
-            simulate_session(
-                "probe", out / f"session-probe-{PROBE_SUBJECT}", subject=PROBE_SUBJECT, seed=seed
-            ),
+            run.simulate("probe", "medium", subject=PROBE_MEDIUM, sites=("cheek",)),
+            run.simulate("probe", PROBE_SUBJECT, subject=PROBE_SUBJECT),
         ]
-    with share("probe: reconstruct sigma_tr and translucency"):
+    with run.share("probe: reconstruct sigma_tr and translucency"):
         for capture in captures:
-            appearance = out / capture.session.name.replace("session", "appearance")
-            pipeline.reconstruct(
-                capture.session,
-                want=PROBE_WANT,
-                out=appearance,
-                calibration=calibration,
-                truth=capture.truth.name if capture.truth else "",
-            )
-            found.errors += _subsurface_rows(appearance, capture.truth)
-    found.tables.append(_left_out("fibre probe", captures[-1]))
+            name, _, maps, truth = run.reconstruct("probe", capture, PROBE_WANT)
+            fits = subsurface.compare_fits(maps, truth)
+            for row in subsurface.by_method(fits):
+                lost = np.mean([not fit.valid for fit in fits if fit.method == row.method])
+                what, error = f"sigma_tr, {row.method}", 100 * row.median
+                run.found.add(name, what, error, "%", row.coverage, float(lost))
+    run.found.add_left_out("fibre probe", captures[-1])
 
 
-RIGS: Mapping[str, Callable[[Path, int, Share, int | None, Findings], None]] = {
+RIGS: Mapping[str, Callable[[Run], None]] = {
     "flash": _flash,
     "dome": _dome,
     "gradient": _gradient,
     "probe": _probe,
 }
 """What the demo does with each rig, in this order."""
-
-
-def _left_out(rig: str, capture: Simulated) -> dict[str, Any]:
-    return {
-        "title": f"Left out by the simulator of the {rig}",
-        "head": ["what", "why"],
-        "rows": [list(item) for item in capture.left_out],
-    }
-
-
-def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-
-    if truth is None:
-        return []
-    rows = flash.compare(store.read(appearance), store.read(truth), rng=np.random.default_rng(0))
-    return [
-        [
-            appearance.name.removeprefix("appearance-"),
-            row.name,
-            100 * row.median_relative,
-            "%",
-            100 * row.coverage.share,
-            100 * row.masked,
-        ]
-        for row in rows
-        if row.band is None and row.against == "blurred"
-    ]
-
-
-def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
-
-    found = store.read(appearance)
-    named = parts_of(found)[FACIAL_COLOR]["truth"]
-    truths = {state: store.read(out / folder) for state, folder in named.items()}
-    states, _ = facial_color.compare(
-        found, hemoglobin_rig(found), truths, rng=np.random.default_rng(0)
-    )
-    return [
-        [
-            appearance.name.removeprefix("appearance-"),
-            f"blood of {row.state}, {row.way}",
-            100 * row.median_relative,
-            "%",
-            100 * row.coverage,
-            0.0,
-        ]
-        for row in states
-        if row.way in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3])
-    ]
-
-
-def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig.evaluating import reflection
-
-    if truth is None:
-        return []
-    found, true = store.read(appearance), store.read(truth)
-    name = appearance.name.removeprefix("appearance-")
-    rows: list[list[Any]] = [
-        [name, row.name, row.judged[1], row.unit, 100 * row.coverage.share, 100 * row.masked]
-        for row in surface_evaluation.compare(found, true, rng=np.random.default_rng(0))
-    ]
-    held_out = reflection.compare(found, true, rng=np.random.default_rng(0))
-    if held_out is not None:
-        rows.append([name, "reflection, held out", 100 * held_out.median, "%", float("nan"), 0.0])
-    return rows
-
-
-def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-
-    if truth is None:
-        return []
-    name = appearance.name.removeprefix("appearance-")
-    fits = subsurface.compare_fits(store.read(appearance), store.read(truth))
-    lost = {
-        method: np.mean([not row.valid for row in fits if row.method == method])
-        for method in dict.fromkeys(row.method for row in fits)
-    }
-    return [
-        [
-            name,
-            f"sigma_tr, {row.method}",
-            100 * row.median,
-            "%",
-            100 * row.coverage,
-            100 * float(lost[row.method]),
-        ]
-        for row in subsurface.by_method(fits)
-    ]
-
-
-def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-
-    if truth is None:
-        return []
-    found, true = store.read(appearance), store.read(truth)
-    name = appearance.name.removeprefix("appearance-")
-    rows: list[list[Any]] = []
-    for row in microrelief.compare(found, true, rng=np.random.default_rng(0)):
-        if row.state.endswith("_n0"):
-            rows.append(
-                [
-                    name,
-                    "normals, neutral",
-                    row.mean_deg,
-                    "deg",
-                    100 * row.coverage,
-                    100 * row.masked,
-                ]
-            )
-            rows.append(
-                [
-                    name,
-                    "height, neutral",
-                    100 * row.height_relative,
-                    "%",
-                    100 * row.height_coverage,
-                    100 * row.masked,
-                ]
-            )
-    strain = microrelief.compare_stretch(found, true)
-    if strain:
-        worst = max(strain, key=lambda row: abs(row.error))
-        rows.append(
-            [
-                name,
-                f"stretch, {state_words(worst.state)}",
-                100 * abs(worst.error),
-                "%",
-                float("nan"),
-                0.0,
-            ]
-        )
-    return rows

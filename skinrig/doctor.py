@@ -21,25 +21,22 @@ class Finding:
     """What to type when it is not fine; empty when nothing needs doing."""
 
 
-_REQUIRED_PACKAGES = {
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "numba": "numba",
-    "pydantic": "pydantic",
+_OTHER_NAMES = {
     "serial": "pyserial",
-    "xxhash": "xxhash",
-    "rawpy": "rawpy",
-    "tifffile": "tifffile",
-    "OpenEXR": "OpenEXR",
     "cv2": "opencv-contrib-python-headless",
     "colour": "colour-science",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
-    "mitsuba": "mitsuba",
-    "matplotlib": "matplotlib",
     "jinja2": "Jinja2",
     "PIL": "pillow",
-    "pygltflib": "pygltflib",
+}
+"""Distributions whose modules have other names, by module."""
+_REQUIRED_PACKAGES = {
+    module: _OTHER_NAMES.get(module, module)
+    for module in (
+        "numpy scipy numba pydantic serial xxhash rawpy tifffile OpenEXR cv2 colour skimage "
+        "sklearn mitsuba matplotlib jinja2 PIL pygltflib"
+    ).split()
 }
 _EXTRA_PACKAGES = {
     "distributed": "cluster",
@@ -59,34 +56,23 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     probe_renderer
         False skips the render probe, which takes a second or two.
     """
-    version = platform.python_version()
-    findings = [
-        Finding(
-            "Python",
-            version,
-            tuple(map(int, version.split(".")[:2])) >= (3, 11),
-            "" if sys.version_info >= (3, 11) else "install Python 3.11 or newer",
-        )
-    ]
+    new_enough = sys.version_info >= (3, 11)
+    mend = "" if new_enough else "install Python 3.11 or newer"
+    findings = [Finding("Python", platform.python_version(), new_enough, mend)]
     for module, name in _REQUIRED_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = importlib.metadata.version(name) if present else "missing"
         findings.append(Finding(name, state, present, "" if present else f"pip install {name}"))
     for module, extra in _EXTRA_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
-        findings.append(
-            Finding(
-                f"optional: {extra}",
-                "installed" if present else "not installed",
-                True,
-                "" if present else f"pip install 'skinrig[{extra}]' when you need it",
-            )
-        )
+        state = "installed" if present else "not installed"
+        mend = "" if present else f"pip install 'skinrig[{extra}]' when you need it"
+        findings.append(Finding(f"optional: {extra}", state, True, mend))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     findings.append(Finding("cores", str(cores), True))
     if probe_renderer:
         findings.append(_renderer())
-    findings.extend(_serial_ports())
+    findings.append(_serial_ports())
     if importlib.util.find_spec("harvesters") is not None:
         findings.append(_camera_producers())
     return findings
@@ -97,26 +83,16 @@ def _renderer() -> Finding:
 
     choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")
-    return Finding(
-        "Mitsuba variant",
-        f"{choice.name} ({choice.why})",
-        True,
-        "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19",
-    )
+    mend = "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19"
+    return Finding("Mitsuba variant", f"{choice.name} ({choice.why})", True, mend)
 
 
-def _serial_ports() -> list[Finding]:
+def _serial_ports() -> Finding:
     from capture.devices.port_url import serial_ports
 
     ports = serial_ports()
-    return [
-        Finding(
-            "serial ports",
-            ", ".join(ports) or "none",
-            True,
-            "" if ports else "none is needed to simulate; plug the rig in and look again",
-        )
-    ]
+    mend = "" if ports else "none is needed to simulate; plug the rig in and look again"
+    return Finding("serial ports", ", ".join(ports) or "none", True, mend)
 
 
 def _camera_producers() -> Finding:

@@ -19,7 +19,10 @@ What a command ends with:
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+Choice = TypeVar("Choice", bound=str)
 
 EXIT_DONE = 0
 LIMIT_MISSED = 1
@@ -55,6 +58,34 @@ class UsageError(ValueError):
 
 class UnusableError(ValueError):
     """An argument that can be read, but names or asks for what is not there or cannot be used."""
+
+
+def one_of(
+    name: str, value: str, choices: Iterable[Choice], error: type[Exception] = UnusableError
+) -> Choice:
+    """Return a value that is one of the choices, else raise an error that names them.
+
+    Parameters
+    ----------
+    name
+        What the value is of: an option, a field.
+    value
+        As it was given.
+    choices
+        What it may be.
+    error
+        Class of the error.
+
+    Examples
+    --------
+    >>> one_of("--clamp", "unit", ("unit", "signed"))
+    'unit'
+    """
+    known = tuple(choices)
+    for choice in known:
+        if value == choice:
+            return choice
+    raise error(f"{name}: got {value!r}, expected one of {', '.join(known)}")
 
 
 def exit_code(error: BaseException) -> int:

@@ -86,11 +86,8 @@ def after_session(
     if target == "sequence":
         return f"skinrig reconstruct {place} --want perfusion_curves --out appearance"
     if not target:
-        needs = (
-            ""
-            if rig not in DEFAULT_WANTS or rig in UNCALIBRATED_RIGS
-            else f" --calibration {store}"
-        )
+        calibrated = rig in DEFAULT_WANTS and rig not in UNCALIBRATED_RIGS
+        needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
         return f"skinrig reconstruct {place} --want {want}{needs} --out appearance"
     kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
@@ -113,17 +110,13 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         As it is to be named in commands.
     """
     steps: list[Step] = []
+    here = shell_quote(folder)
     if found.reports:
-        steps.append(
-            Step(
-                f"{OPEN_COMMAND} {shell_quote(found.reports[0])}",
-                "the report in a browser: maps, errors, checks",
-            )
-        )
+        page = shell_quote(found.reports[0])
+        why = "the report in a browser: maps, errors, checks"
+        steps.append(Step(f"{OPEN_COMMAND} {page}", why))
     elif found.appearances:
-        steps.append(
-            Step(f"skinrig report {shell_quote(folder)}", "one page of all that lies here")
-        )
+        steps.append(Step(f"skinrig report {here}", "one page of all that lies here"))
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
     fresh = [
         (path, document)
@@ -140,28 +133,16 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
             command += _state_option(document)
         steps.append(Step(command, "maps with standard errors"))
     if found.appearances:
-        seen = _most_whole(found.appearances, ("facial_color.json", "mesh.obj"))
-        steps.append(
-            Step(
-                f"skinrig view {shell_quote(seen)}",
-                "a page that shows the skin moving, under light",
-            )
-        )
+        seen = shell_quote(_most_whole(found.appearances, ("facial_color.json", "mesh.obj")))
+        steps.append(Step(f"skinrig view {seen}", "a page that shows the skin moving, under light"))
         given = _most_whole(found.appearances, ("mesh.obj",))
         measured = found.appearances[given].get("source") == "measured"
         use = " --use research" if measured else ""
-        steps.append(
-            Step(
-                f"skinrig export {shell_quote(given)} --to maps{use} --out export", "other programs"
-            )
-        )
+        command = f"skinrig export {shell_quote(given)} --to maps{use} --out export"
+        steps.append(Step(command, "other programs"))
     if found.photographs and not found.sessions:
-        steps.append(
-            Step(
-                f"skinrig import photos {shell_quote(folder)} --out session",
-                "photographs become a session",
-            )
-        )
+        command = f"skinrig import photos {here} --out session"
+        steps.append(Step(command, "photographs become a session"))
     if not steps:
         steps = [
             Step("skinrig demo", "all four rigs, simulated, in under three minutes"),
@@ -193,11 +174,9 @@ def welcome(folder: Path, version: str) -> str:
     if summary:
         lines += [f"In {folder}: {summary}" if folder.name else f"Here: {summary}", ""]
     lines.append("Next:")
-    for step in steps:
-        lines.append(f"  {step.command.ljust(width)}  {step.why}".rstrip())
-    return "\n".join(
-        [*lines, "", "All commands: skinrig --help; one of them: skinrig report --help"]
-    )
+    lines += [f"  {step.command.ljust(width)}  {step.why}".rstrip() for step in steps]
+    lines += ["", "All commands: skinrig --help; one of them: skinrig report --help"]
+    return "\n".join(lines)
 
 
 def _target(session: Mapping[str, Any]) -> str:

@@ -12,19 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-PHOTOGRAPH_SUFFIXES: Final = (
-    ".dng",
-    ".nef",
-    ".cr2",
-    ".cr3",
-    ".arw",
-    ".raf",
-    ".orf",
-    ".rw2",
-    ".tif",
-    ".tiff",
-    ".jpg",
-    ".jpeg",
+PHOTOGRAPH_SUFFIXES: Final = tuple(
+    ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .tif .tiff .jpg .jpeg".split()
 )
 REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
 """How the policy of a report's page begins; that of a live page allows a script."""

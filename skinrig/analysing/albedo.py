@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,19 +20,23 @@ from model.texture_statistics import histograms as texture_histograms
 from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from rigsim.population.population import table_1
 from skinrig import consent
+from skinrig.analysing.brdf_space_figures import new_figure, png_of
 from skinrig.appearances import face_textures
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.fitting import traits
 from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
-from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
+from skinrig.traits.albedo_vectors import AlbedoSample
 from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
 
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
+VECTOR_KIND: Final = "quantiles"
+"""What the components are of, see `albedo_vectors`."""
 CHANNEL_NAMES: Final = ("red", "green", "blue")
 OUTPUT_FILES: Final = ("figure-16.png", "histograms.csv", "components.csv", "analysis.json")
 
@@ -100,7 +104,6 @@ def analyse_measured(
     *,
     labels: Path | None = None,
     landmarks: Path | None = None,
-    vectors: VectorKind = "quantiles",
     size: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> AlbedoAnalysis:
@@ -116,8 +119,6 @@ def analyse_measured(
         Table, see `trait_labels.read`; groups are its columns of 0 and 1, with and without.
     landmarks, size
         See `fitting_traits.fit_traits`.
-    vectors
-        What the components are of, see `albedo_vectors`.
     progress
         Called with a line a step.
 
@@ -138,10 +139,9 @@ def analyse_measured(
     for face in faces:
         tell(face.name)
         samples.append(traits.albedo_sample(face, frame))
-    regions = {name: common_regions.region(name, frame) for name in ("face", "beard", "no-beard")}
     seen = [face.appearance for face in faces]
     found = dataclasses.replace(
-        analyse(samples, names, groups, regions, vectors),
+        analyse(samples, names, groups, frame),
         source="measured" if any(one.source == "measured" for one in seen) else "simulated",
         consent=tuple(consent.merge_consent(*seen)),
     )
@@ -153,7 +153,6 @@ def analyse_simulated(
     *,
     people: int = 87,
     size: int = 192,
-    vectors: VectorKind = "quantiles",
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> AlbedoAnalysis:
@@ -186,11 +185,8 @@ def analyse_simulated(
         name: flags for name, flags in labels_of(some, known).items() if 0 < flags.sum() < len(some)
     }
     groups = {ALL_GROUPS: np.ones(len(some), np.bool_)} | binary
-    regions = {
-        name: common_regions.region(name, faces.frame) for name in ("face", "beard", "no-beard")
-    }
     names = tuple(person.name for person in some)
-    return _write(out, analyse(samples, names, groups, regions, vectors))
+    return _write(out, analyse(samples, names, groups, faces.frame))
 
 
 def complements(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
@@ -207,38 +203,31 @@ def analyse(
     samples: Sequence[AlbedoSample],
     names: tuple[str, ...],
     groups: Mapping[str, BoolArray],
-    regions: Mapping[str, BoolArray],
-    vectors: VectorKind,
+    frame: CommonFrame,
 ) -> AlbedoAnalysis:
     """Analyse albedo maps that lie in one common map."""
     images = [one.r_d for one in samples]
     texture = TextureSpace.fit(
-        [albedo_vectors.encoded(image, vectors) for image in images],
+        [albedo_vectors.encoded(image, VECTOR_KIND) for image in images],
         valid=[one.valid for one in samples],
     )
     histograms, explained, scores = {}, {}, {}
     left_out: list[tuple[str, str]] = []
-    for region, inside in regions.items():
+    for region in ("face", "beard", "no-beard"):
+        inside = common_regions.region(region, frame)
         masks = [inside & one.valid for one in samples]
         fewest = min(int(mask.sum()) for mask in masks)
         if fewest < traits.MIN_REGION_PIXELS:
             left_out.append((region, f"a face shows {fewest} pixels of it"))
             continue
-        reach = (
-            0.0,
-            float(
-                np.ceil(
-                    10 * max(np.quantile(i[m], 0.999) for i, m in zip(images, masks, strict=True))
-                )
-                / 10
-            ),
-        )
+        most = max(np.quantile(i[m], 0.999) for i, m in zip(images, masks, strict=True))
+        reach = (0.0, float(np.ceil(10 * most) / 10))
         histograms[region] = texture_histograms.rgb_histograms(
             images, groups, valid=masks, reach=reach, bins=HISTOGRAM_BINS
         )
         rows = np.array(
             [
-                albedo_vectors.vector(one.r_d, texture, vectors, valid=one.valid, region=mask)
+                albedo_vectors.vector(one.r_d, texture, VECTOR_KIND, valid=one.valid, region=mask)
                 for one, mask in zip(samples, masks, strict=True)
             ]
         )
@@ -254,14 +243,18 @@ def analyse(
 
 def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
     """Write the files into a folder, all or none; other files in it stay."""
+    document = {"schema": "skinrig.analyse-albedo/1", **found.document()}
+    contents = (
+        _figure(found),
+        _table(_histogram_rows(found)),
+        _table(_component_rows(found)),
+        (json.dumps(document, indent=1) + "\n").encode(),
+    )
     part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
     part.mkdir(parents=True)
     try:
-        (part / OUTPUT_FILES[0]).write_bytes(_figure(found))
-        (part / OUTPUT_FILES[1]).write_text(_histogram_rows(found), encoding="utf-8")
-        (part / OUTPUT_FILES[2]).write_text(_component_rows(found), encoding="utf-8")
-        text = json.dumps({"schema": "skinrig.analyse-albedo/1", **found.document()}, indent=1)
-        (part / OUTPUT_FILES[3]).write_text(text + "\n", encoding="utf-8")
+        for name, content in zip(OUTPUT_FILES, contents, strict=True):
+            (part / name).write_bytes(content)
         out.mkdir(parents=True, exist_ok=True)
         for name in OUTPUT_FILES:
             os.replace(part / name, out / name)
@@ -270,72 +263,50 @@ def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
     return found
 
 
-def _histogram_rows(found: AlbedoAnalysis) -> str:
+def _table(rows: Iterable[Sequence[object]]) -> bytes:
     text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(
-        ["region", "group", "members", "channel", "r_d_low", "r_d_high", "share", "stderr"]
-    )
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def _histogram_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:
+    yield "region", "group", "members", "channel", "r_d_low", "r_d_high", "share", "stderr"
     for region, one in found.histograms.items():
         for g, group in enumerate(one.names):
             for c, channel in enumerate(CHANNEL_NAMES):
-                for b, share in enumerate(one.mean[g, c]):
-                    error = one.stderr[g, c, b]
-                    rows.writerow(
-                        [
-                            region,
-                            group,
-                            int(one.members[g]),
-                            channel,
-                            f"{one.edges[b]:.6g}",
-                            f"{one.edges[b + 1]:.6g}",
-                            f"{share:.6g}",
-                            f"{error:.3g}" if np.isfinite(error) else "",
-                        ]
-                    )
-    return text.getvalue()
+                rows = zip(one.edges, one.edges[1:], one.mean[g, c], one.stderr[g, c], strict=False)
+                for low, high, share, error in rows:
+                    numbers = (f"{low:.6g}", f"{high:.6g}", f"{share:.6g}")
+                    told = f"{error:.3g}" if np.isfinite(error) else ""
+                    yield region, group, int(one.members[g]), channel, *numbers, told
 
 
-def _component_rows(found: AlbedoAnalysis) -> str:
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["region", "face", *(f"component_{k}" for k in range(5))])
+def _component_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:
+    yield "region", "face", *(f"component_{k}" for k in range(5))
     for region, places in found.scores.items():
         for name, place in zip(found.names, places, strict=True):
-            rows.writerow([region, name, *(f"{x:.5g}" for x in place)])
-    return text.getvalue()
+            yield region, name, *(f"{x:.5g}" for x in place)
 
 
 def _figure(found: AlbedoAnalysis) -> bytes:
     """Draw the histograms of the whole face by group, one panel a group."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     region, one = next(iter(found.histograms.items()))
     columns = min(4, len(one.names))
     lines = -(-len(one.names) // columns)
-    figure = Figure(figsize=(2.9 * columns, 2.1 * lines + 0.3), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure, panels = new_figure(2.9 * columns, 2.1 * lines + 0.3, lines, columns)
     middle = 0.5 * (one.edges[1:] + one.edges[:-1])
     top = float(one.mean.max()) * 1.05
-    for g, name in enumerate(one.names):
-        axes = figure.add_subplot(lines, columns, g + 1)
+    for g, axes in enumerate(panels.flat):
+        if g >= len(one.names):
+            axes.remove()
+            continue
         for c, color in enumerate(("tab:red", "tab:green", "tab:blue")):
-            axes.plot(middle, one.mean[g, c], color=color, lw=1.0)
-            error = np.nan_to_num(one.stderr[g, c])
-            axes.fill_between(
-                middle,
-                one.mean[g, c] - error,
-                one.mean[g, c] + error,
-                color=color,
-                alpha=0.25,
-                lw=0,
-            )
+            mean, error = one.mean[g, c], np.nan_to_num(one.stderr[g, c])
+            axes.plot(middle, mean, color=color, lw=1.0)
+            axes.fill_between(middle, mean - error, mean + error, color=color, alpha=0.25, lw=0)
         axes.set_ylim(0, top)
         axes.set_xlim(one.edges[0], one.edges[-1])
-        axes.set_title(f"{name} ({one.members[g]})", fontsize=9)
+        axes.set_title(f"{one.names[g]} ({one.members[g]})", fontsize=9)
         axes.tick_params(labelsize=7)
     figure.suptitle(f"R_d, camera RGB, {region}: mean histograms with standard errors", fontsize=9)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    return stream.getvalue()
+    return png_of(figure, dpi=110)

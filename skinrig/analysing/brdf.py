@@ -23,6 +23,7 @@ from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.appearances.face_textures import valid_of
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
@@ -253,37 +254,23 @@ def analyse_measured(
         lost = sum(s.lost for s in sets)
         sets.append(Dataset("all", every, label, tuple(names), np.nan, lost))
     groups = None if table is None else dict(table.binary)
+    how: dict[str, Any] = {"method": method, "rng": rng}
     done = tuple(
-        _up_to(
-            analyse(
-                data,
-                materials,
-                by_label=False,
-                method=method,
-                rng=rng,
-                ranks=[rank for rank in brdf_space.CURVE_RANKS if rank <= kept],
-            ),
-            kept,
-        )
-        for data, kept in zip(sets, lobes, strict=False)
+        _of_face(data, materials, kept, **how) for data, kept in zip(sets, lobes, strict=False)
     )
     for data in sets[len(lobes) :]:
-        done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
+        done += (analyse(data, materials, by_label=True, groups=groups, **how),)
     told = [store.read_document(folder) for folder in folders]
-    _write(
-        out,
-        done,
-        materials,
-        spheres=done[-1],
-        method=method,
-        source="measured" if any(one.source == "measured" for one in told) else "simulated",
-        agreed=consent.merge_consent(*told),
-    )
+    source = "measured" if any(one.source == "measured" for one in told) else "simulated"
+    agreed = consent.merge_consent(*told)
+    _write(out, done, materials, spheres=done[-1], method=method, source=source, agreed=agreed)
     return done
 
 
-def _up_to(one: Analysis, lobes: int) -> Analysis:
-    """Say of a face's own curve why it ends where the lobes that it was reconstructed with do."""
+def _of_face(data: Dataset, materials: BrdfBasis, lobes: int, **how: Any) -> Analysis:
+    """Analyse one face up to the lobes it was reconstructed with, and say why no further."""
+    ranks = [rank for rank in brdf_space.CURVE_RANKS if rank <= lobes]
+    one = analyse(data, materials, by_label=False, ranks=ranks, **how)
     why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
     beyond = tuple((rank, why) for rank in brdf_space.CURVE_RANKS if rank > lobes)
     curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))
@@ -316,9 +303,7 @@ def _measured(
             f"expected {materials.size} ({materials.names[0]}, ...); say --basis DIR where they "
             "were fitted with other files than the built-in ones"
         )
-    known = np.ones(weights[0].values.shape, np.bool_)
-    for one in weights:
-        known &= np.isfinite(one.values) & (True if one.valid is None else one.valid)
+    known = np.logical_and.reduce([valid_of(one) for one in weights])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
         raise AnalysisError(f"{folder}: none of its texels has valid lobes")

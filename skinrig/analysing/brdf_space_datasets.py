@@ -7,9 +7,9 @@ is left is fitted by the tabulated materials.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -96,7 +96,6 @@ def capture(
     count: int,
     *,
     samples: int = SAMPLES_PER_POINT,
-    noise: float = RADIANCE_NOISE,
     rng: np.random.Generator,
 ) -> Captured:
     """Return samples of random points of a face.
@@ -113,8 +112,6 @@ def capture(
         Number of points P.
     samples
         Pairs of light and view a point.
-    noise
-        See `RADIANCE_NOISE`.
     rng
         Of everything random.
 
@@ -161,7 +158,7 @@ def capture(
     )
     f = clean.astype(np.float64).reshape(count, samples, 3)
     mu = np.einsum("pmc,pc->pm", to_light, normal)[..., None]
-    sigma = noise * (f * mu + NOISE_FLOOR_OF_WHITE / np.pi) / mu
+    sigma = RADIANCE_NOISE * (f * mu + NOISE_FLOOR_OF_WHITE / np.pi) / mu
     return Captured(
         f=f + sigma * rng.standard_normal(f.shape),
         variance=np.maximum(sigma, 1e-9) ** 2,
@@ -176,58 +173,23 @@ def capture(
 
 def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.BasisWeights:
     """Fit the materials to what is left of samples after their estimated diffuse part."""
-    found = diffuse_albedo.estimate(
-        captured.f,
-        captured.light,
-        captured.view,
-        captured.normals,
-        eta=fresnel.ETA_SKIN,
-        variance=captured.variance,
-    )
-    given = brdf_basis.surface_samples(
-        captured.f,
-        captured.light,
-        captured.view,
-        captured.normals,
-        found.r_d,
-        eta=fresnel.ETA_SKIN,
-        variance=captured.variance,
-    )
+    samples = (captured.f, captured.light, captured.view, captured.normals)
+    known: dict[str, Any] = {"eta": fresnel.ETA_SKIN, "variance": captured.variance}
+    found = diffuse_albedo.estimate(*samples, **known)
+    given = brdf_basis.surface_samples(*samples, found.r_d, **known)
     return brdf_basis.fit_weights(given, basis)
 
 
-def one_person(
-    points: int,
-    *,
-    member: Member | None = None,
-    noise: float = RADIANCE_NOISE,
-    rng: np.random.Generator,
-) -> Dataset:
-    """Return points of one face as it usually is.
-
-    Parameters
-    ----------
-    points
-        How many.
-    member
-        Whose; None: that of dataset A.
-    noise
-        See `RADIANCE_NOISE`.
-    rng
-        Of everything random.
-    """
-    person = table_1()[DATASET_A_MEMBER] if member is None else member
-    return _gathered(
-        "one person", ("normal",), [points], lambda _: _skin(person, {}), noise=noise, rng=rng
-    )
+def one_person(points: int, *, rng: np.random.Generator) -> Dataset:
+    """Return points of the face of dataset A as it usually is."""
+    person = table_1()[DATASET_A_MEMBER]
+    return _gathered("one person", {"normal": points}, lambda _: _skin(person, {}), rng=rng)
 
 
 def dataset_a(
     points: int,
     *,
-    member: Member | None = None,
     conditions: Sequence[str] = CONDITION_NAMES,
-    noise: float = RADIANCE_NOISE,
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
 ) -> Dataset:
@@ -237,12 +199,8 @@ def dataset_a(
     ----------
     points
         How many in all.
-    member
-        Whose; None: `DATASET_A_MEMBER` of table 1.
     conditions
         Of `rigsim.population.conditions.CONDITION_NAMES`, each of amount 1.
-    noise
-        See `RADIANCE_NOISE`.
     progress
         Called with each condition's name.
     rng
@@ -252,16 +210,11 @@ def dataset_a(
         raise DatasetError(
             f"points: got {points} for {len(conditions)} conditions, expected one each or more"
         )
-    person = table_1()[DATASET_A_MEMBER] if member is None else member
+    person = table_1()[DATASET_A_MEMBER]
     share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
+    counts = dict(zip(conditions, share.tolist(), strict=True))
     return _gathered(
-        "dataset A",
-        tuple(conditions),
-        share.tolist(),
-        lambda k: _skin(person, {conditions[k]: 1.0}),
-        noise=noise,
-        progress=progress,
-        rng=rng,
+        "dataset A", counts, lambda k: _skin(person, {conditions[k]: 1.0}), progress, rng=rng
     )
 
 
@@ -269,7 +222,6 @@ def dataset_b(
     points: int,
     *,
     members: Sequence[Member] | None = None,
-    noise: float = RADIANCE_NOISE,
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
 ) -> Dataset:
@@ -281,8 +233,6 @@ def dataset_b(
         How many of each.
     members
         None: the 87 of `rigsim.population.population.table_1`.
-    noise
-        See `RADIANCE_NOISE`.
     progress
         Called with each member's name.
     rng
@@ -291,15 +241,8 @@ def dataset_b(
     people = table_1() if members is None else tuple(members)
     if not people or points < 1:
         raise DatasetError(f"points: got {points} of {len(people)} people, expected 1 of 1 or more")
-    return _gathered(
-        "dataset B",
-        tuple(person.name for person in people),
-        [points] * len(people),
-        lambda k: _skin(people[k], None),
-        noise=noise,
-        progress=progress,
-        rng=rng,
-    )
+    counts = dict.fromkeys((person.name for person in people), points)
+    return _gathered("dataset B", counts, lambda k: _skin(people[k], None), progress, rng=rng)
 
 
 Skin = tuple[SkinSurface, Float32Array, BoolArray]
@@ -317,26 +260,24 @@ def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
 
 def _gathered(
     name: str,
-    labels: tuple[str, ...],
-    counts: Sequence[int],
+    counts: Mapping[str, int],
     skin: Callable[[int], Skin],
-    *,
-    noise: float,
-    rng: np.random.Generator,
     progress: Callable[[str], None] | None = None,
+    *,
+    rng: np.random.Generator,
 ) -> Dataset:
+    """Return points of some labels, as many of each as is said."""
     basis = brdf_tables.default()
     weights, label = [], []
     twice: tuple[list[Float64Array], list[Float64Array]] = ([], [])
     lost = 0
-    for k, count in enumerate(counts):
+    for k, (of, count) in enumerate(counts.items()):
         if progress is not None:
-            progress(f"{name}: {labels[k]}")
+            progress(f"{name}: {of}")
         surface, place, where = skin(k)
         for start in range(0, count, POINTS_PER_FIT):
-            seen = capture(
-                surface, place, where, min(POINTS_PER_FIT, count - start), noise=noise, rng=rng
-            )
+            some = min(POINTS_PER_FIT, count - start)
+            seen = capture(surface, place, where, some, rng=rng)
             fit = fitted(seen, basis)
             good = fit.valid & (fit.weights @ basis.strength() > 0.0)
             lost += int(np.count_nonzero(~good))
@@ -356,7 +297,7 @@ def _gathered(
         name,
         shares[kept],
         np.concatenate(label)[kept],
-        labels,
+        tuple(counts),
         brdf_space.repeatability(again[0][held], again[1][held], basis),
         lost + int(np.count_nonzero(~kept)),
     )

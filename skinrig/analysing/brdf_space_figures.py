@@ -38,7 +38,7 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
         PNG. In-sample errors are joined by lines, those out of sample dashed; a ring marks the
         plateau.
     """
-    figure, axes = _figure(6.4, 4.0, 1, 1)
+    figure, axes = new_figure(6.4, 4.0, 1, 1)
     plot = axes[0, 0]
     for name, curve in found.items():
         scale = curve.error[0] if curve.error[0] > 0.0 else 1.0
@@ -48,21 +48,14 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
         rank = curve.plateau()
         at = curve.error[curve.ranks.index(rank)] / scale
         plot.plot([rank], [at], "o", ms=10, mfc="none", mec=color)
-        plot.annotate(
-            str(rank),
-            (rank, at),
-            xytext=(0, 8),
-            textcoords="offset points",
-            color=color,
-            fontsize=8,
-            ha="center",
-        )
+        above = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+        plot.annotate(str(rank), (rank, at), color=color, fontsize=8, **above)
     plot.set_xlabel("common mixtures")
     plot.set_ylabel("relative error over that of one mixture")
     plot.set_ylim(bottom=0.0)
     plot.set_title("Error against number of mixtures (dashed: not used for them)", fontsize=10)
     plot.legend(fontsize=8, frameon=False)
-    return _png(figure)
+    return png_of(figure)
 
 
 def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
@@ -84,7 +77,7 @@ def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
     shown = np.concatenate([p[p > 0.0] for row in pictures.values() for p in row])
     white = float(np.percentile(shown, SPHERE_WHITE_PERCENTILE)) if len(shown) else 1.0
     count = max(len(means), 1)
-    figure, axes = _figure(1.25 * count + 0.3, 3.0, len(SPHERE_LIGHTS), count)
+    figure, axes = new_figure(1.25 * count + 0.3, 3.0, len(SPHERE_LIGHTS), count)
     for place in axes.flat:
         place.axis("off")
     for column, (name, row) in enumerate(pictures.items()):
@@ -92,7 +85,7 @@ def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
             level = np.clip(picture / white, 0.0, 1.0) ** (1.0 / DISPLAY_GAMMA)
             axes[k, column].imshow(level, cmap="gray", vmin=0.0, vmax=1.0)
         axes[0, column].set_title(name, fontsize=8)
-    return _png(figure)
+    return png_of(figure)
 
 
 def lit(means: Mapping[str, Float64Array], basis: BrdfBasis) -> dict[str, tuple[Float64Array, ...]]:
@@ -106,7 +99,8 @@ def lit(means: Mapping[str, Float64Array], basis: BrdfBasis) -> dict[str, tuple[
     }
 
 
-def _figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Any, Any]:
+def new_figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Any, Any]:
+    """Return a figure and its (rows, columns) axes; sizes in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -115,7 +109,8 @@ def _figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _png(figure: Any) -> bytes:
+def png_of(figure: Any, dpi: int = 140) -> bytes:
+    """Return a figure as the bytes of a PNG."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
+    figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
     return stream.getvalue()

@@ -37,7 +37,18 @@ def assumed_by(appearance: SkinAppearance) -> list[str]:
 
 def document_digest(folder: Path) -> str:
     """Return the SHA-256 of an APPEARANCE/ folder's document."""
-    return hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
+    return digest(folder / store.DOCUMENT_FILE)
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def source_of(*parts: SkinAppearance) -> str:
+    """Return "simulated" where any part of what is made of appearances is, else "measured"."""
+    return "simulated" if any(part.source == "simulated" for part in parts) else "measured"
 
 
 def versions() -> dict[str, str]:

@@ -85,24 +85,13 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     DynamicAppearanceError
         ``out`` holds maps of another kind, or another part has a map of the same name.
     """
-    previous = _previous(out)
-    parts: dict[str, Any] = {}
-    maps: dict[str, SkinMap] = {}
-    files: dict[str, bytes] = {}
-    inputs: dict[str, str] = {}
-    left_out: list[tuple[str, str]] = []
-    sources, seed = {part.source}, part.seed
-    if previous is not None:
-        for other, entry in parts_of(previous).items():
-            if other == name:
-                continue
-            parts[other] = entry
-            maps |= {n: previous.maps[n] for n in entry["maps"]}
-            files |= {n: previous.files[n] for n in entry["files"]}
-            sources.add(str(entry["source"]))
-        inputs = {k: v for k, v in previous.inputs.items() if k.partition(": ")[0] in parts}
-        left_out = [row for row in previous.left_out if row[0].partition(": ")[0] in parts]
-        seed = previous.seed if seed is None else seed
+    previous = _previous(out) or SkinAppearance({}, part.source)
+    parts = {other: entry for other, entry in parts_of(previous).items() if other != name}
+    maps = {key: previous.maps[key] for entry in parts.values() for key in entry["maps"]}
+    files = {key: previous.files[key] for entry in parts.values() for key in entry["files"]}
+    sources = {part.source, *(str(entry["source"]) for entry in parts.values())}
+    inputs = {k: v for k, v in previous.inputs.items() if k.partition(": ")[0] in parts}
+    left_out = [row for row in previous.left_out if row[0].partition(": ")[0] in parts]
     double = sorted({*maps, *files} & {*part.maps, *part.files})
     if double:
         raise DynamicAppearanceError(f"{double[0]}: another part of {out} has a map of that name")
@@ -120,7 +109,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
         versions=versions(),
         left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
         files={**files, **part.files},
-        seed=seed,
+        seed=previous.seed if part.seed is None else part.seed,
     )
     store.write(out, appearance)
     return appearance

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -128,15 +127,13 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     """
     found = store.read(path)
     name = path.resolve().name.removeprefix("appearance-")
+    face = Face(name, path, found, {}, "none")
     if landmarks is not None:
-        face = Face(name, path, found, {}, "")
         return Face(name, path, found, read_landmarks(landmarks, face), landmarks.name)
     truth = _truth(path, found)
-    if truth is None:
-        return Face(name, path, found, {}, "none")
-    told = store.read_document(truth).parameters.get(TRUE_LANDMARKS_KEY)
+    told = truth and store.read_document(truth).parameters.get(TRUE_LANDMARKS_KEY)
     if not isinstance(told, dict):
-        return Face(name, path, found, {}, "none")
+        return face
     try:
         points = {str(n): _point([float(x) for x in place]) for n, place in told.items()}  # type: ignore[arg-type,union-attr]
     except (TypeError, ValueError) as error:
@@ -149,16 +146,15 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
 def common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
     """Return the common map of some faces with landmarks."""
     names, places = common_parameterization.common_landmarks([face.landmarks for face in faces])
+    cylinders = [common_parameterization.Cylinder(face.landmarks["nose tip"]) for face in faces]
     unrolled = [
-        common_parameterization.Cylinder(face.landmarks["nose tip"]).unroll(
-            face.position[face.surface]
-        )
-        for face in faces
+        cylinder.unroll(face.position[face.surface])
+        for cylinder, face in zip(cylinders, faces, strict=True)
     ]
-    coarse = common_parameterization.frame_around(names, places, unrolled, size=64)
-    texel = max(face.texel_mm() for face in faces)
-    wanted = size_for(coarse.side_mm, texel) if size is None else size
-    return common_parameterization.frame_around(names, places, unrolled, size=wanted)
+    if size is None:
+        coarse = common_parameterization.frame_around(names, places, unrolled, size=64)
+        size = size_for(coarse.side_mm, max(face.texel_mm() for face in faces))
+    return common_parameterization.frame_around(names, places, unrolled, size=size)
 
 
 def read_landmarks(path: Path, face: Face) -> Landmarks:
@@ -217,12 +213,6 @@ def size_for(side_mm: float, texel_mm: float) -> int:
     128
     """
     return int(2 ** np.clip(math.floor(math.log2(max(side_mm / texel_mm, 1.0))), 6, 10))
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _truth(path: Path, found: SkinAppearance) -> Path | None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,10 @@ from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, jointly_valid, source_of, versions
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
-from skinrig.errors import UsageError
+from skinrig.capturing.option_values import parse_amounts
+from skinrig.errors import UsageError, one_of
 
 EXPRESSION_KIND = "expression"
 MIN_WEIGHT_SUM = 1e-6
@@ -126,20 +126,10 @@ def parse_weights(text: str) -> dict[str, float]:
     >>> parse_weights("smile=0.7, anger=0.3")
     {'smile': 0.7, 'anger': 0.3}
     """
-    found: dict[str, float] = {}
-    for part in text.split(","):
-        name, equals, number = (piece.strip() for piece in part.partition("="))
-        try:
-            weight = float(number)
-        except ValueError:
-            weight = float("nan")
-        if not (name and equals and np.isfinite(weight)):
-            raise WeightsError(
-                f"weights: got {part.strip()!r}, expected NAME=NUMBER, for example smile=0.7"
-            )
-        if name in found:
-            raise WeightsError(f"weights: {name!r} is given twice")
-        found[name] = weight
+    found = parse_amounts(text.split(","), "weights", error=WeightsError)
+    for name, weight in found.items():
+        if not np.isfinite(weight):
+            raise WeightsError(f"weights: got {name}={weight}, expected a finite number")
     return found
 
 
@@ -178,9 +168,8 @@ def apply_expression(
     ApplyError, FacialColorError, WrinkleError, DynamicAppearanceError, StoreError
         For weights that a part cannot take, or a folder that holds none of the parts.
     """
-    unknown = [name for name in parts if name not in DYNAMIC_PARTS]
-    if unknown:
-        raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(DYNAMIC_PARTS)}")
+    for name in parts:
+        one_of("parts", name, DYNAMIC_PARTS, ApplyError)
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
     expression = normalized(expression)
@@ -206,12 +195,11 @@ def apply_expression(
     if not done.maps:
         reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
         raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
-    content = (path / store.DOCUMENT_FILE).read_bytes()
     store.write(
         out,
         SkinAppearance(
             maps=done.maps,
-            source=_source(appearance, expression),
+            source=source_of(*_faces(appearance, expression)),
             parameters={
                 "kind": EXPRESSION_KIND,
                 "weights": dict(expression.weights),
@@ -219,14 +207,18 @@ def apply_expression(
                 "emotional": expression.emotional,
                 "gain": expression.gain,
                 consent.CONSENT_KEY: consent.merge_consent(*_faces(appearance, expression)),
-                "figures": _without_times(done.figures),
+                # seconds differ from run to run: the same input gives the same bytes
+                "figures": {
+                    name: {key: value for key, value in part.items() if "seconds" not in key}
+                    for name, part in done.figures.items()
+                },
             },
             inputs={
-                "appearance": hashlib.sha256(content).hexdigest(),
+                "appearance": document_digest(path),
                 **({} if expression.onto is None else expression.onto.hashes),
                 **done.inputs,
             },
-            versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+            versions=versions(),
             left_out=tuple(done.left_out),
             seed=appearance.seed,
         ),
@@ -264,11 +256,6 @@ def _faces(appearance: SkinAppearance, expression: Expression) -> tuple[SkinAppe
     return (appearance,) if other is None else (appearance, other.appearance)
 
 
-def _source(appearance: SkinAppearance, expression: Expression) -> str:
-    both = {one.source for one in _faces(appearance, expression)}
-    return "simulated" if "simulated" in both else "measured"
-
-
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
@@ -287,13 +274,8 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     )
     good = blend.valid
     held = np.where(good, blend.hemoglobin, 0.0).astype(np.float32)
-    done.maps["hemoglobin"] = SkinMap(
-        held,
-        MAP_UNITS["hemoglobin"],
-        np.where(good, blend.stderr, 0.0).astype(np.float32),
-        good,
-        "blend of measured states",
-    )
+    unit, stderr = MAP_UNITS["hemoglobin"], np.where(good, blend.stderr, 0.0).astype(np.float32)
+    done.maps["hemoglobin"] = SkinMap(held, unit, stderr, good, "blend of measured states")
     done.figures[FACIAL_COLOR] = {
         "clipped_fraction": blend.clipped_fraction,
         "valid_fraction": float(good.mean()),
@@ -303,15 +285,10 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         done.left_out.append(("color", "there is no melanin map"))
         return
     melanin = maps["melanin"]
-    seen = good if melanin.valid is None else good & melanin.valid
+    seen = good & jointly_valid(melanin)
     done.maps["melanin"] = melanin
-    done.maps["color"] = SkinMap(
-        colors(melanin.values, held, seen),
-        "1",
-        None,
-        seen,
-        f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1",
-    )
+    note = f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1"
+    done.maps["color"] = SkinMap(colors(melanin.values, held, seen), "1", None, seen, note)
 
 
 def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinRig:
@@ -347,23 +324,9 @@ def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
 def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     weights = wrinkle_weights(model, expression.weights)
-    if model.clamp != expression.clamp:
-        model = WrinkleModel(
-            model.base,
-            model.layers,
-            expression.clamp,
-            model.valid,
-            model.base_stderr,
-            model.weight_stderr,
-        )
-    shown = model.evaluate(weights)
-    done.maps["normals"] = SkinMap(
-        shown.normals.astype(np.float32),
-        "1",
-        None,
-        shown.valid,
-        "tangent space of the texture, +X right, +Y up",
-    )
+    shown = replace(model, clamp=expression.clamp).evaluate(weights)
+    note = "tangent space of the texture, +X right, +Y up"
+    done.maps["normals"] = SkinMap(shown.normals, "1", None, shown.valid, note)
     done.figures[WRINKLES] = {
         "weights": weights,
         "zone_weights": [zones.tolist() for zones in shown.zone_weights],
@@ -385,28 +348,15 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
     rows = {name for layer in model.layers for name in layer.table.rows}  # type: ignore[union-attr]
     found: dict[str, float] = {}
     for state, weight in weights.items():
-        if state in rows:
-            row: str | None = state
-        elif state in ROW_OF_STATE:
-            row = ROW_OF_STATE[state]
-            if row is not None and row not in rows:
-                raise ApplyError(
-                    f"weights: wrinkles were not fitted to {state!r}, expected out of "
-                    f"{', '.join(sorted(rows))}; leave them out with --parts "
-                    "facial_color,microstructure"
-                )
-        else:
+        if state not in rows and state not in ROW_OF_STATE:
+            one_of("weights", state, sorted(rows), ApplyError)
+        row = state if state in rows else ROW_OF_STATE[state]
+        if row is not None and row not in rows:
             raise ApplyError(
-                f"weights: got state {state!r}, expected out of {', '.join(sorted(rows))}"
+                f"weights: wrinkles were not fitted to {state!r}, expected out of "
+                f"{', '.join(sorted(rows))}; leave them out with --parts "
+                "facial_color,microstructure"
             )
         if row is not None:
             found[row] = found.get(row, 0.0) + weight
     return found
-
-
-def _without_times(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop seconds, which differ from run to run: the same input gives the same bytes."""
-    return {
-        name: {key: value for key, value in part.items() if "seconds" not in key}
-        for name, part in figures.items()
-    }

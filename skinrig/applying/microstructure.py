@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -96,10 +96,6 @@ class MicrostructureReport:
     convolution_s: float
     tiles: int
     tiles_before: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report as values for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,29 +186,22 @@ def apply_microstructure(
     def valid_at(window: Window) -> BoolArray:
         return np.asarray(valid[window.rows, window.columns], bool)
 
-    tiles = tiles_of(size, tile)
-    journal = None
     if out is None:
-        target: Float32Array = np.empty(size, np.float32)
+        journal = _Tiles(np.empty(size, np.float32), [])
     else:
         job = _job(moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile)))
         journal = _Journal.open(Path(out), job, size)
-        target = journal.target
-    before = [] if journal is None else list(journal.finished)
-    done = len(before)
+    before = list(journal.finished)
 
     def finished(number: int, count: int) -> None:
-        nonlocal done
-        done += 1
-        if journal is not None:
-            journal.add(number)
+        journal.add(number)
         if progress is not None:
-            progress(done, count)
+            progress(len(journal.finished), count)
 
     begin = time.perf_counter()
     convolve_tiled(
         neutral_height,
-        target,
+        journal.target,
         fields_at,
         tile=tile,
         sampling=sampling,
@@ -220,20 +209,26 @@ def apply_microstructure(
         finished=before,
         progress=finished,
     )
-    if journal is not None:
-        journal.close()
+    journal.close()
     convolution_s = time.perf_counter() - begin
-    report = _report(
-        found,
-        regions,
-        mesh,
-        size,
-        extrapolate,
-        (strain_s, convolution_s),
-        (len(tiles), len(before)),
-        _shares(found, mesh, regions, size, extrapolate),
+    covered, changed, unresolved = _shares(found, mesh, regions, size, extrapolate)
+    report = MicrostructureReport(
+        size_px=size,
+        fitted_range=regions.tables[0].stretch_range,
+        extrapolate=extrapolate,
+        degenerate_share=found.degenerate_share,
+        uv_degenerate_share=found.uv_degenerate_share,
+        uv_turned_share=found.uv_turned_share,
+        covered_share=covered,
+        changed_share=changed,
+        unresolved_share=unresolved,
+        strain_s=strain_s,
+        convolution_s=convolution_s,
+        tiles=len(tiles_of(size, tile)),
+        tiles_before=len(before),
+        **_stretches(found, regions, mesh, size, extrapolate),
     )
-    return AppliedMicrostructure(target, found, report)
+    return AppliedMicrostructure(journal.target, found, report)
 
 
 def _shares(
@@ -262,16 +257,14 @@ def _shares(
     )
 
 
-def _report(
+def _stretches(
     found: MeshStrain,
     regions: KernelRegions,
     mesh: BlendShapeMesh,
     size: tuple[int, int],
     extrapolate: str,
-    seconds: tuple[float, float],
-    tiles: tuple[int, int],
-    shares: tuple[float, float, float],
-) -> MicrostructureReport:
+) -> dict[str, Any]:
+    """Return what of a report is of the vertices: stretch, range, pixels."""
     good = found.valid
     if not good.any():
         raise ApplyMicrostructureError("mesh: no vertex has a triangle with an area and a texture")
@@ -293,29 +286,19 @@ def _report(
             )
         ]
     )
-    return MicrostructureReport(
-        size_px=size,
-        stretch_s=(float(both[0].min()), float(both[0].max())),
-        stretch_t=(float(both[1].min()), float(both[1].max())),
-        fitted_range=regions.tables[0].stretch_range,
-        outside_share=float((below | above).any(axis=0).mean()),
-        below_share=float(below.any(axis=0).mean()),
-        above_share=float(above.any(axis=0).mean()),
-        extrapolate=extrapolate,
-        clipped_share=float(clipped.any(axis=0).mean()),
-        invalid_share=float(1.0 - good.mean()),
-        degenerate_share=found.degenerate_share,
-        uv_degenerate_share=found.uv_degenerate_share,
-        uv_turned_share=found.uv_turned_share,
-        covered_share=float(shares[0]),
-        changed_share=float(shares[1]),
-        unresolved_share=float(shares[2]),
-        pixel_um=float(1e3 / np.median(pixels)),
-        strain_s=seconds[0],
-        convolution_s=seconds[1],
-        tiles=tiles[0],
-        tiles_before=tiles[1],
+    outside, low, high, limited = (
+        float(each.any(axis=0).mean()) for each in (below | above, below, above, clipped)
     )
+    return {
+        "stretch_s": (float(both[0].min()), float(both[0].max())),
+        "stretch_t": (float(both[1].min()), float(both[1].max())),
+        "outside_share": outside,
+        "below_share": low,
+        "above_share": high,
+        "clipped_share": limited,
+        "invalid_share": float(1.0 - good.mean()),
+        "pixel_um": float(1e3 / np.median(pixels)),
+    }
 
 
 def _job(
@@ -340,13 +323,25 @@ def _job(
 
 
 @dataclass(slots=True, eq=False)
-class _Journal:
-    """Which tiles of a file are done."""
+class _Tiles:
+    """A map, and which tiles of it are done."""
+
+    target: Any
+    finished: list[int]
+
+    def add(self, number: int) -> None:
+        self.finished.append(number)
+
+    def close(self) -> None:
+        """Nothing is left to be done with a map in memory."""
+
+
+@dataclass(slots=True, eq=False)
+class _Journal(_Tiles):
+    """Which tiles of a file are done, kept beside it."""
 
     path: Path
     job: str
-    target: Any
-    finished: list[int]
 
     @classmethod
     def open(cls, out: Path, job: str, size: tuple[int, int]) -> _Journal:
@@ -368,10 +363,10 @@ class _Journal:
             target = np.load(out, mmap_mode="r+")
             if target.shape != size or target.dtype != np.float32:
                 raise ApplyMicrostructureError(f"{out}: got {target.dtype} {target.shape}")
-            return cls(path, job, target, done)
+            return cls(target, done, path, job)
         out.parent.mkdir(parents=True, exist_ok=True)
         target = np.lib.format.open_memmap(out, "w+", np.float32, size)
-        journal = cls(path, job, target, [])
+        journal = cls(target, [], path, job)
         journal._write()
         return journal
 

@@ -29,6 +29,7 @@ from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
+from skinrig.errors import one_of
 
 CHART_HALF_SIDE: Final = 1.1
 """Half the chart's side, in units of the projection: 1 is the rim that is seen from +z."""
@@ -146,10 +147,7 @@ class DeformedSphere:
         within_rad : float
             Angle around it on the neutral sphere, rad, 0.02 to 0.5.
         """
-        if place not in ROUGHNESS_POINTS:
-            raise SphereError(
-                f"place: got {place!r}, expected one of {', '.join(ROUGHNESS_POINTS)}"
-            )
+        one_of("place", place, ROUGHNESS_POINTS, SphereError)
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
         near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[place]) > (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from scipy import ndimage
@@ -22,12 +22,14 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.subject.expressions import displacement_mm, moves
 from rigsim.subject.face_regions import on_mean_head, region_masks
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.appearances.contents import digest
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
+from skinrig.errors import one_of
 
 REGION_ATLAS_PX: Final = 256
 """Texels a side of the maps that say whose relief is where, and how large pixels are."""
@@ -46,26 +48,12 @@ PIXEL_SIZE_TOL: Final = 0.01
 """Sizes of pixels that count as one: calibrations of one rig differ by less."""
 POSITION_ATLAS_PX: Final = 1024
 ROWS_PER_NOISE_BAND: Final = 256
+SECONDS_KEYS: Final = ("strain_s", "convolution_s")
 RELIEF_SOURCES: Final = ("patches", "noise")
-EXTRAPOLATION_MODES: Final = ("hold", "formula")
+Extrapolation = Literal["hold", "formula"]
+EXTRAPOLATION_MODES: Final[tuple[Extrapolation, ...]] = get_args(Extrapolation)
 MAX_EXR_SIDE_PX: Final = 8192
 """Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
-
-Choice = TypeVar("Choice", bound=str)
-
-
-def one_of(option: str, value: str, choices: tuple[Choice, ...]) -> Choice:
-    """Return an option's value when it is one of the choices.
-
-    Raises
-    ------
-    ApplyError
-        It is none.
-    """
-    for choice in choices:
-        if value == choice:
-            return choice
-    raise ApplyError(f"{option}: got {value!r}, expected one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +93,7 @@ class Relief:
     size_px: int
     site: str | None
     source: str
-    extrapolate: Literal["hold", "formula"]
+    extrapolate: Extrapolation
     seed: int
     aside: Path
     mesh_sha256: str
@@ -135,48 +123,102 @@ class Relief:
         """
         if not MIN_PATCH_PX <= size_px <= 65_536:
             raise ApplyError(f"size: got {size_px}, expected {MIN_PATCH_PX} to 65536 px")
-        mesh = blend_shapes.load(path)
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
-        shaped, own = _with_states(mesh, list(used))
-        held = one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES)
-        kept: Literal["hold", "formula"] = "hold" if held == "hold" else "formula"
-        moved = {n: w for n, w in used.items() if n in shaped.shapes}
-        aside = out.with_name(f"{out.name}-large")
-        made_of = one_of("synthesize", source, RELIEF_SOURCES)
+        shaped, own = _with_states(blend_shapes.load(path), list(used))
         return Relief(
-            shaped, moved, own, size_px, site, made_of, kept, seed, aside, _sha256(path), progress
+            shaped,
+            {name: weight for name, weight in used.items() if name in shaped.shapes},
+            own,
+            size_px,
+            site,
+            one_of("synthesize", source, RELIEF_SOURCES, ApplyError),
+            one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES, ApplyError),
+            seed,
+            out.with_name(f"{out.name}-large"),
+            _sha256(path),
+            progress,
         )
 
     def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
         sites = dict(part["sites"])
-        if self.site is not None and self.site not in sites:
-            raise ApplyError(f"site: got {self.site!r}, expected one of {', '.join(sites)}")
+        if self.site is not None:
+            one_of("site", self.site, sites, ApplyError)
         names = [self.site] if self.site is not None else list(sites)
-        scale = _scale(self.mesh)
-        rng = np.random.default_rng(self.seed)
-        patches = {name: [_patch(name, appearance, sites[name])] for name in names}
-        pixels_um = [float(sites[name]["pixel_um"]) for name in names]
+        regions = _regions(self.mesh, names)
+        neutral = self._neutral(appearance, {name: sites[name] for name in names}, regions)
+        tables = tuple(
+            KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
+        )
+        self.progress("strain and convolution")
+        moved = apply_microstructure(
+            self.mesh,
+            self.weights,
+            neutral,
+            tables[0] if regions is None else KernelRegions(tables, regions),
+            extrapolate=self.extrapolate,
+            out=self.aside / "displacement.npy" if self.large else None,
+            progress=lambda at, of: self.progress(f"tile {at} of {of}"),
+        )
+        made = "noise as high as" if self.source == "noise" else "grown from"
+        note = f"um, {made} measured patches; texture of the mesh"
+        step = -(-self.size_px // MAX_EXR_SIDE_PX) if self.large else 1
+        if self.large:
+            why = f"EXR of {self.size_px} px: written to {self.aside.name} as .npy"
+            done.left_out.append((MICROSTRUCTURE, why))
+            note += f"; every {step}. pixel"
+        for name, height, more in (
+            ("displacement_neutral", neutral, ""),
+            ("displacement", moved.height, ", under strain"),
+        ):
+            shown = np.array(height[::step, ::step]) if self.large else np.asarray(height)
+            done.maps[name] = SkinMap(shown, "um", None, None, note + more)
+        figures = asdict(moved.report)
+        seconds = {f"{key[:-2]}_seconds": figures.pop(key) for key in SECONDS_KEYS}
+        done.figures[MICROSTRUCTURE] = {
+            "sites": names,
+            "source": self.source,
+            "tables": [table.source for table in tables],
+            "own_shapes": list(self.own_shapes),
+            **figures,
+            **seconds,
+            "seed": self.seed,
+        }
+        done.inputs["mesh"] = self.mesh_sha256
+        if self.large:
+            done.figures[MICROSTRUCTURE]["files"] = {
+                path.name: _sha256(path) for path in sorted(self.aside.glob("displacement*.npy"))
+            }
+
+    @property
+    def large(self) -> bool:
+        """Whether the maps are too large for EXR."""
+        return self.size_px > MAX_EXR_SIDE_PX
+
+    def _neutral(
+        self, appearance: SkinAppearance, sites: Mapping[str, Any], regions: Float64Array | None
+    ) -> Any:
+        """Return the neutral relief on the mesh's texture, um: grown patches, or noise."""
+        patches = {name: [_patch(name, appearance, entry)] for name, entry in sites.items()}
+        pixels_um = [float(entry["pixel_um"]) for entry in sites.values()]
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --site"
             )
-        regions = _regions(self.mesh, names)
-        large = self.size_px > MAX_EXR_SIDE_PX
+        rng, scale = np.random.default_rng(self.seed), _scale(self.mesh)
+        shape = f"{self.size_px} x {self.size_px}"
         neutral: Any = None
-        if large:
+        if self.large:
             self.aside.mkdir(parents=True, exist_ok=True)
             growing = self.aside / "displacement_neutral.npy.part"
             neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (self.size_px,) * 2)
         if self.source == "noise":
-            self.progress(f"draw noise on {self.size_px} x {self.size_px} pixels")
+            self.progress(f"draw noise on {shape} pixels")
             rms_um = float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
             neutral = _noise(self.mesh, self.size_px, rms_um, scale, rng=rng, out=neutral)
         else:
-            self.progress(
-                f"grow the relief of {', '.join(names)} to {self.size_px} x {self.size_px}"
-            )
+            self.progress(f"grow the relief of {', '.join(sites)} to {shape}")
             neutral = displacement_synthesis.grow(
                 patches,
                 self.size_px,
@@ -187,62 +229,19 @@ class Relief:
                 patch_pixel_um=float(np.mean(pixels_um)),
                 threads=2,
             )
-        if large:
+        if self.large:
             neutral.flush()
             os.replace(growing, self.aside / "displacement_neutral.npy")
-        tables = tuple(
-            KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
-        )
-        kernels = tables[0] if regions is None else KernelRegions(tables, regions)
-        self.progress("strain and convolution")
-        moved = apply_microstructure(
-            self.mesh,
-            self.weights,
-            neutral,
-            kernels,
-            extrapolate=self.extrapolate,
-            out=self.aside / "displacement.npy" if large else None,
-            progress=lambda at, of: self.progress(f"tile {at} of {of}"),
-        )
-        made = "noise as high as" if self.source == "noise" else "grown from"
-        note = f"um, {made} measured patches; texture of the mesh"
-        if large:
-            done.left_out.append(
-                (MICROSTRUCTURE, f"EXR of {self.size_px} px: written to {self.aside.name} as .npy")
-            )
-            step = -(-self.size_px // MAX_EXR_SIDE_PX)
-            note += f"; every {step}. pixel"
-            shown = [np.array(each[::step, ::step]) for each in (neutral, moved.height)]
-        else:
-            shown = [neutral, np.asarray(moved.height)]
-        done.maps["displacement_neutral"] = SkinMap(shown[0], "um", None, None, note)
-        done.maps["displacement"] = SkinMap(shown[1], "um", None, None, f"{note}, under strain")
-        figures = moved.report.to_dict()
-        seconds = ("strain_s", "convolution_s")
-        done.figures[MICROSTRUCTURE] = {
-            "sites": names,
-            "source": self.source,
-            "tables": [table.source for table in tables],
-            "own_shapes": list(self.own_shapes),
-            **{key: value for key, value in figures.items() if key not in seconds},
-            **{f"{key[:-2]}_seconds": figures[key] for key in seconds},
-            "seed": self.seed,
-        }
-        done.inputs["mesh"] = self.mesh_sha256
-        if large:
-            done.figures[MICROSTRUCTURE]["files"] = {
-                path.name: _sha256(path) for path in sorted(self.aside.glob("displacement*.npy"))
-            }
+        return neutral
 
 
 def _sha256(path: Path) -> str:
     if path.is_dir():  # OBJ files of a folder
-        digest = hashlib.sha256()
+        total = hashlib.sha256()
         for each in sorted(path.iterdir()):
-            digest.update(each.name.encode() + bytes.fromhex(_sha256(each)))
-        return digest.hexdigest()
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+            total.update(each.name.encode() + bytes.fromhex(_sha256(each)))
+        return total.hexdigest()
+    return digest(path)
 
 
 def _with_states(
@@ -299,18 +298,12 @@ def _noise(
     target = np.empty((size_px, size_px), np.float32) if out is None else out
     columns = (np.arange(size_px) + 0.5) * POSITION_ATLAS_PX / size_px - 0.5
     for top in range(0, size_px, ROWS_PER_NOISE_BAND):
-        rows = (
-            np.arange(top, min(top + ROWS_PER_NOISE_BAND, size_px)) + 0.5
-        ) * POSITION_ATLAS_PX / size_px - 0.5
+        rows = columns[top : top + ROWS_PER_NOISE_BAND]
         at = np.meshgrid(rows, columns, indexing="ij")
-        points = np.stack(
-            [
-                ndimage.map_coordinates(places[..., k], at, order=1, mode="nearest")
-                for k in range(3)
-            ],
-            axis=-1,
+        along = (
+            ndimage.map_coordinates(places[..., k], at, order=1, mode="nearest") for k in range(3)
         )
-        target[top : top + len(rows)] = noise.at(points)
+        target[top : top + len(rows)] = noise.at(np.stack(list(along), axis=-1))
     return target
 
 
@@ -329,7 +322,6 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
         return None
-
     unknown = [name for name in names if name not in SITE_REGIONS]
     if unknown:
         raise ApplyError(
@@ -345,10 +337,8 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
 
 
 def _atlas(mesh: BlendShapeMesh) -> Any:
-
     return unwrap(_face(mesh), REGION_ATLAS_PX)
 
 
 def _face(mesh: BlendShapeMesh) -> Any:
-
     return build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv)

@@ -25,8 +25,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.arrays import Float64Array, Int64Array
+from skinrig.arrays import Float64Array
 from skinrig.blend_shapes.errors import BlendShapeFileError
+from skinrig.blend_shapes.obj import MeshArrays
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 COMPONENT_DTYPES: Final[dict[int, np.dtype[Any]]] = {
@@ -125,10 +126,9 @@ class _Gltf:
             self.buffers[number] = data
         return self.buffers[number]
 
-    def _rows(
-        self, view_number: int, offset: int, count: int, component: int, width: int
-    ) -> NDArray[Any]:
-        """Return (count, width) numbers of a view of a buffer."""
+    def _rows(self, entry: dict[str, Any], count: int, component: int, width: int) -> NDArray[Any]:
+        """Return (count, width) numbers of an entry's view of a buffer."""
+        view_number, offset = int(entry["bufferView"]), int(entry.get("byteOffset", 0))
         kind = COMPONENT_DTYPES[component]
         view = self.document["bufferViews"][view_number]
         stride = int(view.get("byteStride", 0)) or kind.itemsize * width
@@ -145,38 +145,28 @@ class _Gltf:
         entry = self.document["accessors"][number]
         if entry["type"] != kind:
             raise self.wrong(f"accessor {number}: got {entry['type']}, expected {kind}")
-        component, count, width = (
-            int(entry["componentType"]),
-            int(entry["count"]),
-            ACCESSOR_WIDTHS[kind],
-        )
+        component, count = int(entry["componentType"]), int(entry["count"])
+        width = ACCESSOR_WIDTHS[kind]
         if component not in COMPONENT_DTYPES:
             raise self.wrong(f"accessor {number}: got component type {component}")
         if "bufferView" in entry:
-            offset = int(entry.get("byteOffset", 0))
-            values = self._rows(int(entry["bufferView"]), offset, count, component, width)
+            values = self._rows(entry, count, component, width)
         else:
             values = np.zeros((count, width), COMPONENT_DTYPES[component])
         if "sparse" in entry:
             sparse = entry["sparse"]
             n, at, new = int(sparse["count"]), sparse["indices"], sparse["values"]
-            places = self._rows(
-                int(at["bufferView"]), int(at.get("byteOffset", 0)), n, int(at["componentType"]), 1
-            )[:, 0]
+            places = self._rows(at, n, int(at["componentType"]), 1)[:, 0]
             if n and int(places.max()) >= count:
                 raise self.wrong(f"accessor {number}: a sparse index is beyond {count - 1}")
-            values[places] = self._rows(
-                int(new["bufferView"]), int(new.get("byteOffset", 0)), n, component, width
-            )
+            values[places] = self._rows(new, n, component, width)
         if entry.get("normalized") and values.dtype.kind in "iu":
             top = float(np.iinfo(values.dtype).max)
             return np.asarray(np.maximum(values.astype(np.float64) / top, -1.0))
         return values
 
 
-def read(
-    path: Path, part: str | None
-) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
+def read(path: Path, part: str | None) -> MeshArrays:
     """Read the mesh with morph targets of a glTF file.
 
     Parameters
@@ -205,9 +195,7 @@ def read(
         raise gltf.wrong(f"a part is missing or of a wrong kind: {error!r}") from error
 
 
-def _read(
-    gltf: _Gltf, part: str | None
-) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
+def _read(gltf: _Gltf, part: str | None) -> MeshArrays:
     number = _chosen(gltf, part)
     mesh = gltf.document["meshes"][number]
     matrix = _transform(gltf, number)
@@ -244,9 +232,8 @@ def _read(
         count += len(points)
     if len({len(targets) for targets in moved}) != 1:
         raise gltf.wrong("primitives of the mesh differ in their number of targets")
-    names = mesh.get("extras", {}).get("targetNames") or [
-        f"shape_{i}" for i in range(len(moved[0]))
-    ]
+    unnamed = [f"shape_{i}" for i in range(len(moved[0]))]
+    names = mesh.get("extras", {}).get("targetNames") or unnamed
     if len(names) != len(moved[0]) or len(set(names)) != len(names):
         raise gltf.wrong(f"got {len(names)} names of targets, expected {len(moved[0])} distinct")
     shapes = {

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.arrays import Float32Array, Float64Array, Int32Array, Int64Array
+from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf
 from skinrig.blend_shapes import obj as blend_shape_obj
 from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
@@ -143,20 +143,18 @@ def load(
         raise BlendShapeError(f"unit_mm: got {unit_mm}, expected a number above 0")
     if not source.exists():
         raise BlendShapeFileError(f"{source}: no such file or folder")
+    scale = 1.0 if unit_mm is None else unit_mm
     if source.is_dir() or kind == ".obj":
         vertices, uv, faces, deltas = blend_shape_obj.read(source, shapes)
-        scale = 1.0
     elif kind in (".gltf", ".glb"):
         vertices, uv, faces, deltas = blend_shape_gltf.read(source, part)
-        scale = MM_PER_M
+        scale = MM_PER_M if unit_mm is None else unit_mm
     elif kind == ".npz":
         vertices, uv, faces, deltas = _read_npz(source)
-        scale = 1.0
     else:
         raise BlendShapeFileError(
             f"{source}: got {kind or 'no suffix'}, expected .npz, .obj, .gltf, .glb or a folder"
         )
-    scale = scale if unit_mm is None else unit_mm
     return BlendShapeMesh(
         np.asarray(scale * vertices, np.float32),
         np.asarray(uv, np.float32),
@@ -165,7 +163,7 @@ def load(
     )
 
 
-def _read_npz(path: Path) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
+def _read_npz(path: Path) -> blend_shape_obj.MeshArrays:
     try:
         with np.load(path, allow_pickle=False) as archive:
             missing = [key for key in NPZ_KEYS if key not in archive]

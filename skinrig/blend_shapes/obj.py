@@ -15,6 +15,8 @@ import numpy as np
 from skinrig.arrays import Float64Array, Int64Array
 from skinrig.blend_shapes.errors import BlendShapeFileError
 
+MeshArrays = tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]
+"""Vertices (V, 3), texture coordinates (V, 2), triangles (F, 3), and shapes by name (V, 3)."""
 NEUTRAL = "neutral"
 """Stem of the neutral file of a folder, in any case."""
 
@@ -29,9 +31,7 @@ class ObjMesh:
     """Triangles, (F, 3, 2): position and texture index of each corner."""
 
 
-def read(
-    path: Path, shapes: Mapping[str, Path] | None
-) -> tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]:
+def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
     """Read a neutral OBJ and its shapes.
 
     Parameters

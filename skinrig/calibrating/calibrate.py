@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -11,14 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from capture import raw
-from capture.calibration import polarization, sensor, store
+from capture.calibration import polarization, store
 from capture.calibration.color import chart, colorimetry, white
 from capture.calibration.color import matrix as color
 from capture.calibration.fiber.phantom import read_certificate
-from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array
 from skinrig.calibrating import dome, gradient, probe, white_tile
+from skinrig.calibrating.outcome import CalibratingError, Made, photon_transfer, provenance
+from skinrig.console import picked
+from skinrig.errors import one_of
 
 CALIBRATION_KINDS = (
     "sensor",
@@ -30,21 +31,12 @@ CALIBRATION_KINDS = (
 )
 
 
-class CalibratingError(ValueError):
-    """Sessions that do not hold the frames a calibration needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome(Made):
     """A calibration that was made, and how it differs from the one before it."""
 
-    calibration: store.Calibration
     path: Path
     drift: tuple[store.Drift, ...]
-    summary: tuple[tuple[str, str], ...]
-    """What to tell the user: quantity and value with standard error."""
-    findings: tuple[str, ...] = ()
-    """What is wrong with the rig."""
 
 
 def calibrate(
@@ -82,43 +74,36 @@ def calibrate(
     NoTileError
         When the frames for "white" show something else than a white tile.
     """
-    if kind not in CALIBRATION_KINDS:
-        raise CalibratingError(
-            f"kind: got {kind!r}, expected one of {', '.join(CALIBRATION_KINDS)}"
-        )
+    one_of("kind", kind, CALIBRATION_KINDS, CalibratingError)
     opened = [Session.open(path) for path in sessions]
     if not opened:
         raise CalibratingError("sessions: got none, expected at least one folder")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
-    findings: tuple[str, ...] = ()
     if kind == probe.FIBER_CALIBRATION_KIND:
         paper = None if phantom is None else read_certificate(phantom)
-        done = probe.calibrate_probe(opened, out, made_on, certificate=paper)
-        calibration, summary, findings = done.calibration, done.summary, done.findings
+        made = probe.calibrate_probe(opened, out, made_on, certificate=paper)
     elif gradient.of_a_gradient_sphere(opened):
-        found = gradient.calibrate_gradient(kind, opened, out, made_on)
-        calibration, summary, findings = found.calibration, found.summary, found.findings
+        made = gradient.calibrate_gradient(kind, opened, out, made_on)
     elif kind in dome.DOME_CALIBRATION_KINDS:
         made = dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
-        calibration, summary, findings = made.calibration, made.summary, made.findings
     else:
-        frames = _Frames(opened)
-        calibration = _CALIBRATION_MAKERS[kind](frames, made_on)
-        summary, findings = tuple(_summary(calibration)), tuple(frames.findings)
+        frames = _Frames(opened, made_on)
+        calibration = _CALIBRATION_MAKERS[kind](frames)
+        made = Made(calibration, tuple(_summary(calibration)), tuple(frames.findings))
     drift: tuple[store.Drift, ...] = ()
     try:
-        drift = store.drift(store.load(out, kind), calibration)
+        drift = store.drift(store.load(out, kind), made.calibration)
     except store.CalibrationMissing:
         pass
     Path(out).mkdir(parents=True, exist_ok=True)
-    path = store.save(calibration, out)
-    return Outcome(calibration, path, drift, summary, findings)
+    path = store.save(made.calibration, out)
+    return Outcome(**picked(made, "calibration", "summary", "findings"), path=path, drift=drift)
 
 
 class _Frames:
     """The frames of one camera in several sessions."""
 
-    def __init__(self, sessions: Sequence[Session]) -> None:
+    def __init__(self, sessions: Sequence[Session], created: date) -> None:
         self.sessions = sessions
         self.rig = sessions[0].rig
         serials = {view.serial for session in sessions for view in session.rig.views}
@@ -129,9 +114,7 @@ class _Frames:
                 f"cameras: got {len(named)} ({some}), expected one: give sessions of one camera; "
                 "a dome needs `calibrate geometry` and `calibrate lights` only"
             )
-        self.serial = serials.pop()
-        self.source = sessions[0].source
-        self.inputs = {session.id: session.content_hash for session in sessions}
+        self.about = {"serial": serials.pop(), **provenance(sessions, created)}
         self.findings: list[str] = []
 
     def of(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
@@ -165,43 +148,27 @@ class _Frames:
 
     def dark_level(self) -> Float32Array | float:
         """Return what a frame without light shows above its black level, (h, w, 3)."""
-        darks = [raw.linear_rgb(frame, demosaic="centered").rgb for _, frame in self.of("dark")]
+        darks = [image.rgb for image in _linear(self.of("dark"))]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
-def _sensor(frames: _Frames, created: date) -> store.Calibration:
-    by_power = defaultdict(list)
-    first = frames.need("flat")[0][1]
-    for record, frame in frames.of("flat"):
-        by_power[frames.setting(record, "power")].append(frame.cfa)
-    pairs = [
-        FlatPair(cfas[k], cfas[k + 1], light)
-        for light, cfas in sorted(by_power.items())
-        for k in range(0, len(cfas) - 1, 2)
-    ]
-    darks = frames.need("dark")
-    result = sensor.photon_transfer(
-        pairs,
-        [frame.cfa for _, frame in darks],
-        white_dn=first.white,
-        pattern=first.pattern,
-        dark_exposures_s=[frames.setting(record, "exposure_s") for record, _ in darks],
-        block=max(4, min(16, min(first.cfa.shape) // 32)),
-    )
-    return result.to_calibration(
-        serial=frames.serial,
-        rig=frames.rig.name,
-        source=frames.source,
-        created=created,
-        inputs=frames.inputs,
-    )
+def _linear(shots: Sequence[tuple[FrameRecord, raw.RawFrame]]) -> list[raw.LinearImage]:
+    """Return camera RGB of frames at half their resolution."""
+    return [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
 
 
-def _white(frames: _Frames, created: date) -> store.Calibration:
+def _sensor(frames: _Frames) -> store.Calibration:
+    flats = [(frames.setting(record, "power"), frame) for record, frame in frames.need("flat")]
+    darks = [(frames.setting(record, "exposure_s"), frame) for record, frame in frames.need("dark")]
+    result = photon_transfer(flats, darks)
+    return result.to_calibration(**frames.about)
+
+
+def _white(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("subject", polarizer="crossed")
     powers = [frames.setting(record, "power") for record, _ in shots]
-    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    linear = _linear(shots)
     for (record, _), image in zip(shots, linear, strict=True):
         what = f"frame {record.step_id} of state {record.index.get('state')!r}"
         frames.findings += white_tile.examine(image.rgb - dark, image.valid, what)
@@ -215,23 +182,16 @@ def _white(frames: _Frames, created: date) -> store.Calibration:
         # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
         degree=None,
     )
-    return reference.to_calibration(
-        serial=frames.serial,
-        rig=frames.rig.name,
-        source=frames.source,
-        created=created,
-        inputs=frames.inputs,
-    )
+    return reference.to_calibration(**frames.about)
 
 
 WHITE_TILE_REFLECTANCE = 0.99
 """Of the white tile, pressed PTFE or the like, between 400 and 700 nm."""
 
 
-def _color(frames: _Frames, created: date) -> store.Calibration:
+def _color(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
-    shots = frames.need("chart", polarizer="crossed")
-    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    linear = _linear(frames.need("chart", polarizer="crossed"))
     image = np.mean([picture.rgb - dark for picture in linear], axis=0)
     valid = np.logical_and.reduce([picture.valid for picture in linear])
     centers = chart.find_chart(image)
@@ -245,22 +205,14 @@ def _color(frames: _Frames, created: date) -> store.Calibration:
         white=neutral.value,
         valid=patches.valid,
     )
-    return color.to_calibration(
-        fit,
-        neutral,
-        serial=frames.serial,
-        rig=frames.rig.name,
-        source=frames.source,
-        created=created,
-        inputs=frames.inputs,
-    )
+    return color.to_calibration(fit, neutral, **frames.about)
 
 
-def _polarization(frames: _Frames, created: date) -> store.Calibration:
+def _polarization(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("malus")
     angles = np.deg2rad([frames.setting(record, "analyser_deg") for record, _ in shots])
-    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    linear = _linear(shots)
     images = [picture.rgb - dark for picture in linear]
     valid = np.logical_and.reduce([picture.valid for picture in linear])
     chosen = polarization.modulated_pixels(angles, images, valid=valid)
@@ -271,16 +223,10 @@ def _polarization(frames: _Frames, created: date) -> store.Calibration:
     variance = np.array([p.variance[chosen].sum(axis=0) for p in linear]) / count**2
     fit = polarization.fit_malus(angles, mean, variance=variance)
     result = polarization.PolarizationCalibration.from_fit(fit, ("R", "G", "B"))
-    return result.to_calibration(
-        serial=frames.serial,
-        rig=frames.rig.name,
-        source=frames.source,
-        created=created,
-        inputs=frames.inputs,
-    )
+    return result.to_calibration(**frames.about)
 
 
-_CALIBRATION_MAKERS: dict[str, Callable[[_Frames, date], store.Calibration]] = {
+_CALIBRATION_MAKERS: dict[str, Callable[[_Frames], store.Calibration]] = {
     "sensor": _sensor,
     "color": _color,
     "polarization": _polarization,

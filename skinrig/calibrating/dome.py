@@ -19,13 +19,10 @@ from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float64Array
+from skinrig.calibrating.outcome import CalibratingError, Made, numbered, provenance
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
-
-
-class DomeCalibratingError(ValueError):
-    """Sessions that do not hold what a calibration of the dome needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +45,6 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
     return DomeTargets(board, sphere_radius_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class DomeCalibration:
-    """A calibration of the dome and what to say of it."""
-
-    calibration: store.Calibration
-    summary: tuple[tuple[str, str], ...]
-    findings: tuple[str, ...]
-    """What is wrong with the rig: a moved camera, a dead light, lights in the wrong order."""
-
-
 def calibrate_dome(
     kind: str,
     sessions: Sequence[Session],
@@ -65,7 +52,7 @@ def calibrate_dome(
     created: date,
     *,
     targets: DomeTargets | None = None,
-) -> DomeCalibration:
+) -> Made:
     """Make the calibration "geometry" or "lights" of a dome.
 
     Parameters
@@ -84,44 +71,42 @@ def calibrate_dome(
 
     Raises
     ------
-    DomeCalibratingError
+    CalibratingError
         When the frames that are needed are missing.
     """
     rigs = {session.rig.name for session in sessions}
     if len(rigs) != 1:
-        raise DomeCalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
+        raise CalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
     if "dome" not in sessions[0].rig.boxes:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
         )
-    what = targets or DomeTargets()
-    if kind == "geometry":
-        return _geometry(sessions, Path(folder), created, what)
-    return _lights(sessions, Path(folder), created, what)
+    make = _geometry if kind == "geometry" else _lights
+    return make(sessions, Path(folder), created, targets or DomeTargets())
 
 
-def _frames(sessions: Sequence[Session], kind: str) -> Iterator[tuple[int, Session, FrameRecord]]:
+def _frames(
+    sessions: Sequence[Session], kind: str, place: str
+) -> Iterator[tuple[int, Session, FrameRecord]]:
+    """Yield frames with the number of their place, over all sessions."""
     for number, session in enumerate(sessions):
         for record in session.frames(kind):
-            yield number, session, record
+            yield SESSION_STEP * number + int(record.index[place]), session, record
 
 
-def _geometry(
-    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
-) -> DomeCalibration:
+def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
     rig = sessions[0].rig
     sightings: dict[tuple[str, int], Sighting] = {}
     without = 0
-    for number, session, record in _frames(sessions, "charuco"):
+    for pose, session, record in _frames(sessions, "charuco", "pose"):
         image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
         sighting = find_board(image, what.board)
         if sighting is None:
             without += 1
         else:
-            pose = SESSION_STEP * number + int(record.index["pose"])
             sightings[record.camera, pose] = sighting
     if not sightings:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             f"sessions: the board was found in none of {without} frames of kind 'charuco'; capture"
             " it (`skinrig simulate dome --target charuco`), or say its squares"
         )
@@ -138,22 +123,12 @@ def _geometry(
         center, error = camera.center_mm, np.sqrt(np.diag(found.center_covariance_mm2[name]))
         place = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
         focal, focal_error = camera.matrix[0, 0], camera.matrix_stderr[0, 0]
-        summary.append(
-            (
-                f"{name} ({camera.serial})",
-                f"{found.rms_px[name]:.3f} px; centre {place} mm; "
-                f"f {focal:.1f} ± {focal_error:.1f} px",
-            )
-        )
+        told = f"centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px"
+        summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {told}"))
     calibration = geometry.to_calibration(
-        found.cameras,
-        rig=rig.name,
-        source=sessions[0].source,
-        created=created,
-        reprojection_px=found.rms_px,
-        inputs={session.id: session.content_hash for session in sessions},
+        found.cameras, reprojection_px=found.rms_px, **provenance(sessions, created)
     )
-    return DomeCalibration(calibration, tuple(summary), findings)
+    return Made(calibration, tuple(summary), findings)
 
 
 def _moved(
@@ -167,9 +142,7 @@ def _moved(
         return ()
 
 
-def _lights(
-    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
-) -> DomeCalibration:
+def _lights(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
     rig = sessions[0].rig
     cameras = geometry.poses_from(store.load(folder, "geometry"), rig)
     table = LightTable.nominal(rig)
@@ -178,7 +151,7 @@ def _lights(
     notes = {}
     kinds = {record.kind for session in sessions for record in session.frames()}
     if not kinds & {"mirror", "white"}:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
             " simulate dome --target mirror`, `--target white`)"
         )
@@ -210,17 +183,11 @@ def _lights(
         table = fit.table
         lit = table.intensity[table.valid]
         relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
+        count = int((table.intensity > 0).all(axis=1).sum())
+        shared = f"{100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance"
         summary += [
-            (
-                "lights measured",
-                f"{int((table.intensity > 0).all(axis=1).sum())} of"
-                f" {len(rig.lights)}, in {fit.frames} frames",
-            ),
-            (
-                "standard error of an intensity",
-                f"{100 * np.median(relative):.2f} % (and"
-                f" {100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance)",
-            ),
+            ("lights measured", f"{count} of {len(rig.lights)}, in {fit.frames} frames"),
+            ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and {shared})"),
             ("residual of the plate's parts", f"{100 * fit.residual:.2f} %"),
         ]
         for serial, response in table.cameras.items():
@@ -234,13 +201,9 @@ def _lights(
     else:
         notes["intensities"] = "nominal and relative: no session of the white plate was given"
     calibration = table.to_calibration(
-        rig=rig.name,
-        source=sessions[0].source,
-        created=created,
-        notes={**notes, **{f"finding {k}": text for k, text in enumerate(findings)}},
-        inputs={session.id: session.content_hash for session in sessions},
+        notes={**notes, **numbered(findings)}, **provenance(sessions, created)
     )
-    return DomeCalibration(calibration, tuple(summary), tuple(findings))
+    return Made(calibration, tuple(summary), tuple(findings))
 
 
 def _mirror(
@@ -252,7 +215,7 @@ def _mirror(
     """Return the lights' places from the frames of mirror spheres."""
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}
-    for number, session, record in _frames(sessions, "mirror"):
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         if record.index.get("light") != "outline":
             continue
         frame = session.read(record)
@@ -260,10 +223,9 @@ def _mirror(
         image = neutral_mosaic(frame, colors[record.camera])
         edges = mirror_sphere.find_outline(image, cameras[record.camera], what.sphere_radius_mm)
         if edges is not None:
-            sphere = SESSION_STEP * number + int(record.index["sphere"])
             outlines.setdefault(sphere, {})[record.camera] = edges
     if not outlines:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: no outline of a mirror sphere was found; its frames of the lit dome (index"
             " light = 'outline') must show it darker than what is behind it"
         )
@@ -273,8 +235,7 @@ def _mirror(
     }
     windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
     seen = []
-    for number, session, record in _frames(sessions, "mirror"):
-        sphere = SESSION_STEP * number + int(record.index["sphere"])
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         if record.index.get("light") == "outline" or sphere not in spheres:
             continue
         if record.camera not in colors:
@@ -306,14 +267,14 @@ def _white(
 ) -> list[PlateSamples]:
     """Return the parts of the white plate in all frames lit by one light."""
     markers: dict[tuple[str, int], Sighting] = {}
-    for number, session, record in _frames(sessions, "white"):
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several":
             image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
             sighting = what.plate.find(image)
             if sighting is not None:
-                markers[record.camera, SESSION_STEP * number + int(record.index["pose"])] = sighting
+                markers[record.camera, pose] = sighting
     if not markers:
-        raise DomeCalibratingError(
+        raise CalibratingError(
             "sessions: the white plate's markers were found in no frame lit by several lights"
             " (index light = 'several')"
         )
@@ -323,8 +284,7 @@ def _white(
     }
     windows: dict[tuple[str, int], PlateWindow | None] = {}
     samples = []
-    for number, session, record in _frames(sessions, "white"):
-        pose = SESSION_STEP * number + int(record.index["pose"])
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several" or pose not in places:
             continue
         key = (record.camera, pose)
@@ -335,14 +295,6 @@ def _white(
             continue
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
-        samples.append(
-            window.sample(
-                shot.rgb,
-                shot.variance,
-                shot.valid,
-                view=record.camera,
-                light=str(record.settings["light"]),
-                on_s=on_s,
-            )
-        )
+        light, seen = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
+        samples.append(window.sample(*seen, view=record.camera, light=light, on_s=on_s))
     return samples

@@ -4,39 +4,30 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 
-from capture.calibration import sensor, store
 from capture.calibration.fiber.spot_photometry import Shot, shot
 from capture.calibration.led_sphere.findings import SphereSurvey
 from capture.calibration.led_sphere.survey import GlassBall, survey_sphere
 from capture.calibration.record import Quantity
-from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.raw import RawFrame
 from capture.session import FrameRecord, Session
-from skinrig.arrays import Float32Array, Float64Array, UInt16Array
+from skinrig.arrays import Float32Array, Float64Array
+from skinrig.calibrating.outcome import (
+    CalibratingError,
+    Made,
+    numbered,
+    photon_transfer,
+    provenance,
+    sensor_in,
+)
 
 GRADIENT_CALIBRATION_KINDS = ("sensor", "lights", "polarization")
 ANALYZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser in each of its named states."""
-
-
-class GradientCalibratingError(ValueError):
-    """Sessions that do not hold what a calibration of the gradient sphere needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class GradientCalibration:
-    """A calibration of the gradient sphere and what to say of it."""
-
-    calibration: store.Calibration
-    summary: tuple[tuple[str, str], ...]
-    findings: tuple[str, ...]
-    """What is wrong with the rig: dead lights, an analyser that is off."""
 
 
 def of_a_gradient_sphere(sessions: Sequence[Session]) -> bool:
@@ -51,7 +42,7 @@ def calibrate_gradient(
     created: date,
     *,
     target: GlassBall | None = None,
-) -> GradientCalibration:
+) -> Made:
     """Make the calibration "sensor", "lights" or "polarization" of a gradient sphere.
 
     Parameters
@@ -69,7 +60,7 @@ def calibrate_gradient(
 
     Raises
     ------
-    GradientCalibratingError
+    CalibratingError
         When the frames that are needed are missing, or are of several rigs or cameras.
     BallError, PolarizationError
         When the ball's frames do not tell what is wanted.
@@ -77,45 +68,29 @@ def calibrate_gradient(
     rigs = {session.rig.name for session in sessions}
     serials = {view.serial for session in sessions for view in session.rig.views}
     if len(rigs) != 1 or len(serials) != 1:
-        raise GradientCalibratingError(
+        raise CalibratingError(
             f"sessions: got rigs {sorted(rigs)} with cameras {sorted(serials)}, expected one rig"
             " with one camera"
         )
     if kind not in GRADIENT_CALIBRATION_KINDS:
         known = ", ".join(GRADIENT_CALIBRATION_KINDS)
-        raise GradientCalibratingError(
-            f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}"
-        )
+        raise CalibratingError(f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}")
     if kind == "sensor":
         return _sensor(sessions, created)
     survey, notes = _survey(sessions, Path(folder), created, target or GlassBall())
-    rig, view = sessions[0].rig, sessions[0].rig.views[0]
     findings = (*survey.findings, *notes)
-    told = {f"finding {k}": text for k, text in enumerate(findings)}
-    inputs = {session.id: session.content_hash for session in sessions}
-    source = sessions[0].source
+    about = {"notes": numbered(findings), **provenance(sessions, created)}
     if kind == "lights":
-        made = survey.lights.to_calibration(
-            rig=rig.name,
-            source=source,
-            created=created,
-            notes=told,
-            inputs=inputs,
-            ball=_ball_quantities(survey),
-        )
-        return GradientCalibration(made, _lights_summary(survey), findings)
-    made = survey.films.to_calibration(
-        serial=view.serial, rig=rig.name, source=source, created=created, notes=told, inputs=inputs
-    )
-    return GradientCalibration(made, _films_summary(survey), findings)
+        made = survey.lights.to_calibration(ball=_ball_quantities(survey), **about)
+        return Made(made, _lights_summary(survey), findings)
+    made = survey.films.to_calibration(serial=sessions[0].rig.views[0].serial, **about)
+    return Made(made, _films_summary(survey), findings)
 
 
-def _frames(
-    sessions: Sequence[Session], kind: str, need: bool = True
-) -> list[tuple[FrameRecord, Session]]:
+def _frames(sessions: Sequence[Session], kind: str) -> list[tuple[FrameRecord, Session]]:
     found = [(record, session) for session in sessions for record in session.frames(kind)]
-    if need and not found:
-        raise GradientCalibratingError(
+    if not found:
+        raise CalibratingError(
             f"sessions: hold no frames of kind {kind!r}; capture that target (`skinrig simulate"
             f" gradient --target {kind}`, or `skinrig capture gradient --target {kind}`)"
         )
@@ -127,7 +102,7 @@ def _survey(
 ) -> tuple[SphereSurvey, tuple[str, ...]]:
     with_ball = {session.id for _, session in _frames(sessions, "ball")}
     if len(with_ball) > 1:
-        raise GradientCalibratingError(
+        raise CalibratingError(
             f"sessions: got {len(with_ball)} of the ball, expected one; between two the ball has"
             " moved, so calibrate from each alone"
         )
@@ -135,7 +110,7 @@ def _survey(
     flat, notes = _flat_field(folder, sessions[0], created)
     shots = tuple(_shots(sessions, flat))
     if not shots:
-        raise GradientCalibratingError(
+        raise CalibratingError(
             "sessions: hold no frames of the ball under pattern 'full' at a level above 0"
         )
     return survey_sphere(shots, rig, view=rig.views[0].name, target=target), notes
@@ -161,7 +136,7 @@ def _shots(sessions: Sequence[Session], flat: Float64Array | float) -> Iterator[
         offset = 0.0 if frame.noise_profile is None else frame.noise_profile[1]
         yield shot(
             frame,
-            amount_s=exposure_s * float(record.settings["level"]),
+            amount_s=_light_s(record),
             reading_deg=_reading_deg(record),
             dark=0.0 if dark is None else dark,
             dark_variance=offset / count if count else 0.0,
@@ -174,63 +149,43 @@ def _above_black(frame: RawFrame) -> Float32Array:
     return (frame.cfa.astype(np.float32) - black) / (np.float32(frame.white) - black)
 
 
+def _light_s(record: FrameRecord) -> float:
+    """Return the seconds at full level that give as much light as a frame had."""
+    return float(record.settings["level"]) * float(record.settings["exposure_s"])
+
+
 def _reading_deg(record: FrameRecord) -> float:
     asked = record.settings.get("analyser_deg")
-    return (
-        float(asked)
-        if asked is not None
-        else ANALYZER_READING_DEG[str(record.settings["polarizer"])]
-    )
+    if asked is not None:
+        return float(asked)
+    return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
 
 
 def _flat_field(
     folder: Path, session: Session, created: date
 ) -> tuple[Float64Array | float, tuple[str, ...]]:
     """Return the camera's flat field, from the folder's sensor calibration where there is one."""
-    view = session.rig.views[0]
-    try:
-        found = store.load(folder, "sensor")
-        store.require(
-            found, rig=session.rig.name, serials=[view.serial], on_date=created, kind="sensor"
-        )
-    except store.CalibrationMissing:
+    known = sensor_in(folder, session, created)
+    if known is None:
         return 1.0, (
             "the folder holds no sensor calibration: intensities hold the lens's own shading;"
             " calibrate sensor first",
         )
-    known = sensor.SensorCalibration.from_calibration(found, view.serial)
+    view = session.rig.views[0]
     return known.flat_mosaic(view.height_px, view.width_px), ()
 
 
-def _sensor(sessions: Sequence[Session], created: date) -> GradientCalibration:
-    by_light: dict[float, list[UInt16Array]] = defaultdict(list)
-    frames = _frames(sessions, "flat")
-    first = frames[0][1].read(frames[0][0])
-    for record, session in frames:
-        light = float(record.settings["level"]) * float(record.settings["exposure_s"])
-        by_light[light].append(session.read(record).cfa)
-    pairs = [
-        FlatPair(stack[k], stack[k + 1], light)
-        for light, stack in sorted(by_light.items())
-        for k in range(0, len(stack) - 1, 2)
+def _sensor(sessions: Sequence[Session], created: date) -> Made:
+    flats = [
+        (_light_s(record), session.read(record)) for record, session in _frames(sessions, "flat")
     ]
-    darks = _frames(sessions, "dark")
-    result = sensor.photon_transfer(
-        pairs,
-        [session.read(record).cfa for record, session in darks],
-        white_dn=first.white,
-        pattern=first.pattern,
-        dark_exposures_s=[float(record.settings["exposure_s"]) for record, _ in darks],
-        block=max(4, min(16, min(first.cfa.shape) // 32)),
-    )
-    rig = sessions[0].rig
-    made = result.to_calibration(
-        serial=rig.views[0].serial,
-        rig=rig.name,
-        source=sessions[0].source,
-        created=created,
-        inputs={session.id: session.content_hash for session in sessions},
-    )
+    darks = [
+        (float(record.settings["exposure_s"]), session.read(record))
+        for record, session in _frames(sessions, "dark")
+    ]
+    result = photon_transfer(flats, darks)
+    serial = sessions[0].rig.views[0].serial
+    made = result.to_calibration(serial=serial, **provenance(sessions, created))
     rows = []
     for name, quantity, scale, unit in (
         ("gain", result.gain_e_per_dn, 1.0, "e/DN"),
@@ -240,7 +195,7 @@ def _sensor(sessions: Sequence[Session], created: date) -> GradientCalibration:
     ):
         error = 0.0 if quantity.stderr is None else scale * float(quantity.stderr[0])
         rows.append((name, f"{scale * float(quantity.value[0]):.4g} ± {error:.2g} {unit}"))
-    return GradientCalibration(made, tuple(rows), ())
+    return Made(made, tuple(rows))
 
 
 def _ball_quantities(survey: SphereSurvey) -> dict[str, Quantity]:
@@ -276,27 +231,19 @@ def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     films = survey.films
     zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
     leaked, glass = films.leakage, films.glass_leakage[films.valid]
-    return (
-        ("analyser's misalignment", f"{zero:+.3f}° ± {error:.3f}°"),
-        (
-            "extinction of the lights' films",
-            f"{1 / films.light_leak:.0f} : 1 (leak"
-            f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})",
-        ),
-        (
-            "extinction of the analyser",
-            f"{1 / films.analyser_leak:.0f} : 1 (leak"
-            f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})",
-        ),
-        ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f}°"),
-        (
-            "glass leaks crossed",
-            f"median {100 * np.median(glass):.2f} %, most {100 * glass.max():.1f} % of parallel",
-        ),
-        (
-            f"skin (eta {films.eta:g}) will leak",
-            f"median {100 * np.median(leaked):.3f} %, 9 of 10"
-            f" lights below {100 * np.quantile(leaked, 0.9):.2f} %",
-        ),
-        ("readings of the analyser", ", ".join(f"{r:g}" for r in survey.readings_deg)),
-    )
+    low = f"9 of 10 lights below {100 * np.quantile(leaked, 0.9):.2f} %"
+    rows = {
+        "analyser's misalignment": f"{zero:+.3f}° ± {error:.3f}°",
+        "extinction of the lights' films": _extinction(films.light_leak, films.light_leak_stderr),
+        "extinction of the analyser": _extinction(films.analyser_leak, films.analyser_leak_stderr),
+        "lights' polarizers off their axes": f"{np.degrees(survey.turn_scatter_rad):.2f}°",
+        "glass leaks crossed": f"median {100 * np.median(glass):.2f} %,"
+        f" most {100 * glass.max():.1f} % of parallel",
+        f"skin (eta {films.eta:g}) will leak": f"median {100 * np.median(leaked):.3f} %, {low}",
+        "readings of the analyser": ", ".join(f"{r:g}" for r in survey.readings_deg),
+    }
+    return tuple(rows.items())
+
+
+def _extinction(leak: float, stderr: float) -> str:
+    return f"{1 / leak:.0f} : 1 (leak {leak:.2e} ± {stderr:.0e})"

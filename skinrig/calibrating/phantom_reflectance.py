@@ -62,19 +62,14 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
         np.ones((1, 3)) if gray else spectra.band_weights(camera, light, wavelength_nm=wavelength)
     )
     sigma_a, sigma_s = certificate.at(wavelength)
-    radius = np.array(probe.radius_mm)
     how: dict[str, Any] = {"eta": certificate.eta, "g": certificate.g, "collection": "fibre"}
+    at = (np.array(probe.radius_mm), sigma_a[:, None], sigma_s[:, None])
+    cores: dict[str, Any] = {"core_mm": probe.fibres[0].core_mm}
+    cores["source_core_mm"] = probe.source_core_mm
     try:
-        held = photon_table.domain(radius, sigma_a[:, None], sigma_s[:, None], **how)
-        slopes = photon_table.derivatives(
-            radius,
-            sigma_a[:, None],
-            sigma_s[:, None],
-            core_mm=probe.fibres[0].core_mm,
-            source_core_mm=probe.source_core_mm,
-            **how,
-        )
-        own = photon_table.relative_error(radius, sigma_a[:, None], sigma_s[:, None], **how)
+        held = photon_table.domain(*at, **how)
+        slopes = photon_table.derivatives(*at, **(cores | how))
+        own = photon_table.relative_error(*at, **how)
     except photon_table.TableDomainError as exc:
         raise CertificateError(f"phantom: {exc}") from exc
     if not held[:, :3].any():
@@ -92,13 +87,9 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
     # the table's errors at neighboring wavelengths are the same ones: they do not average out
     stderr = band(value * np.where(np.isfinite(own), np.minimum(own, 1.0), 1.0))
     unsure = certificate.uncertainty
-    common = np.stack(
-        [
-            band(slopes.by_sigma_a * sigma_a[:, None]) * unsure.sigma_a / mean,
-            band(slopes.by_sigma_s_prime * sigma_s[:, None]) * unsure.sigma_s_prime / mean,
-        ]
-    )
-    return ExpectedReflectance(mean, stderr, common)
+    by_a = band(slopes.by_sigma_a * sigma_a[:, None]) * unsure.sigma_a / mean
+    by_s = band(slopes.by_sigma_s_prime * sigma_s[:, None]) * unsure.sigma_s_prime / mean
+    return ExpectedReflectance(mean, stderr, np.stack([by_a, by_s]))
 
 
 def packaged_certificate() -> PhantomCertificate:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from capture.calibration import sensor, store
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
 from capture.calibration.fiber.gains import calibrate_fibers
 from capture.calibration.fiber.merge import MergedSeries, merge_series
@@ -20,26 +18,12 @@ from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.calibration.fiber.readings import FiberReadings, sum_spots
 from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session
+from skinrig.calibrating.outcome import CalibratingError, Made, numbered, provenance, sensor_in
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
 FIBER_CALIBRATION_KIND: Final = "fibre"
 MIN_HEALTHY_GAIN: Final = 0.5
 """Of the usual gain: a fibre below it is told of."""
-
-
-class ProbeCalibratingError(ValueError):
-    """Sessions that do not hold what a calibration of the probe needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProbeCalibration:
-    """A calibration of a probe and what to say of it."""
-
-    calibration: store.Calibration
-    fibres: FiberCalibration
-    summary: tuple[tuple[str, str], ...]
-    findings: tuple[str, ...]
-    """What is wrong with the probe: dead fibres, spots that overlap."""
 
 
 def calibrate_probe(
@@ -48,7 +32,7 @@ def calibrate_probe(
     created: date,
     *,
     certificate: PhantomCertificate | None = None,
-) -> ProbeCalibration:
+) -> Made:
     """Make the calibration "fibre" of a probe from a session of target "phantom".
 
     Parameters
@@ -64,20 +48,20 @@ def calibrate_probe(
 
     Raises
     ------
-    ProbeCalibratingError
+    CalibratingError
         When the frames that are needed are missing, or the phantom is not known.
     CalibrationError
         When the frames do not tell what is wanted.
     """
     if len(sessions) != 1:
-        raise ProbeCalibratingError(
+        raise CalibratingError(
             f"sessions: got {len(sessions)}, expected one; between two the light may have changed,"
             " so calibrate from each alone"
         )
     session = sessions[0]
     rig = session.rig
     if rig.probe is None:
-        raise ProbeCalibratingError(
+        raise CalibratingError(
             f"kind 'fibre': got a session of rig {rig.name!r}, expected one with a fibre probe"
         )
     paper = certificate or _packaged_certificate(session)
@@ -107,17 +91,10 @@ def calibrate_probe(
     findings = (*spots.findings, *notes, *_worn(fibres))
     made = fibres.to_calibration(
         serial=rig.views[0].serial,
-        rig=rig.name,
-        source=session.source,
-        created=created,
-        notes={
-            **{f"finding {k}": text for k, text in enumerate(findings)},
-            "phantom": paper.name or "not named",
-            "noise": noise.origin,
-        },
-        inputs={session.id: session.content_hash},
+        notes={**numbered(findings), "phantom": paper.name or "not named", "noise": noise.origin},
+        **provenance(sessions, created),
     )
-    return ProbeCalibration(made, fibres, _summary(fibres, series, paper), findings)
+    return Made(made, _summary(fibres, series, paper), findings)
 
 
 class _Series:
@@ -127,7 +104,7 @@ class _Series:
         self._session, self._noise = session, noise
         darks = session.frames("dark")
         if not darks:
-            raise ProbeCalibratingError(
+            raise CalibratingError(
                 f"session {session.id}: holds no frames of kind 'dark', so the camera's dark signal"
                 " is not known; capture the phantom with darks"
             )
@@ -139,7 +116,7 @@ class _Series:
         )
         self._phantom = session.frames("phantom")
         if not self._phantom:
-            raise ProbeCalibratingError(
+            raise CalibratingError(
                 f"session {session.id}: holds no frames of kind 'phantom'; capture that target"
                 " (`skinrig simulate probe --target phantom`, or `skinrig capture probe --target"
                 " phantom`)"
@@ -150,7 +127,7 @@ class _Series:
         frames = [*self._phantom, *self._session.frames("mask")]
         levels = {float(record.settings.get("level", 1.0)) for record in frames}
         if len(levels) != 1:
-            raise ProbeCalibratingError(
+            raise CalibratingError(
                 f"session {self._session.id}: got levels {sorted(levels)} of the source, expected"
                 " one"
             )
@@ -223,24 +200,18 @@ def _temperature(records: Sequence[FrameRecord]) -> float | None:
 
 
 def _noise(folder: Path, session: Session, created: date) -> tuple[CameraNoise, tuple[str, ...]]:
-    view = session.rig.views[0]
-    try:
-        found = store.load(folder, "sensor")
-        store.require(
-            found, rig=session.rig.name, serials=[view.serial], on_date=created, kind="sensor"
-        )
-    except store.CalibrationMissing:
-        return CameraNoise.of_view(view), (
+    known = sensor_in(folder, session, created)
+    if known is None:
+        return CameraNoise.of_view(session.rig.views[0]), (
             "the folder holds no sensor calibration: gain and read noise are the camera's nominal"
             " ones",
         )
-    known = sensor.SensorCalibration.from_calibration(found, view.serial)
     return CameraNoise.of_sensor(known), ()
 
 
 def _packaged_certificate(session: Session) -> PhantomCertificate:
     if session.source != "simulated":
-        raise ProbeCalibratingError(
+        raise CalibratingError(
             "phantom: its optics are not known; give the certificate of the block that was measured"
             " as --phantom FILE.json (schema skinrig.phantom/1, see docs/probe-calibration.md)"
         )
@@ -269,12 +240,8 @@ def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
 
 
 def _worn(fibres: FiberCalibration) -> tuple[str, ...]:
-    usual = np.array(
-        [
-            np.median(g[v]) if v.any() else 1.0
-            for g, v in zip(fibres.gain.T, fibres.valid.T, strict=True)
-        ]
-    )
+    both = zip(fibres.gain.T, fibres.valid.T, strict=True)
+    usual = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in both])
     found = []
     for i, name in enumerate(fibres.names):
         if fibres.dead[i]:
@@ -292,73 +259,52 @@ def _summary(
     fibres: FiberCalibration, series: _Series, paper: PhantomCertificate
 ) -> tuple[tuple[str, str], ...]:
     spots, mixed = fibres.spots, fibres.crosstalk
-    count = len(fibres.names)
-    rows = [
-        (
-            "spots found",
-            f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
-            f" {spots.shift_px[1]:+.2f} px off their places, row turned"
-            f" {np.degrees(spots.rotation_rad):+.2f}°",
-        ),
-        ("standard error of a place", f"worst {spots.center_stderr_px[spots.found].max():.3f} px"),
-        (
-            "radius of spots, of apertures",
-            f"{spots.radius_px[spots.found].mean():.2f}, {spots.aperture_px:.2f} px",
-        ),
-    ]
+    darks, phantom, mask = series.counts
+    across, down = spots.shift_px
+    rows = {
+        "spots found": f"{int(spots.found.sum())} of {len(fibres.names)}, {across:+.2f},"
+        f" {down:+.2f} px off their places, row turned {np.degrees(spots.rotation_rad):+.2f}°",
+        "standard error of a place": f"worst {spots.center_stderr_px[spots.found].max():.3f} px",
+        "radius of spots, of apertures": f"{spots.radius_px[spots.found].mean():.2f},"
+        f" {spots.aperture_px:.2f} px",
+    }
     for c, color in enumerate(("red", "green", "blue")[: fibres.gain.shape[1]]):
-        good = fibres.valid[:, c]
-        if not good.any():
-            rows.append((f"gain {color}", "no fibre calibrated"))
-            continue
-        gain, error = (
-            fibres.gain[good, c],
-            (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c],
-        )
-        shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
-        worst = int(np.flatnonzero(good)[np.argmax(error)])
-        rows.append(
-            (
-                f"gain {color}",
-                f"{gain.min() / np.median(gain):.2f} to"
-                f" {gain.max() / np.median(gain):.2f} of the usual, {int(good.sum())} fibres;"
-                f" standard error median {100 * np.median(error):.2f} %,"
-                f" worst {100 * error.max():.2f} %"
-                f" ({fibres.names[worst]}); in common up to {100 * shape:.1f} %",
-            )
-        )
+        rows[f"gain {color}"] = _gain_text(fibres, c)
     if mixed.measured:
         first, second = (np.diagonal(mixed.matrix, k) for k in (1, 2))
-        error = np.diagonal(mixed.stderr, 1)
-        rows.append(
-            (
-                "cross-talk",
-                f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
-                f" {first.max():.1e}, standard error {np.median(error):.0e}), next"
-                f" {np.median(second):.1e}",
-            )
-        )
+        error = np.median(np.diagonal(mixed.stderr, 1))
         strays = np.abs(mixed.offset).max()
         strays_error = np.hypot(mixed.offset_stderr, mixed.offset_common).max()
-        rows.append(
-            ("stray light", f"at most {strays:.1e} ± {strays_error:.0e} full scales per second")
-        )
-        rows.append(
-            ("covers let through", f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}")
-        )
-    darks, phantom, mask = series.counts
-    rows += [
-        (
-            "dark current",
-            f"{series.darks.mean_rate_dn_per_s:.3g} ±"
-            f" {series.darks.mean_rate_stderr:.1g} DN/s, {int(series.darks.hot.sum())} hot pixels",
-        ),
-        ("dead fibres", ", ".join(np.array(fibres.names)[fibres.dead]) or "none"),
-        ("frames", f"{darks} dark, {phantom} phantom, {mask} mask"),
-        (
-            "phantom",
-            f"{paper.name or 'not named'}: uncertain by {100 * paper.uncertainty.sigma_a:g}"
-            f" % of sigma_a, {100 * paper.uncertainty.sigma_s_prime:g} % of sigma_s'",
-        ),
-    ]
-    return tuple(rows)
+        rows |= {
+            "cross-talk": f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
+            f" {first.max():.1e}, standard error {error:.0e}), next {np.median(second):.1e}",
+            "stray light": f"at most {strays:.1e} ± {strays_error:.0e} full scales per second",
+            "covers let through": f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}",
+        }
+    dark, unsure = series.darks, paper.uncertainty
+    rows |= {
+        "dark current": f"{dark.mean_rate_dn_per_s:.3g} ± {dark.mean_rate_stderr:.1g} DN/s,"
+        f" {int(dark.hot.sum())} hot pixels",
+        "dead fibres": ", ".join(np.array(fibres.names)[fibres.dead]) or "none",
+        "frames": f"{darks} dark, {phantom} phantom, {mask} mask",
+        "phantom": f"{paper.name or 'not named'}: uncertain by {100 * unsure.sigma_a:g}"
+        f" % of sigma_a, {100 * unsure.sigma_s_prime:g} % of sigma_s'",
+    }
+    return tuple(rows.items())
+
+
+def _gain_text(fibres: FiberCalibration, c: int) -> str:
+    """Return what is to be said of the gains of a channel."""
+    good = fibres.valid[:, c]
+    if not good.any():
+        return "no fibre calibrated"
+    gain = fibres.gain[good, c]
+    error = (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c]
+    shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
+    worst = fibres.names[int(np.flatnonzero(good)[np.argmax(error)])]
+    low, high = np.array([gain.min(), gain.max()]) / np.median(gain)
+    return (
+        f"{low:.2f} to {high:.2f} of the usual, {int(good.sum())} fibres;"
+        f" standard error median {100 * np.median(error):.2f} %, worst {100 * error.max():.2f} %"
+        f" ({worst}); in common up to {100 * shape:.1f} %"
+    )

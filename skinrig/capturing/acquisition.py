@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from capture.acquire import Operator, run_plan
 from capture.devices.box import Box
@@ -83,31 +83,19 @@ def capture_session(
     if order.out is None and not order.dry_run:
         raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(plan.steps)} steps, about {seconds:.0f} s")
-    for line in sequence_lines(plan):
+    light: Mapping[str, Any] = {} if rig.leds is None else light_figures(plan, rig)
+    for line in (*sequence_lines(plan), *(light_lines(plan, rig) if light else ())):
         console.say(line)
-    light: Mapping[str, Any] = {}
-    if rig.leds is not None:
-        light = light_figures(plan, rig)
-        for line in light_lines(plan, rig):
-            console.say(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
         console.say(f"{file}: the plan; change it and hand it over with --plan {shell_quote(file)}")
     if order.out is None or order.dry_run:
-        console.rows(
-            ("step", "kind", "settings"),
-            [
-                (s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
-                for s in plan.steps
-            ],
-        )
-        return {
-            "steps": len(plan.steps),
-            "estimated_s": seconds,
-            "captured": 0,
-            "light": light,
-            "plan": plan.to_json(),
-        }
+        steps = plan.steps
+        told = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
+        rows = [(s.id, s.kind, text) for s, text in zip(steps, told, strict=True)]
+        console.rows(("step", "kind", "settings"), rows)
+        figures = {"steps": len(steps), "estimated_s": seconds, "captured": 0, "light": light}
+        return figures | {"plan": plan.to_json()}
     return _run(rig, plan, order.out, order, console)
 
 
@@ -125,7 +113,7 @@ def _run(
             session = Session.resume(out)
             plan = session.plan
         else:
-            fresh = not out.exists()
+            fresh, maker = not out.exists(), next(iter(boxes.values())).identify()
             session = Session.create(
                 out,
                 plan=plan,
@@ -133,7 +121,7 @@ def _run(
                 devices={name: order.boxes[name] for name in boxes}
                 | {name: camera.info.serial for name, camera in cameras.items()},
                 subject=order.subject,
-                source=_source(next(iter(boxes.values())).identify()),
+                source="simulated" if maker.upper().startswith("RIGSIM") else "measured",
             )
             stack.enter_context(_unless_used(session, fresh, console))
         stack.callback(session.release)
@@ -158,19 +146,12 @@ def _run(
         left_out = dict(session.left_out())
     if done.dead_lights:
         console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
-    for reason in dict.fromkeys(left_out.values()):
-        console.say(f"left out: {reason}")
+    console.each("left out", dict.fromkeys(left_out.values()))
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {shell_quote(out)}")
-    return {
-        "session": out,
-        "captured": done.frames,
-        "retakes": done.retakes,
-        "stale_frames": done.stale,
-        "steps": len(plan.steps),
-        "dead_lights": done.dead_lights,
-        "left_out": left_out,
-    }
+    figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
+    figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
+    return figures | {"dead_lights": done.dead_lights, "left_out": left_out}
 
 
 def _open_devices(
@@ -232,11 +213,6 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
         (path / "orphans").rmdir()
         if with_folder:
             path.rmdir()
-
-
-def _source(identity: str) -> Literal["measured", "simulated"]:
-    """Say where frames come from, by how the box names its maker."""
-    return "simulated" if identity.upper().startswith("RIGSIM") else "measured"
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from capture.plan.fiber_light import SKIN_APERTURE_MM, fiber_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
+from skinrig.console import picked
 
 LIGHT_FIGURE_LABELS: Final[Mapping[str, str]] = {
     "flashes_per_s": "flashes in the worst second",
@@ -66,14 +67,8 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     """
     if rig.probe is not None:
         light = fiber_light(plan, rig)
-        return {
-            "led": light.led,
-            "led_ws": light.led_ws,
-            "limit_ws": light.limit_ws,
-            "placement_ws": light.placement_ws,
-            "skin_w_m2": light.skin_w_m2,
-            "stare_s": light.stare_s,
-        }
+        names = ("led", "led_ws", "limit_ws", "placement_ws", "skin_w_m2", "stare_s")
+        return picked(light, *names)
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
     limits = rig.leds or LedLimits()
     skin: dict[str, float | str] = {}
@@ -85,11 +80,7 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
         "flashes_per_s": flicker.flashes_per_s,
         "flicker_rms": flicker.rms,
         "open_eyes": "allowed" if flicker.within(limits) and not skin else "refused",
-        "led": dose.led,
-        "led_ws": dose.led_ws,
-        "limit_ws": dose.limit_ws,
-        "blue_share": dose.blue_share,
-        "eye_j_m2": dose.eye_j_m2,
+        **picked(dose, "led", "led_ws", "limit_ws", "blue_share", "eye_j_m2"),
         **skin,
     }
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast, get_args
+from typing import get_args
 
 from capture.devices.dome import Eyes
 from skinrig.capturing.sequences import SequenceOrder
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UsageError, one_of
 
 
 def parse_eye_state(text: str) -> Eyes:
@@ -18,9 +18,7 @@ def parse_eye_state(text: str) -> Eyes:
     ------
     UnusableError
     """
-    if text not in get_args(Eyes):
-        raise UnusableError(f"--eyes: got {text!r}, expected one of {', '.join(get_args(Eyes))}")
-    return cast(Eyes, text)
+    return one_of("--eyes", text, get_args(Eyes))
 
 
 def parse_floats(text: str | None, option: str) -> tuple[float, ...] | None:
@@ -54,27 +52,47 @@ def parse_names(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(part.strip() for part in text.split(","))
 
 
-def parse_amounts(texts: Sequence[str] | None, option: str) -> dict[str, float]:
-    """Return the amounts of ``NAME`` or ``NAME=AMOUNT``; a name alone stands for 1.
+def parse_amounts(
+    texts: Sequence[str],
+    option: str,
+    *,
+    default: float | None = None,
+    error: type[UsageError] = UsageError,
+) -> dict[str, float]:
+    """Return the amounts of ``NAME=AMOUNT``, each name once.
 
-    Examples
-    --------
-    >>> parse_amounts(["lotion=0.6", "powder"], "--condition")
-    {'lotion': 0.6, 'powder': 1.0}
+    Parameters
+    ----------
+    texts
+        As they were typed.
+    option
+        Where, for messages.
+    default
+        What a name alone stands for; None: it needs an amount.
+    error
+        Class of the error.
 
     Raises
     ------
     UsageError
+        For another form, and a name given twice.
+
+    Examples
+    --------
+    >>> parse_amounts(["lotion=0.6", "powder"], "--condition", default=1.0)
+    {'lotion': 0.6, 'powder': 1.0}
     """
+    form = "NAME=NUMBER" if default is None else "NAME or NAME=NUMBER"
     found: dict[str, float] = {}
-    for text in texts or ():
-        name, sign, amount = text.partition("=")
+    for text in texts:
+        name, sign, amount = (part.strip() for part in text.partition("="))
         try:
-            value = float(amount) if sign else 1.0
+            value = default if default is not None and not sign else float(amount)
+            if not name or name in found:
+                raise ValueError(name)
         except ValueError as exc:
-            raise UsageError(f"{option}: got {text!r}, expected NAME or NAME=AMOUNT") from exc
-        if not name or name in found:
-            raise UsageError(f"{option}: got {text!r}, expected each NAME once, or NAME=AMOUNT")
+            said = f"{option}: got {text.strip()!r}, expected {form}, each name once"
+            raise error(said) from exc
         found[name] = value
     return found
 
@@ -128,13 +146,12 @@ def parse_sequence(
                 "--sequence STATE"
             )
         return None
-    for option, text in (
-        ("--prompt-period", prompt_period),
-        ("--shot-period", shot_period),
-        ("--duration", duration),
-    ):
-        if text is not None:
-            _seconds(text, option)
+    seconds = {"prompt-period": prompt_period, "shot-period": shot_period, "duration": duration}
+    for option, text in seconds.items():
+        try:  # the plan keeps the digits as they were given
+            float(text or 0)
+        except ValueError as exc:
+            raise UsageError(f"--{option}: got {text!r}, expected seconds, such as 5.5") from exc
     order = SequenceOrder(
         state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
     )
@@ -143,11 +160,3 @@ def parse_sequence(
     if not order.prompted and (prompt_period is not None or captures is not None):
         raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)
-
-
-def _seconds(text: str, option: str) -> None:
-    """Refuse what is no number; the plan keeps the digits as they were given."""
-    try:
-        float(text)
-    except ValueError as exc:
-        raise UsageError(f"{option}: got {text!r}, expected seconds, such as 5.5") from exc

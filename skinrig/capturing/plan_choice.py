@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast, get_args
+from typing import get_args
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
@@ -13,7 +13,7 @@ from capture.plan.gradient import GradientTarget, gradient_calibration_plan, gra
 from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig
 from skinrig.capturing.sequences import SequenceOrder, sequence_plan
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 
 FLASH_CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
 
@@ -86,32 +86,26 @@ def choose_plan(
     if "gradient_sphere" in rig.boxes:
         if target is None:
             return gradient_plan(rig, angles=angles, steps=steps)
-        _require_target(target, get_args(GradientTarget))
-        return gradient_calibration_plan(rig, cast(GradientTarget, target))
+        known = get_args(GradientTarget)
+        return gradient_calibration_plan(rig, one_of("target", target, known, CaptureError))
     if "dome" in rig.boxes:
         if target is None:
             return dome_plan(rig)
-        _require_target(target, get_args(DomeTarget))
-        return dome_calibration_plan(rig, cast(DomeTarget, target))
+        known = get_args(DomeTarget)
+        return dome_calibration_plan(rig, one_of("target", target, known, CaptureError))
     if rig.probe is not None:
         if target is None:
             return probe_plan(
                 rig, sites=sites or PROBE_SITES, repeats=repeats, angles=directions_of(angles)
             )
-        _require_target(target, get_args(ProbeTarget))
-        return probe_calibration_plan(rig, cast(ProbeTarget, target), repeats=repeats)
+        shown = one_of("target", target, get_args(ProbeTarget), CaptureError)
+        return probe_calibration_plan(rig, shown, repeats=repeats)
     if target is None:
         return flash_plan(rig, states=states or ("neutral",), repeats=repeats, interleave=True)
     if target == "white":
         return flash_plan(rig, states=("white",), repeats=4)
-    _require_target(target, ("white", *FLASH_CALIBRATION_TARGETS))
+    one_of("target", target, ("white", *FLASH_CALIBRATION_TARGETS), CaptureError)
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
-
-
-def _require_target(target: str, known: Sequence[str]) -> None:
-    """Raise for a target that the rig has not."""
-    if target not in known:
-        raise CaptureError(f"target: got {target!r}, expected one of {', '.join(known)}")
 
 
 def directions_of(angles: Sequence[float] | None) -> int:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out
+from skinrig.commands.options import Json, Out, argument, option
 from skinrig.console import Console
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UnusableError, UsageError, one_of
 
-Labels = Annotated[
-    Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
-]
+Labels = Annotated[Path | None, option("Table name,TRAIT,... of 0 and 1, a line for each face.")]
 
 analyse_app = typer.Typer(cls=Subcommands, help="Analyse faces together.", no_args_is_help=True)
 
@@ -28,24 +26,23 @@ def analyse() -> None:
 def analyse_brdf(
     out: Out,
     appearances: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Maps of dome sessions, with lobes; none: simulated faces."),
+        list[Path] | None, argument("Maps of dome sessions, with lobes; none: simulated faces.")
     ] = None,
     labels: Labels = None,
     basis: Annotated[
-        Path | None, typer.Option(help="Folder of the MERL files the lobes were fitted with.")
+        Path | None, option("Folder of the MERL files the lobes were fitted with.")
     ] = None,
     points: Annotated[
         int | None,
-        typer.Option(
-            help="Texels of each face, default 2000; simulated: points of the one person and of "
+        option(
+            "Texels of each face, default 2000; simulated: points of the one person and of "
             "the seven conditions, default 5000, each of the 87 people having two fifths of it."
         ),
     ] = None,
     method: Annotated[
-        str, typer.Option(help="How lobes are joined: as shares of materials, or as brdf.")
+        str, option("How lobes are joined: as shares of materials, or as brdf.")
     ] = "shares",
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    seed: Annotated[int, option("Of everything random.")] = 0,
     json: Json = False,
 ) -> None:
     """Tell how many lobes the surfaces of faces need, and draw their mean reflection.
@@ -56,35 +53,24 @@ def analyse_brdf(
 
     Example: skinrig analyse brdf appearance-a appearance-b --labels labels.csv --out analysis
     """
+    from reconstruction.brdf_basis.space import Method
     from skinrig.analysing import brdf as analysing_brdf
 
-    if method not in ("shares", "brdf"):
-        raise UnusableError(f"--method: got {method!r}, expected shares or brdf")
+    how = one_of("--method", method, get_args(Method))
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more")
-    how = cast(Literal["shares", "brdf"], method)
     console = Console(json)
     if appearances:
-        found = analysing_brdf.analyse_measured(
-            out,
-            appearances,
-            labels=labels,
-            basis=basis,
-            points_each=points or analysing_brdf.N_POINTS_PER_FACE,
-            method=how,
-            seed=seed,
-        )
+        each = points or analysing_brdf.N_POINTS_PER_FACE
+        given: dict[str, Any] = {"labels": labels, "basis": basis, "method": how, "seed": seed}
+        found = analysing_brdf.analyse_measured(out, appearances, points_each=each, **given)
     elif labels is not None or basis is not None:
         raise UsageError("--labels, --basis: are of measured faces; name their folders")
     else:
         some = points or analysing_brdf.N_POINTS_PER_DATASET
+        each = max(1, round(0.4 * some))
         found = analysing_brdf.analyse_simulated(
-            out,
-            points=some,
-            points_each=max(1, round(0.4 * some)),
-            method=how,
-            seed=seed,
-            progress=console.progress,
+            out, points=some, points_each=each, method=how, seed=seed, progress=console.progress
         )
     documents = [one.document() for one in found]
     console.rows(
@@ -102,8 +88,8 @@ def analyse_brdf(
         ],
     )
     for document in documents:
-        for rank, why in document["left_out"]:
-            console.say(f"left out: {document['name']}, {rank} lobes and more: {why}")
+        left_out = document["left_out"]
+        console.left_out((f"{document['name']}, {r} lobes and more", why) for r, why in left_out)
         if document["points_lost"]:
             console.say(f"{document['name']}: {document['points_lost']} points show no lobe")
     console.say(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")

@@ -9,28 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skinrig import errors
+from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import (
-    AllBrackets,
-    Angles,
-    Consent,
-    ConsentExpires,
-    Directions,
-    Json,
-    Pairs,
-    Placements,
-    Resume,
-    Seed,
-    SequenceOptions,
-    Site,
-    Sites,
-    Size,
-    Steps,
-    Subject,
-    expand,
-    target_of,
-)
-from skinrig.console import Console, counted
+from skinrig.commands.options import argument, expand, option, target_of
+from skinrig.console import Console, counted, picked
 
 if TYPE_CHECKING:
     from skinrig.capturing.acquisition import CaptureOrder
@@ -46,30 +28,28 @@ serve_app = typer.Typer(
     help="Serve a simulated rig, by its name or its TOML file, to any client.",
 )
 
-Eyes = Annotated[
-    str, typer.Option("--eyes", help="The subject's eyes among LEDs: open, closed or shielded.")
-]
+Eyes = Annotated[str, option("The subject's eyes among LEDs: open, closed or shielded.", "--eyes")]
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureOptions:
     """Options of every capture."""
 
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None
+    out: Annotated[Path | None, option("Folder of the session.", "--out")] = None
     port: Annotated[
         list[str] | None, typer.Option(metavar="NAME=URL", help="Address of a box; repeatable.")
     ] = None
     camera: Annotated[
         list[str] | None, typer.Option(metavar="VIEW=URL", help="Address of a camera; repeatable.")
     ] = None
-    plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous"
-    consent: Consent = None
-    consent_expires: ConsentExpires = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False
-    plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None
-    resume: Resume = False
-    json: Json = False
+    plan: Annotated[Path | None, option("Plan, JSON; default: the rig's own.")] = None
+    subject: Annotated[str, option("Pseudonym of the subject.")] = "anonymous"
+    consent: options.Consent = None
+    consent_expires: options.ConsentExpires = None
+    dry_run: Annotated[bool, option("Only print the plan.", "--dry-run")] = False
+    plan_out: Annotated[Path | None, option("New file for the plan, JSON.")] = None
+    resume: options.Resume = False
+    json: options.Json = False
 
     def order(self, **more: Any) -> CaptureOrder:
         """Return the order of a capture, with what only some rigs have."""
@@ -82,9 +62,7 @@ class CaptureOptions:
             boxes=addresses(self.port or (), "--port"),
             cameras=addresses(self.camera or (), "--camera"),
             subject=subject_of(self.subject, self.consent, self.consent_expires),
-            dry_run=self.dry_run,
-            plan_out=self.plan_out,
-            resume=self.resume,
+            **picked(self, "dry_run", "plan_out", "resume"),
             **more,
         )
 
@@ -94,12 +72,12 @@ class CaptureOptions:
 def capture_flash(
     context: typer.Context,
     common: CaptureOptions,
-    sequence: SequenceOptions,
+    sequence: options.SequenceOptions,
     target: Annotated[str | None, target_of("flash")] = None,
     state: Annotated[
-        list[str] | None, typer.Option(help="State of the face, such as smile; repeatable.")
+        list[str] | None, option("State of the face, such as smile; repeatable.")
     ] = None,
-    repeats: Pairs = 1,
+    repeats: options.Pairs = 1,
 ) -> None:
     """Run a plan on a flash rig: states of a face, a sequence in time, or a target.
 
@@ -135,11 +113,10 @@ def capture_gradient(
     target: Annotated[str | None, target_of("gradient")] = None,
     eyes: Eyes = "open",
     force_limit: Annotated[
-        float | None,
-        typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
+        float | None, option("Greatest force of the caliper on this skin, newton; no default.")
     ] = None,
-    angles: Angles = None,
-    steps: Steps = None,
+    angles: options.Angles = None,
+    steps: options.Steps = None,
 ) -> None:
     """Run a plan on a gradient sphere: a patch of skin in a caliper, or a target.
 
@@ -158,10 +135,10 @@ def capture_probe(
     context: typer.Context,
     common: CaptureOptions,
     target: Annotated[str | None, target_of("probe")] = None,
-    sites: Sites = None,
-    repeats: Placements = 1,
-    angles: Directions = None,
-    all_brackets: AllBrackets = False,
+    sites: options.Sites = None,
+    repeats: options.Placements = 1,
+    angles: options.Directions = None,
+    all_brackets: options.AllBrackets = False,
 ) -> None:
     """Run a plan on a fibre probe: skin at some sites, or a target.
 
@@ -199,24 +176,22 @@ def _capture(
 class ServeOptions:
     """Options of every served rig."""
 
-    pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False
+    pty: Annotated[bool, option("Boxes on a pseudo terminal.", "--pty")] = False
     tcp: Annotated[
-        str, typer.Option(help="Address for cameras and, without --pty, boxes; port 0: a free one.")
+        str, option("Address for cameras and, without --pty, boxes; port 0: a free one.")
     ] = "127.0.0.1:0"
-    allow_remote: Annotated[
-        bool, typer.Option("--allow-remote", help="Let other machines connect.")
-    ] = False
-    subject: Subject = "III"
-    size: Size = "small"
-    seed: Seed = 0
+    allow_remote: Annotated[bool, option("Let other machines connect.", "--allow-remote")] = False
+    subject: options.Subject = "III"
+    size: options.Size = "small"
+    seed: options.Seed = 0
     resume: Annotated[
         Path | None,
-        typer.Option(
-            help="Session that was captured from an earlier server of this rig and seed and is to "
+        option(
+            "Session that was captured from an earlier server of this rig and seed and is to "
             "be gone on with: noise of its shots does not come again."
         ),
     ] = None
-    json: Json = False
+    json: options.Json = False
 
 
 @serve_app.command("flash", cls=RigCommand)
@@ -244,7 +219,7 @@ def serve_dome(context: typer.Context, common: ServeOptions) -> None:
 
 @serve_app.command("gradient", cls=RigCommand)
 @expand
-def serve_gradient(context: typer.Context, common: ServeOptions, site: Site = None) -> None:
+def serve_gradient(context: typer.Context, common: ServeOptions, site: options.Site = None) -> None:
     """Serve a simulated gradient sphere, small only; the first lines are the addresses.
 
     Example: skinrig serve gradient --site cheek
@@ -266,21 +241,13 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    order = ServeOrder(
-        pty=common.pty,
-        tcp=common.tcp,
-        allow_remote=common.allow_remote,
-        subject=common.subject,
-        size=common.size,
-        seed=common.seed,
-        site=site,
-        resume=common.resume,
-    )
+    options = ("pty", "tcp", "allow_remote", "subject", "size", "seed", "resume")
+    order = ServeOrder(site=site, **picked(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
 def verify(
-    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")], json: Json = False
+    session: Annotated[Path, argument("SESSION/ folder.")], json: options.Json = False
 ) -> None:
     """Check every byte of a session; exit code 3 names what is damaged.
 
@@ -290,23 +257,13 @@ def verify(
 
     console = Console(json)
     found = check(session)
-    for text in found.warnings:
-        console.say(f"warning: {text}")
-    for text in found.problems:
-        console.say(f"damaged: {text}")
+    console.each("warning", found.warnings)
+    console.each("damaged", found.problems)
     console.say(
         f"{session}: {'sound' if found.ok else 'DAMAGED'}, {counted(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
-    console.document(
-        "skinrig.verify/1",
-        {
-            "ok": found.ok,
-            "problems": found.problems,
-            "warnings": found.warnings,
-            "frames": found.frames,
-            "bytes": found.bytes,
-        },
-    )
+    figures = picked(found, "ok", "problems", "warnings", "frames", "bytes")
+    console.document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.BAD_INPUT)

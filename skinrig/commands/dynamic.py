@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps
-from skinrig.console import Console
-from skinrig.errors import UsageError
+from skinrig.commands.options import Json, NewMaps, argument, expand, option
+from skinrig.console import Console, picked
+from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
 
-Weights = Annotated[
-    str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
-]
-Mesh = Annotated[
-    Path | None,
-    typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it."),
-]
-Size = Annotated[int, typer.Option(help="Pixels a side of the displacement map.")]
-At = Annotated[str | None, typer.Option("--site", help="Whose microrelief; default: the first.")]
-Synthesize = Annotated[
-    str, typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space).")
-]
-Extrapolate = Annotated[
-    str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
-]
+if TYPE_CHECKING:
+    from skinrig.applying.expression import Applied, Expression, OtherFace
+    from skinrig.applying.relief import Relief
 
 fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
 apply_app = typer.Typer(
@@ -39,16 +29,16 @@ apply_app = typer.Typer(
 
 @fit_app.command("facial-color", cls=Command)
 def fit_facial_color(
-    sessions: Annotated[list[Path], typer.Argument(help="Flash sessions of one subject.")],
+    sessions: Annotated[list[Path], argument("Flash sessions of one subject.")],
     out: NewMaps,
-    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
+    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(help="Folder with STATE.csv (name,x,y) for each state.")
+        Path | None, option("Folder with STATE.csv (name,x,y) for each state.")
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(help="Radius of the local statistics, px; default: side / 32.")
+        float | None, option("Radius of the local statistics, px; default: side / 32.")
     ] = None,
-    stored_size: Annotated[int, typer.Option(help="Cells a side of scale and bias maps.")] = 256,
+    stored_size: Annotated[int, option("Cells a side of scale and bias maps.")] = 256,
     json: Json = False,
 ) -> None:
     """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
@@ -74,39 +64,27 @@ def fit_facial_color(
     console.rows(
         ("state", "change of blood, points", "change, %", "median scale", "place error, px"), rows
     )
-    for what, why in found.left_out:
-        console.say(f"left out: {what}: {why}")
+    console.left_out(found.left_out)
     states = ",".join(found.hemoglobin)
     console.say(f"{out}: hemoglobin rig of {states}")
     last = list(found.changes)[-1]
     console.say(
         f"next: skinrig apply expression {shell_quote(out)} --weights {last}=1 --out {last}"
     )
-    console.document(
-        "skinrig.fit/1",
-        {
-            "model": "facial_color",
-            "out": out,
-            "states": list(found.hemoglobin),
-            "radius_px": found.rig.radius_px,
-            "left_out": [list(row) for row in found.left_out],
-            "rows": [list(row) for row in rows],
-        },
-    )
+    found_values = {"states": list(found.hemoglobin), "radius_px": found.rig.radius_px}
+    fitted(console, "facial_color", out, found_values | {"left_out": found.left_out, "rows": rows})
 
 
 @fit_app.command("wrinkles", cls=Command)
 def fit_wrinkles(
-    appearances: Annotated[
-        list[Path], typer.Argument(help="Maps of dome sessions: neutral and expressions.")
-    ],
+    appearances: Annotated[list[Path], argument("Maps of dome sessions: neutral and expressions.")],
     out: NewMaps,
     mask: Annotated[
-        list[Path] | None, typer.Option(help="RGBA picture of four zones; twice for eight.")
+        list[Path] | None, option("RGBA picture of four zones; twice for eight.")
     ] = None,
-    size: Annotated[int, typer.Option(help="Texels a side of the wrinkle map.")] = 256,
-    mask_size: Annotated[int, typer.Option(help="Texels a side of masks that are found.")] = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the search for zones.")] = 0,
+    size: Annotated[int, option("Texels a side of the wrinkle map.")] = 256,
+    mask_size: Annotated[int, option("Texels a side of masks that are found.")] = 64,
+    seed: Annotated[int, option("Seed of the search for zones.")] = 0,
     json: Json = False,
 ) -> None:
     """Fit a wrinkle map, its zones and their weights to normals of expressions.
@@ -120,25 +98,17 @@ def fit_wrinkles(
     found = fit(appearances, out=out, masks=mask, size=size, mask_size=mask_size, seed=seed)
     console.rows(("expression", *zone_names(found).values()), summary(found))
     console.say(f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of the differences")
-    console.document(
-        "skinrig.fit/1",
-        {
-            "model": "wrinkles",
-            "out": out,
-            "explained": found.fit.explained,
-            "rows": [list(row) for row in summary(found)],
-        },
-    )
+    fitted(console, "wrinkles", out, {"explained": found.fit.explained, "rows": summary(found)})
 
 
 @fit_app.command("microstructure", cls=Command)
 def fit_microstructure(
     appearances: Annotated[
-        list[Path], typer.Argument(help="Maps of caliper sessions with heights and kernels.")
+        list[Path], argument("Maps of caliper sessions with heights and kernels.")
     ],
     out: NewMaps,
     paper_table: Annotated[
-        bool, typer.Option("--paper-table", help="The paper's forehead where kernels are too few.")
+        bool, option("The paper's forehead where kernels are too few.", "--paper-table")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -151,53 +121,96 @@ def fit_microstructure(
     from skinrig.fitting.microstructure import fit_microstructure as fit
 
     console = Console(json)
-    found = fit(appearances, out=out, paper_table=paper_table, on_message=console.say)
+    found = fit(appearances, out=out, paper_table=paper_table)
+    for site, one in found.items():
+        low, high = one.table.stretch_range
+        how = f"{one.kernels} kernels" if one.kernels else "the paper's forehead table"
+        console.say(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
     console.say(
         f"next: skinrig apply microstructure {shell_quote(out)} --mesh MESH --weights SHAPE=1 "
         "--out DIR"
     )
-    console.document(
-        "skinrig.fit/1",
-        {
-            "model": "microstructure",
-            "out": out,
-            "sites": {site: one.document() for site, one in found.items()},
-        },
-    )
+    sites = {site: one.document() for site, one in found.items()}
+    fitted(console, "microstructure", out, {"sites": sites})
+
+
+@dataclass(frozen=True, slots=True)
+class ReliefOptions:
+    """Options of the relief that moves with a mesh."""
+
+    size: Annotated[int, option("Pixels a side of the displacement map.")] = 4096
+    site: Annotated[str | None, option("Whose microrelief; default: the first.", "--site")] = None
+    synthesize: Annotated[
+        str, option("Neutral relief: patches (measured ones, grown) or noise (in space).")
+    ] = "patches"
+    extrapolate: Annotated[
+        str, option("Beyond the table's stretch range: hold its ends, or formula.")
+    ] = "hold"
+    seed: Annotated[int, option("Seed of the grown relief.")] = 0
+
+    def relief(
+        self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
+    ) -> Relief:
+        """Return what evaluates the relief on a mesh under weights of its shapes."""
+        from skinrig.applying.relief import Relief
+
+        given = picked(self, "site", "extrapolate", "seed")
+        given |= {"size_px": self.size, "source": self.synthesize}
+        return Relief.of(mesh, weights, out=out, progress=console.progress, **given)
+
+
+@dataclass(frozen=True, slots=True)
+class ExpressionOptions:
+    """Options of blood, color and wrinkles of an expression."""
+
+    parts: Annotated[
+        str | None, option("Of facial_color,wrinkles,microstructure; default: all.")
+    ] = None
+    normalize: Annotated[bool, option("Divide the weights by their sum.", "--normalize")] = False
+    clamp: Annotated[
+        str, option("Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
+    ] = "unit"
+    emotional: Annotated[
+        bool, option("Anger reddens, fear pales the whole face.", "--emotional")
+    ] = False
+    gain: Annotated[float, option("One more factor of all blood.")] = 1.0
+    onto: Annotated[
+        Path | None,
+        option("Maps of another face (hemoglobin, melanin) that the rig is applied to."),
+    ] = None
+    landmarks: Annotated[
+        list[Path] | None,
+        option("Table name,x,y of the rig's face; a second one of the other face."),
+    ] = None
+
+    def expression(self, weights: Mapping[str, float]) -> Expression:
+        """Return the expression that is asked for."""
+        from skinrig.applying.expression import Expression
+
+        return Expression(
+            weights,
+            normalize=self.normalize,
+            clamp=one_of("--clamp", self.clamp, ("unit", "signed")),
+            emotional=self.emotional,
+            gain=self.gain,
+            onto=_other_face(self.onto, self.landmarks or []),
+        )
 
 
 @apply_app.command("expression", cls=Command)
+@expand
 def apply_expression(
-    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
-    weights: Weights,
+    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
+    weights: Annotated[
+        str, option("States and their weights: smile=0.7,anger=0.3; they sum to one.")
+    ],
     out: NewMaps,
-    mesh: Mesh = None,
-    parts: Annotated[
-        str | None, typer.Option(help="Of facial_color,wrinkles,microstructure; default: all.")
+    *,
+    mesh: Annotated[
+        Path | None, option("Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it.")
     ] = None,
-    normalize: Annotated[
-        bool, typer.Option("--normalize", help="Divide the weights by their sum.")
-    ] = False,
-    clamp: Annotated[
-        str, typer.Option(help="Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
-    ] = "unit",
-    emotional: Annotated[
-        bool, typer.Option("--emotional", help="Anger reddens, fear pales the whole face.")
-    ] = False,
-    gain: Annotated[float, typer.Option(help="One more factor of all blood.")] = 1.0,
-    onto: Annotated[
-        Path | None,
-        typer.Option(help="Maps of another face (hemoglobin, melanin) that the rig is applied to."),
-    ] = None,
-    landmarks: Annotated[
-        list[Path] | None,
-        typer.Option(help="Table name,x,y of the rig's face; a second one of the other face."),
-    ] = None,
-    size: Size = 4096,
-    site: At = None,
-    synthesize: Synthesize = "patches",
-    extrapolate: Extrapolate = "hold",
-    seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
+    chosen: ExpressionOptions,
+    moving: ReliefOptions,
     json: Json = False,
 ) -> None:
     """Evaluate blood, color, normals and displacement of an expression.
@@ -206,51 +219,31 @@ def apply_expression(
     """
     from skinrig.appearances.dynamic import DYNAMIC_PARTS
     from skinrig.applying import expression as applying
-    from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES, Relief, one_of
+    from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES
+    from skinrig.capturing.option_values import parse_names
 
     console = Console(json)
-    given = applying.parse_weights(weights)
-    wanted = DYNAMIC_PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
-    expression = applying.Expression(
-        given,
-        normalize=normalize,
-        clamp=one_of("--clamp", clamp, ("unit", "signed")),
-        emotional=emotional,
-        gain=gain,
-        onto=_other_face(onto, landmarks or []),
-    )
+    given = chosen.expression(applying.parse_weights(weights))
+    parts = parse_names(chosen.parts) or DYNAMIC_PARTS
     relief = None
-    one_of("--synthesize", synthesize, RELIEF_SOURCES)
-    one_of("--extrapolate", extrapolate, EXTRAPOLATION_MODES)
+    one_of("--synthesize", moving.synthesize, RELIEF_SOURCES)
+    one_of("--extrapolate", moving.extrapolate, EXTRAPOLATION_MODES)
     if mesh is not None:
-        relief = Relief.of(
-            mesh,
-            applying.normalized(expression).weights,
-            size_px=size,
-            site=site,
-            source=synthesize,
-            extrapolate=extrapolate,
-            seed=seed,
-            out=out,
-            progress=console.progress,
-        )
+        relief = moving.relief(mesh, applying.normalized(given).weights, out, console)
     done = applying.apply_expression(
-        appearance, expression, out=out, parts=wanted, relief=relief, progress=console.progress
+        appearance, given, out=out, parts=parts, relief=relief, progress=console.progress
     )
-    _tell(console, out, done)
+    _report(console, out, done)
 
 
 @apply_app.command("microstructure", cls=Command)
+@expand
 def apply_microstructure(
-    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
-    mesh: Annotated[Path, typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF.")],
-    weights: Annotated[str, typer.Option(help="Blend shapes or states: jawOpen=0.5,smile=1.")],
+    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
+    mesh: Annotated[Path, option("Mesh with blend shapes: .npz, OBJ or glTF.")],
+    weights: Annotated[str, option("Blend shapes or states: jawOpen=0.5,smile=1.")],
     out: NewMaps,
-    size: Size = 4096,
-    site: At = None,
-    synthesize: Synthesize = "patches",
-    extrapolate: Extrapolate = "hold",
-    seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
+    moving: ReliefOptions,
     json: Json = False,
 ) -> None:
     """Grow the measured relief over a mesh and let it follow the mesh's strain.
@@ -259,33 +252,18 @@ def apply_microstructure(
     """
     from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
-    from skinrig.applying.relief import Relief
 
     console = Console(json)
-    given = applying.parse_weights(weights)
-    relief = Relief.of(
-        mesh,
-        given,
-        size_px=size,
-        site=site,
-        source=synthesize,
-        extrapolate=extrapolate,
-        seed=seed,
-        out=out,
-        progress=console.progress,
-    )
+    given = applying.Expression(applying.parse_weights(weights))
+    relief = moving.relief(mesh, given.weights, out, console)
+    parts = (MICROSTRUCTURE,)
     done = applying.apply_expression(
-        appearance,
-        applying.Expression(given),
-        out=out,
-        parts=(MICROSTRUCTURE,),
-        relief=relief,
-        progress=console.progress,
+        appearance, given, out=out, parts=parts, relief=relief, progress=console.progress
     )
-    _tell(console, out, done)
+    _report(console, out, done)
 
 
-def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
+def _other_face(onto: Path | None, landmarks: list[Path]) -> OtherFace | None:
     """Return the face that a rig is applied to, with its landmarks."""
     from model import store
     from skinrig.applying.expression import OtherFace
@@ -308,34 +286,26 @@ def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
     return OtherFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
 
 
-def _tell(console: Console, out: Path, done: Any) -> None:
-    rows = [
-        (part, key, value)
-        for part, figures in done.figures.items()
-        for key, value in figures.items()
-        if isinstance(value, int | float | str)
-    ]
-    console.rows(("part", "figure", "value"), rows)
-    for what, why in done.left_out:
-        console.say(f"left out: {what}: {why}")
+def _report(console: Console, out: Path, done: Applied) -> None:
+    """Print what an evaluation made."""
+    console.figures(done.figures, int, float, str)
+    console.left_out(done.left_out)
     console.say(f"{out}: {', '.join(done.maps)}")
-    console.document(
-        "skinrig.apply/1",
-        {
-            "out": out,
-            "maps": list(done.maps),
-            "figures": done.figures,
-            "left_out": [list(row) for row in done.left_out],
-        },
-    )
+    document = {"out": out, "maps": list(done.maps), **picked(done, "figures", "left_out")}
+    console.document("skinrig.apply/1", document)
+
+
+def fitted(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
+    """Print the document of a fit."""
+    console.document("skinrig.fit/1", {"model": model, "out": out, **found})
 
 
 @fit_app.command("reflectance", cls=Command)
 def fit_reflectance(
-    dome: Annotated[Path, typer.Argument(help="Maps of a dome session: normals, r_d, lobes.")],
+    dome: Annotated[Path, argument("Maps of a dome session: normals, r_d, lobes.")],
     out: NewMaps,
     probe: Annotated[
-        Path | None, typer.Argument(help="Maps of a fibre probe session on the same subject.")
+        Path | None, argument("Maps of a fibre probe session on the same subject.")
     ] = None,
     landmarks: Annotated[
         Path | None,
@@ -360,20 +330,9 @@ def fit_reflectance(
     console.rows(("median over valid texels", "red", "green", "blue"), rows)
     for site in found.placed.sites if found.placed is not None else ():
         console.say(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
-    for text in found.assumed:
-        console.say(f"assumed: {text}")
-    for what, why in found.left_out:
-        console.say(f"left out: {what}: {why}")
+    console.each("assumed", found.assumed)
+    console.left_out(found.left_out)
     valid = float(found.model.valid.mean())
     console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
     console.say(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
-    console.document(
-        "skinrig.fit/1",
-        {
-            "model": "reflectance",
-            "out": out,
-            "assumed": list(found.assumed),
-            "left_out": [list(row) for row in found.left_out],
-            "rows": [list(row) for row in rows],
-        },
-    )
+    fitted(console, "reflectance", out, picked(found, "assumed", "left_out") | {"rows": rows})

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
-
-from skinrig.commands.options import Json, Out
-from skinrig.console import Console, counted
-from skinrig.errors import UnusableError
+from skinrig.commands.options import Json, Out, argument, expand, option
+from skinrig.console import Console, counted, picked
+from skinrig.errors import UnusableError, one_of
 from skinrig.exporting.options import Delivery
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
@@ -26,63 +25,80 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 """What to do with each format."""
 
 
+@dataclass(frozen=True, slots=True)
+class DeliveryOptions:
+    """How an appearance is delivered."""
+
+    unit: Annotated[str | None, option("Scene unit: m (default), cm or mm (mtlx, usd).")] = None
+    normal_y: Annotated[str, option("Green of normal maps: gl is +Y up, dx is -Y (Unreal).")] = "gl"
+    udim: Annotated[str, option("Names of textures: none, dot (.1001) or underscore (_1001).")] = (
+        "none"
+    )
+    with_errors: Annotated[
+        bool, option("Standard errors and masks beside the values.", "--with-errors")
+    ] = False
+    only: Annotated[
+        str | None,
+        option("Names of maps (maps), of up to three states (metahuman), of states (stokes)."),
+    ] = None
+    mesh: Annotated[
+        Path | None, option("Mesh with the maps' texture coordinates and blend shapes, in mm.")
+    ] = None
+    onto: Annotated[
+        Path | None, option("Dome's maps whose texture gets the colors (metahuman).")
+    ] = None
+    landmarks: Annotated[
+        list[Path] | None, option("Tables name,x,y of the flash picture, then of that texture.")
+    ] = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is written; none: all that there are."""
+        return () if self.only is None else tuple(name.strip() for name in self.only.split(","))
+
+    def delivery(self) -> Delivery:
+        """Return the same as an export of maps takes it."""
+        return Delivery(
+            only=self.names,
+            landmarks=tuple(self.landmarks or ()),
+            **picked(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceOptions:
+    """The place on the skin whose BRDF is exported."""
+
+    at: Annotated[
+        str | None, option("Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
+    ] = None
+    radius: Annotated[float, option("Average around the place, mm.")] = 0.0
+    without_diffuse: Annotated[bool, option("The place's surface alone.", "--without-diffuse")] = (
+        False
+    )
+
+
+@expand
 def export(
-    source: Annotated[Path, typer.Argument(help="APPEARANCE/ or SESSION/ folder.")],
+    source: Annotated[Path, argument("APPEARANCE/ or SESSION/ folder.")],
     to: Annotated[
         str,
-        typer.Option(
-            help="Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
+        option(
+            "Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
             "Of a session: mhl, frames, lp, stokes, event-model."
         ),
     ],
     out: Out,
+    *,
     use: Annotated[
-        str | None, typer.Option(help="What the copy is for; the subjects' consent must cover it.")
+        str | None, option("What the copy is for; the subjects' consent must cover it.")
     ] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Scene unit: m (default), cm or mm (mtlx, usd).")
-    ] = None,
-    normal_y: Annotated[
-        str, typer.Option(help="Green of normal maps: gl is +Y up, dx is -Y (Unreal).")
-    ] = "gl",
-    udim: Annotated[
-        str, typer.Option(help="Names of textures: none, dot (.1001) or underscore (_1001).")
-    ] = "none",
-    with_errors: Annotated[
-        bool, typer.Option("--with-errors", help="Standard errors and masks beside the values.")
-    ] = False,
-    only: Annotated[
-        str | None,
-        typer.Option(
-            help="Names of maps (maps), of up to three states (metahuman), of states (stokes)."
-        ),
-    ] = None,
-    mesh: Annotated[
-        Path | None,
-        typer.Option(help="Mesh with the maps' texture coordinates and blend shapes, in mm."),
-    ] = None,
-    onto: Annotated[
-        Path | None, typer.Option(help="Dome's maps whose texture gets the colors (metahuman).")
-    ] = None,
-    landmarks: Annotated[
-        list[Path] | None,
-        typer.Option(help="Tables name,x,y of the flash picture, then of that texture."),
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option(help="Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
-    ] = None,
-    radius: Annotated[float, typer.Option(help="Average around the place, mm.")] = 0.0,
-    without_diffuse: Annotated[
-        bool, typer.Option("--without-diffuse", help="The place's surface alone.")
-    ] = False,
-    camera: Annotated[
-        str | None, typer.Option(help="Whose pictures (lp); default: the one in front.")
-    ] = None,
+    how: DeliveryOptions,
+    place: PlaceOptions,
+    camera: Annotated[str | None, option("Whose pictures (lp); default: the one in front.")] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            help="CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."
-        ),
+        option("CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -97,17 +113,50 @@ def export(
     from skinrig.exporting.sessions import light_lists, stokes
 
     console = Console(json)
-    known = (
-        *appearances.APPEARANCE_FORMATS,
-        *brdfs.BRDF_SUFFIXES,
-        *sessions.SESSION_FORMATS,
-        light_lists.LIGHT_LIST_FORMAT,
-        stokes.STOKES_FORMAT,
-    )
-    if to not in known:
-        raise UnusableError(f"--to: got {to!r}, expected one of {', '.join(known)}")
     of_maps = (*appearances.APPEARANCE_FORMATS, *brdfs.BRDF_SUFFIXES)
-    of_sessions = tuple(name for name in known if name not in of_maps)
+    _check_format(
+        to,
+        source,
+        of_maps,
+        (*sessions.SESSION_FORMATS, light_lists.LIGHT_LIST_FORMAT, stokes.STOKES_FORMAT),
+    )
+    if to in brdfs.BRDF_SUFFIXES:
+        spot = brdfs.place_of(place.at, radius_mm=place.radius, diffuse=not place.without_diffuse)
+        done = appearances.export_brdfs(source, out, to=to, place=spot, use=use)
+    elif to in of_maps:
+        done = appearances.export_appearance(source, out, to=to, delivery=how.delivery(), use=use)
+    else:
+        needed = sessions.require_use(use)
+        if to == light_lists.LIGHT_LIST_FORMAT:
+            done = light_lists.export_light_list(
+                source, out, use=needed, camera=camera, calibration=calibration
+            )
+        elif to == stokes.STOKES_FORMAT:
+            done = stokes.export_stokes(
+                source,
+                out,
+                use=needed,
+                only=how.names,
+                with_errors=how.with_errors,
+                calibration=calibration,
+            )
+        else:
+            done = sessions.export_session(source, out, to=to, use=needed)
+    after = NEXT_STEP_BY_FORMAT.get(
+        to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
+    )
+    console.left_out(done.left_out)
+    console.say(f"{done.path}: {counted(done.files, 'file')}, listed in {done.manifest}")
+    console.say(f"next: {after}")
+    document = picked(done, "path", "files", "manifest") | {"to": to, "next": after}
+    console.document("skinrig.export/1", document | picked(done, "left_out"))
+
+
+def _check_format(
+    to: str, source: Path, of_maps: Sequence[str], of_sessions: Sequence[str]
+) -> None:
+    """Raise for a format that there is not, or that is not of what the source holds."""
+    one_of("--to", to, (*of_maps, *of_sessions))
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions),
         ("appearance.json", "maps", of_maps),
@@ -116,52 +165,3 @@ def export(
             raise UnusableError(
                 f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
             )
-    names = () if only is None else tuple(name.strip() for name in only.split(","))
-    if to in brdfs.BRDF_SUFFIXES:
-        place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)
-        done = appearances.export_brdfs(source, out, to=to, place=place, use=use)
-    elif to in appearances.APPEARANCE_FORMATS:
-        delivery = Delivery(
-            unit=unit,
-            normal_y=normal_y,
-            udim=udim,
-            with_errors=with_errors,
-            only=names,
-            mesh=mesh,
-            onto=onto,
-            landmarks=tuple(landmarks or ()),
-        )
-        done = appearances.export_appearance(source, out, to=to, delivery=delivery, use=use)
-    elif to == light_lists.LIGHT_LIST_FORMAT:
-        done = light_lists.export_light_list(
-            source, out, use=sessions.require_use(use), camera=camera, calibration=calibration
-        )
-    elif to == stokes.STOKES_FORMAT:
-        done = stokes.export_stokes(
-            source,
-            out,
-            use=sessions.require_use(use),
-            only=names,
-            with_errors=with_errors,
-            calibration=calibration,
-        )
-    else:
-        done = sessions.export_session(source, out, to=to, use=sessions.require_use(use))
-    after = NEXT_STEP_BY_FORMAT.get(
-        to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
-    )
-    for what, why in done.left_out:
-        console.say(f"left out: {what}: {why}")
-    console.say(f"{done.path}: {counted(done.files, 'file')}, listed in {done.manifest}")
-    console.say(f"next: {after}")
-    console.document(
-        "skinrig.export/1",
-        {
-            "path": done.path,
-            "files": done.files,
-            "manifest": done.manifest,
-            "to": to,
-            "next": after,
-            "left_out": [list(row) for row in done.left_out],
-        },
-    )

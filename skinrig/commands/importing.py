@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out
-from skinrig.console import Console, counted
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out, argument, option
+from skinrig.console import Console, counted, picked
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
@@ -19,12 +19,12 @@ import_app = typer.Typer(
 
 @import_app.command("photos", cls=Command)
 def import_photos(
-    directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
+    directory: Annotated[Path, argument("Folder of photographs, or one file.")],
     out: Out,
     rig: Annotated[
-        str | None, typer.Option(help="Rig whose camera took them, so that its calibrations hold.")
+        str | None, option("Rig whose camera took them, so that its calibrations hold.")
     ] = None,
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "unnamed",
+    subject: Annotated[str, option("Pseudonym of the subject.")] = "unnamed",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     json: Json = False,
@@ -40,10 +40,8 @@ def import_photos(
     console = Console(json)
     person = subject_of(subject, consent, consent_expires)
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
-    for name in done.ignored:
-        console.say(f"ignored: {name}")
+    console.each("assumed", done.assumed)
+    console.each("ignored", done.ignored)
     console.say(
         f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
@@ -57,25 +55,18 @@ def import_photos(
         after = f"verify {place}"
     console.say(f"next: skinrig {after}")
     console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "assumed": done.assumed,
-            "states": done.states,
-            "ignored": done.ignored,
-        },
+        "skinrig.import/1", picked(done, "path", "frames", "assumed", "states", "ignored")
     )
 
 
 @import_app.command("mesh", cls=Command)
 def import_mesh(
-    file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
-    session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
+    file: Annotated[Path, argument("Scanned mesh: .obj or .ply.")],
+    session: Annotated[Path, option("Session that gets the mesh.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="New folder for a copy, where it is closed.")
+        Path | None, option("New folder for a copy, where it is closed.", "--out")
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
+    unit: Annotated[str, option("Unit of the file: mm, cm, m or inch.")] = "mm",
     json: Json = False,
 ) -> None:
     """Attach a scanned mesh to a session.
@@ -95,31 +86,23 @@ def import_mesh(
     console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
     console.document(
         "skinrig.import/1",
-        {
-            "path": done.path,
-            "vertices": done.vertices,
-            "faces": done.faces,
-            "has_uv": done.has_uv,
-            "extent_mm": done.extent_mm,
-            "reopened": done.reopened,
-        },
+        picked(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
     )
 
 
 @import_app.command("lp", cls=Command)
 def import_lp(
-    directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
+    directory: Annotated[Path, argument("Folder of pictures, one a light.")],
     out: Out,
     lights: Annotated[
-        Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
+        Path | None, option(".lp, list of directions, or folder of a chrome ball.")
     ] = None,
-    mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
+    mask: Annotated[Path | None, option("Picture that is bright at the object.")] = None,
     encoding: Annotated[
-        str, typer.Option(help="How 8-bit and PNG values code light: auto, sRGB or linear.")
+        str, option("How 8-bit and PNG values code light: auto, sRGB or linear.")
     ] = "auto",
     mm_per_px: Annotated[
-        float | None,
-        typer.Option(help="Size of a pixel; then the list's rows are positions in mm."),
+        float | None, option("Size of a pixel; then the list's rows are positions in mm.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -138,20 +121,16 @@ def import_lp(
         encoding=encoding,  # type: ignore[arg-type]
         mm_per_px=mm_per_px,
     )
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
+    console.each("assumed", done.assumed)
     console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
     console.say(
         f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
     )
     console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "lights": done.lights,
-            "encoding": done.encoding,
-            "mask": done.mask,
-            "assumed": done.assumed,
-        },
+        "skinrig.import/1", picked(done, "path", "frames", "lights", "encoding", "mask", "assumed")
     )
+
+
+def _document(console: Console, done: object, *names: str) -> None:
+    """Print the document of an import: its path, and figures by their names."""
+    console.document("skinrig.import/1", picked(done, "path", *names))

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
-from skinrig.commands.options import Json
-from skinrig.console import Console
+from skinrig.commands.options import Json, option
+from skinrig.console import Console, picked
 from skinrig.doctor import examine
 from skinrig.waiting_threads import wait_asleep
 
@@ -31,19 +31,15 @@ def bench(
         ),
     ] = None,
     stage: Annotated[
-        list[str] | None,
-        typer.Option(help="Stage, or several; repeatable.", autocompletion=completion.stages),
+        list[str] | None, option("Stage, or several; repeatable.", autocompletion=completion.stages)
     ] = None,
     budget: Annotated[
-        float | None, typer.Option(help="Seconds to spend, about; default 600.", show_default=False)
+        float | None, option("Seconds to spend, about; default 600.", show_default=False)
     ] = None,
-    toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
-    extremes: Annotated[
-        bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
-    ] = False,
+    toy: Annotated[bool, option("Smallest sizes, no limits judged.", "--toy")] = False,
+    extremes: Annotated[bool, option("Try stiff and extreme cases instead.", "--extremes")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for bench.json, a table and plots; or extremes.json."),
+        Path | None, option("Folder for bench.json, a table and plots; or extremes.json.", "--out")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -99,9 +95,7 @@ def doctor(json: Json = False) -> None:
         ("", "what", "state", "to mend"),
         [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
     )
-    rows: list[dict[str, Any]] = [
-        {"what": f.what, "state": f.state, "fine": f.fine, "mend": f.mend} for f in findings
-    ]
+    rows = [picked(f, "what", "state", "fine", "mend") for f in findings]
     console.document("skinrig.doctor/1", {"findings": rows})
     if not all(f.fine for f in findings):
         raise typer.Exit(errors.EXTRA_MISSING)

@@ -17,9 +17,20 @@ from skinrig.errors import UnusableError, UsageError
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder
 
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+
+def option(text: str, *names: str, **settings: Any) -> Any:
+    """Return an option: its help, its names unless they are the parameter's, settings of Typer."""
+    return typer.Option(*names, help=text, **settings)
+
+
+def argument(text: str, **settings: Any) -> Any:
+    """Return an argument by its help and settings of Typer."""
+    return typer.Argument(help=text, **settings)
+
+
+Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
+Seed = Annotated[int, option("Seed of everything that is drawn.")]
+Out = Annotated[Path, option("Folder to write.", "--out")]
 
 
 def _free(context: typer.Context, out: Path) -> Path:
@@ -54,40 +65,29 @@ STDOUT_MARK = "-"
 Page = Annotated[Path, typer.Option("-o", "--out", callback=page_to_write, help="The page.")]
 Subject = Annotated[
     str,
-    typer.Option(
-        help="Whose skin: a preset, I to VI, palest or darkest, or a file NAME.toml.",
+    option(
+        "Whose skin: a preset, I to VI, palest or darkest, or a file NAME.toml.",
         autocompletion=completion.subjects,
     ),
 ]
-Size = Annotated[
-    str, typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes)
-]
-Width = Annotated[int | None, typer.Option(help="Pixels across, instead of the size.")]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
-]
-Site = Annotated[
-    str | None, typer.Option(help="Where the skin is from: forehead (default), cheek or chin.")
-]
+Size = Annotated[str, option("Of the pictures: small or full.", autocompletion=completion.sizes)]
+Width = Annotated[int | None, option("Pixels across, instead of the size.")]
+Resume = Annotated[bool, option("Go on with a session that was interrupted.", "--resume")]
+Site = Annotated[str | None, option("Where the skin is from: forehead (default), cheek or chin.")]
 Sites = Annotated[
-    str | None,
-    typer.Option(help="Where the probe is placed, joined by commas: forehead,cheek,chin."),
+    str | None, option("Where the probe is placed, joined by commas: forehead,cheek,chin.")
 ]
-Pairs = Annotated[int, typer.Option("--repeats", help="Image pairs a state.")]
-Placements = Annotated[int, typer.Option("--repeats", help="Placements a site and direction.")]
+Pairs = Annotated[int, option("Image pairs a state.", "--repeats")]
+Placements = Annotated[int, option("Placements a site and direction.", "--repeats")]
 AllBrackets = Annotated[
-    bool, typer.Option("--all-brackets", help="Record every exposure, also such as show no more.")
+    bool, option("Record every exposure, also such as show no more.", "--all-brackets")
 ]
-Angles = Annotated[
-    str | None, typer.Option(help="Angles of the caliper, degrees, joined by commas: 0,90.")
-]
-Directions = Annotated[
-    str | None, typer.Option("--angles", help="How many directions of the head: 16.")
-]
-Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
+Angles = Annotated[str | None, option("Angles of the caliper, degrees, joined by commas: 0,90.")]
+Directions = Annotated[str | None, option("How many directions of the head: 16.", "--angles")]
+Steps = Annotated[str | None, option("First and last position of the caliper: -2..3.")]
 Consent = Annotated[
     list[str] | None,
-    typer.Option("--consent", help="Use that the subject agreed to; repeatable, or by commas."),
+    option("Use that the subject agreed to; repeatable, or by commas.", "--consent"),
 ]
 ConsentExpires = Annotated[
     datetime | None,
@@ -98,8 +98,8 @@ ConsentExpires = Annotated[
 def target_of(rig: str) -> Any:
     """Return the option --target of a rig."""
     names = completion.targets_of(rig)
-    return typer.Option(
-        help=f"A target instead of a subject: {', '.join(names)}.",
+    return option(
+        f"A target instead of a subject: {', '.join(names)}.",
         autocompletion=lambda incomplete: completion.beginning(names, incomplete),
     )
 
@@ -110,27 +110,23 @@ class SequenceOptions:
 
     sequence: Annotated[
         str | None,
-        typer.Option(
-            help="A sequence in time: an expression made and dropped by a sound, such as smile, or "
+        option(
+            "A sequence in time: an expression made and dropped by a sound, such as smile, or "
             "exercise or alcohol, followed after the event."
         ),
     ] = None
     prompt_period: Annotated[
-        str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
+        str | None, option("Of a sequence: seconds from sound to sound; default 5.")
     ] = None
     shot_period: Annotated[
-        str | None,
-        typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
+        str | None, option("Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300.")
     ] = None
     captures: Annotated[
-        int | None,
-        typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
+        int | None, option("Shots of a sequence by sounds; default: each phase, a tenth twice.")
     ] = None
     duration: Annotated[
         str | None,
-        typer.Option(
-            help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."
-        ),
+        option("Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
     ] = None
 
     def order(self) -> SequenceOrder | None:

@@ -11,8 +11,8 @@ import typer
 
 from skinrig import errors
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import Json, Subject, expand, file_to_write
-from skinrig.console import Console
+from skinrig.commands.options import Json, Subject, expand, file_to_write, option
+from skinrig.console import Console, picked
 from skinrig.next_steps import shell_quote
 from skinrig.written_units import written
 
@@ -25,14 +25,14 @@ plan_app = typer.Typer(
 
 def _want(example: str) -> typer.models.OptionInfo:
     """Return the option --want of a rig."""
-    return typer.Option(
-        help=f"Medians that must be reached: {example}. Empty: what the whole rig, or --forecast, "
+    return option(
+        f"Medians that must be reached: {example}. Empty: what the whole rig, or --forecast, "
         "will give."
     )
 
 
 PlanWidth = Annotated[
-    int | None, typer.Option("--width", help="Pixels across the cameras; default: the rig's own.")
+    int | None, option("Pixels across the cameras; default: the rig's own.", "--width")
 ]
 
 
@@ -42,19 +42,17 @@ class PlanOptions:
 
     subject: Subject = "III"
     valid_share: Annotated[
-        float, typer.Option(help="Of what the whole rig gives an estimate, so much must keep it.")
+        float, option("Of what the whole rig gives an estimate, so much must keep it.")
     ] = 0.9
-    forecast: Annotated[
-        Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
-    ] = None
+    forecast: Annotated[Path | None, option("A plan, JSON: say what it will give instead.")] = None
     out: Annotated[
         Path | None, typer.Option("--out", callback=file_to_write, help="File for the plan, JSON.")
     ] = None
     confirm: Annotated[
         Path | None,
-        typer.Option(help="Folder: simulate the plan, reconstruct, and compare with the forecast."),
+        option("Folder: simulate the plan, reconstruct, and compare with the forecast."),
     ] = None
-    seed: Annotated[int, typer.Option(help="Seed of the face.")] = 0
+    seed: Annotated[int, option("Seed of the face.")] = 0
     json: Json = False
 
 
@@ -64,7 +62,7 @@ def plan_dome(
     common: PlanOptions,
     want: Annotated[str, _want("normals<=1deg,r_d<=3%")] = "",
     width: PlanWidth = None,
-    most_lights: Annotated[int | None, typer.Option(help="No more lights than these.")] = None,
+    most_lights: Annotated[int | None, option("No more lights than these.")] = None,
 ) -> None:
     """Choose the dome's lights and cameras that reach an error, and say what is left out.
 
@@ -119,7 +117,7 @@ def _plan(
     most_lights: int | None = None,
 ) -> None:
     """Choose a plan, print it, and write it."""
-    from skinrig.planning.plans import choose, confirmed, lines
+    from skinrig.planning.plans import choose, lines
     from skinrig.simulating.subject_records import unused_subject_keys
 
     console = Console(common.json)
@@ -129,16 +127,8 @@ def _plan(
             f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
         )
     unused = unused_subject_keys(subject, rig, console.progress)
-    choice = choose(
-        rig,
-        want,
-        subject=subject,
-        seed=seed,
-        width_px=width,
-        most_lights=most_lights,
-        valid_share=common.valid_share,
-        forecast=common.forecast,
-    )
+    asked = picked(common, "subject", "seed", "valid_share", "forecast")
+    choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
     for line in lines(choice):
         console.say(line)
     document = choice.to_document()
@@ -146,6 +136,8 @@ def _plan(
         document["subject_unused"] = list(unused)
     reached = choice.reached
     if common.confirm is not None:
+        from skinrig.planning.confirmation import confirmed
+
         found = confirmed(
             choice, common.confirm, subject=subject, seed=seed, progress=console.progress
         )

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import Json, Out
-from skinrig.console import Console, counted
+from skinrig.commands.options import Json, Out, argument, option
+from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 
@@ -18,22 +18,18 @@ from skinrig.next_steps import shell_quote
 def calibrate(
     kind: Annotated[
         str,
-        typer.Argument(
-            help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
+        argument(
+            "Of the flash rig sensor, color, polarization, white; of the dome geometry, "
             "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
             autocompletion=completion.calibrations,
         ),
     ],
-    sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
+    sessions: Annotated[list[Path], argument("Sessions of the target.")],
     out: Out = Path("calibration"),
-    square_mm: Annotated[
-        float, typer.Option(help="Side of the squares of geometry's board, mm.")
-    ] = 36.0,
-    sphere_mm: Annotated[
-        float, typer.Option(help="Radius of the mirror sphere of lights, mm.")
-    ] = 50.0,
+    square_mm: Annotated[float, option("Side of the squares of geometry's board, mm.")] = 36.0,
+    sphere_mm: Annotated[float, option("Radius of the mirror sphere of lights, mm.")] = 50.0,
     phantom: Annotated[
-        Path | None, typer.Option(help="Certificate (JSON) of the block fibre was measured on.")
+        Path | None, option("Certificate (JSON) of the block fibre was measured on.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -47,21 +43,13 @@ def calibrate(
     console = Console(json)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
     console.rows(("quantity", "value"), done.summary)
-    for text in done.findings:
-        console.say(f"found: {text}")
+    console.each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
             console.say(f"drift: {change}")
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
-    console.document(
-        "skinrig.calibrate/1",
-        {
-            "path": done.path,
-            "values": dict(done.summary),
-            "findings": done.findings,
-            "drift": [str(d) for d in done.drift],
-        },
-    )
+    values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
+    console.document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
 
 def check_rank(rank: int | None, basis: Path | None) -> None:
@@ -99,31 +87,27 @@ def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="SESSION/ folder.")],
     want: Annotated[
         str,
-        typer.Option(
-            help="Maps, separated by commas; a wrong name lists those there are.",
+        option(
+            "Maps, separated by commas; a wrong name lists those there are.",
             autocompletion=completion.wants,
         ),
     ],
     out: Out,
-    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
-    state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
+    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
+    state: Annotated[str, option("State of the subject.")] = "neutral",
     scan: Annotated[
-        Path | None, typer.Option(help="Mesh of the face, PLY in mm, instead of a dome session's.")
+        Path | None, option("Mesh of the face, PLY in mm, instead of a dome session's.")
     ] = None,
     basis: Annotated[
-        Path | None, typer.Option(help="Folder of MERL tables to fit a dome's lobes with.")
+        Path | None, option("Folder of MERL tables to fit a dome's lobes with.")
     ] = None,
     landmarks: Annotated[
-        Path | None,
-        typer.Option(help="Table name,x,y of a probe's sites in pixels of its 256 x 256 map."),
+        Path | None, option("Table name,x,y of a probe's sites in pixels of its 256 x 256 map.")
     ] = None,
     hold_out: Annotated[
-        str | None,
-        typer.Option(help="A dome's frames that no fit sees: lights=L007,L023,views=C03."),
+        str | None, option("A dome's frames that no fit sees: lights=L007,L023,views=C03.")
     ] = None,
-    rank: Annotated[
-        int | None, typer.Option(help="Lobes that a dome's points share; default 4.")
-    ] = None,
+    rank: Annotated[int | None, option("Lobes that a dome's points share; default 4.")] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -157,22 +141,12 @@ def reconstruct(
             truth=truth.name if truth else "",
             dome=DomeOptions(scan, basis, hold_out, rank),
         )
-        for text in done.assumed:
-            console.say(f"assumed: {text}")
+        console.each("assumed", done.assumed)
         console.say(f"run: {', '.join(done.ran) or 'nothing'}")
         console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
-        for what, why in done.left_out:
-            console.say(f"left out: {what} ({why})")
-        made.append(
-            {
-                "path": folder,
-                "ran": done.ran,
-                "reused": done.reused,
-                "left_out": done.left_out,
-                "assumed": done.assumed,
-                "work": [dict(w) for w in done.work],
-            }
-        )
+        console.each("left out", (f"{what} ({why})" for what, why in done.left_out))
+        written = picked(done, "ran", "reused", "left_out", "assumed", "work")
+        made.append({"path": folder, **written})
     console.say(f"next: skinrig report {shell_quote(out)}")
     console.document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}

@@ -2,80 +2,82 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json
+from skinrig.commands.options import Json, Out, argument, expand, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
 
-Views = Annotated[
-    str, typer.Option(help="View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
-]
-Lights = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Light of the rig (L017), direction towards it (1,1,2) or place in mm "
-        "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
-    ),
-]
+if TYPE_CHECKING:
+    from skinrig.rendering.figures import Effort
 
 
-def render(
-    appearance: Annotated[
-        list[Path], typer.Argument(help="Fitted maps of the dome, with lobes; several for --bases.")
-    ],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write.")],
-    view: Views = "0,0,700",
-    light: Lights = None,
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    """What is seen, from where, and under which light."""
+
+    view: Annotated[
+        str, option("View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
+    ] = "0,0,700"
+    light: Annotated[
+        list[str] | None,
+        option(
+            "Light of the rig (L017), direction towards it (1,1,2) or place in mm "
+            "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
+        ),
+    ] = None
     environment: Annotated[
-        Path | None, typer.Option(help="Light from everywhere: latitude-longitude OpenEXR map.")
-    ] = None,
-    environment_lights: Annotated[
-        int, typer.Option(help="Lights that are drawn from the environment.")
-    ] = 64,
+        Path | None, option("Light from everywhere: latitude-longitude OpenEXR map.")
+    ] = None
+    environment_lights: Annotated[int, option("Lights that are drawn from the environment.")] = 64
     mesh: Annotated[
-        Path | None,
-        typer.Option(help="Another mesh with the maps' texture coordinates: OBJ, PLY or .npz."),
-    ] = None,
-    rig: Annotated[str, typer.Option(help="Rig whose views and lights are named.")] = "dome",
+        Path | None, option("Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.")
+    ] = None
+    rig: Annotated[str, option("Rig whose views and lights are named.")] = "dome"
     calibration: Annotated[
-        Path | None, typer.Option(help="CALIBRATION/ folder; default: the rig as drawn.")
-    ] = None,
-    size: Annotated[int, typer.Option(help="Columns of the picture.")] = 512,
-    fov: Annotated[
-        float, typer.Option(help="Of a camera given by its place: degrees across.")
-    ] = 25.0,
-    target: Annotated[str, typer.Option(help="What that camera looks at, mm.")] = "0,0,0",
-    samples: Annotated[int, typer.Option(help="Rays a pixel: 1, 4, 9, 16 ...")] = 4,
-    shadow_samples: Annotated[
-        int, typer.Option(help="Points of each light's disc that a ray looks for.")
-    ] = 4,
+        Path | None, option("CALIBRATION/ folder; default: the rig as drawn.")
+    ] = None
+    size: Annotated[int, option("Columns of the picture.")] = 512
+    fov: Annotated[float, option("Of a camera given by its place: degrees across.")] = 25.0
+    target: Annotated[str, option("What that camera looks at, mm.")] = "0,0,0"
+
+
+@dataclass(frozen=True, slots=True)
+class EffortOptions:
+    """How much is computed, and what light does in the skin."""
+
+    samples: Annotated[int, option("Rays a pixel: 1, 4, 9, 16 ...")] = 4
+    shadow_samples: Annotated[int, option("Points of each light's disc that a ray looks for.")] = 4
     light_radius: Annotated[
-        float | None,
-        typer.Option(help="Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10."),
-    ] = None,
+        float | None, option("Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.")
+    ] = None
     subsurface: Annotated[
         str,
-        typer.Option(
-            help="dipole: light spreads in skin; local: it leaves where it entered; none: the "
+        option(
+            "dipole: light spreads in skin; local: it leaves where it entered; none: the "
             "surface alone."
         ),
-    ] = "dipole",
+    ] = "dipole"
     translucency: Annotated[
-        str | None,
-        typer.Option(help="sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173."),
-    ] = None,
+        str | None, option("sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.")
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class PictureOptions:
+    """Which pictures are made."""
+
     components: Annotated[
-        bool, typer.Option("--components", help="Light from inside and surface apart, too.")
-    ] = False,
+        bool, option("Light from inside and surface apart, too.", "--components")
+    ] = False
     bases: Annotated[
-        str | None,
-        typer.Option(help="Compare numbers of lobes: 1,2,4; more than were fitted cannot be had."),
-    ] = None,
+        str | None, option("Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.")
+    ] = None
     shadow_boundary: Annotated[
         bool,
         typer.Option(
@@ -83,29 +85,40 @@ def render(
             help="A card's shadow on the forehead and on a flat patch, by least and greatest "
             "sigma_tr; brings its own view and light.",
         ),
-    ] = False,
+    ] = False
     exposure: Annotated[
-        float | None, typer.Option(help="Factor of the PNGs; default: skin is shown well.")
-    ] = None,
+        float | None, option("Factor of the PNGs; default: skin is shown well.")
+    ] = None
     against: Annotated[
         Path | None,
-        typer.Option(
-            help="Session whose photographs the model was not fitted to (reconstruct --hold-out): "
+        option(
+            "Session whose photographs the model was not fitted to (reconstruct --hold-out): "
             "render what they show, and compare; with --components take the photograph of --view "
             "and --light apart."
         ),
-    ] = None,
+    ] = None
     photographs: Annotated[
-        int, typer.Option(help="With --against: most photographs, even over those held out.")
-    ] = 24,
+        int, option("With --against: most photographs, even over those held out.")
+    ] = 24
     ablation: Annotated[
         bool,
         typer.Option(
             "--ablation/--no-ablation",
             help="With --against: also compare without each part of the model.",
         ),
-    ] = True,
-    seed: Annotated[int, typer.Option(help="Of the environment's lights, and of --bases.")] = 0,
+    ] = True
+    seed: Annotated[int, option("Of the environment's lights, and of --bases.")] = 0
+
+
+@expand
+def render(
+    appearance: Annotated[
+        list[Path], argument("Fitted maps of the dome, with lobes; several for --bases.")
+    ],
+    out: Out,
+    scene: SceneOptions,
+    effort: EffortOptions,
+    pictures: PictureOptions,
     json: Json = False,
 ) -> None:
     """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
@@ -115,78 +128,103 @@ def render(
     """
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
-    from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
+    from skinrig.rendering.request import subpixels_of
 
     console = Console(json)
-    if subsurface not in get_args(Subsurface):
+    if effort.subsurface not in get_args(Subsurface):
         raise UnusableError(
-            f"--subsurface: got {subsurface!r}, expected {', '.join(get_args(Subsurface))}"
+            f"--subsurface: got {effort.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
         )
+    exposure = pictures.exposure
     if exposure is not None and not exposure > 0.0:
         raise UnusableError(f"--exposure: got {exposure}, expected a factor above 0")
-    if len(appearance) > 1 and bases is None:
+    if len(appearance) > 1 and pictures.bases is None:
         raise UsageError("appearance: got several, expected one; several are for --bases")
-    effort = figures.Effort(
-        subsurface=subsurface,  # type: ignore[arg-type]
-        subpixels=subpixels_of(samples),
-        shadow_samples=shadow_samples,
+    costs = figures.Effort(
+        subsurface=effort.subsurface,  # type: ignore[arg-type]
+        subpixels=subpixels_of(effort.samples),
+        shadow_samples=effort.shadow_samples,
         exposure=exposure,
-        seed=seed,
+        seed=pictures.seed,
         progress=console.progress,
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
-    if against is not None and not components:
-        from skinrig.rendering.photographs import comparison, evaluation
+    if pictures.against is not None and not pictures.components:
+        _compare(appearance[0], pictures.against, out, scene, effort, pictures, console)
+    elif pictures.shadow_boundary:
+        subject = figures.RenderModel.of(appearance[0], mesh=scene.mesh)
+        _report(console, figures.draw_shadow_boundary(subject, out, costs, size_px=scene.size))
+    else:
+        _report(console, _draw(appearance, out, scene, effort, pictures, costs))
 
-        found = evaluation.evaluate_folders(
-            appearance[0],
-            against,
-            out,
-            calibration=calibration,
-            translucency=translucency,
-            subsurface=subsurface,  # type: ignore[arg-type]
-            count=photographs,
-            ablation=ablation,
-            seed=seed,
-            progress=console.progress,
-        )
-        comparison.print_comparison(console, found)
-        if not found["passed"]:
-            raise typer.Exit(errors.LIMIT_MISSED)
-        return
-    if shadow_boundary:
-        subject = figures.RenderModel.of(appearance[0], mesh=mesh)
-        done = figures.draw_shadow_boundary(subject, out, effort, size_px=size)
-        _tell(console, done)
-        return
-    stage = RenderRig.of(rig, calibration)
-    camera = stage.camera(view, size_px=size, target_mm=target, fov_deg=fov)
+
+def _compare(
+    appearance: Path,
+    session: Path,
+    out: Path,
+    scene: SceneOptions,
+    effort: EffortOptions,
+    pictures: PictureOptions,
+    console: Console,
+) -> None:
+    """Compare renderings with photographs of a session that no fit has seen."""
+    from skinrig.rendering.photographs import comparison, evaluation
+
+    found = evaluation.evaluate_folders(
+        appearance,
+        session,
+        out,
+        calibration=scene.calibration,
+        translucency=effort.translucency,
+        subsurface=effort.subsurface,  # type: ignore[arg-type]
+        count=pictures.photographs,
+        ablation=pictures.ablation,
+        seed=pictures.seed,
+        progress=console.progress,
+    )
+    comparison.print_comparison(console, found)
+    if not found["passed"]:
+        raise typer.Exit(errors.LIMIT_MISSED)
+
+
+def _draw(
+    appearance: list[Path],
+    out: Path,
+    scene: SceneOptions,
+    effort: EffortOptions,
+    pictures: PictureOptions,
+    costs: Effort,
+) -> dict[str, Any]:
+    """Draw a picture, a photograph beside its rendering, or one for each number of lobes."""
+    from skinrig.rendering import figures
+    from skinrig.rendering.request import RenderRig, lights_of
+
+    stage = RenderRig.of(scene.rig, scene.calibration)
+    camera = stage.camera(scene.view, size_px=scene.size, target_mm=scene.target, fov_deg=scene.fov)
     lights = lights_of(
         stage,
-        light or (),
-        radius_mm=light_radius,
-        environment=environment,
-        environment_count=environment_lights,
-        seed=seed,
+        scene.light or (),
+        radius_mm=effort.light_radius,
+        environment=scene.environment,
+        environment_count=scene.environment_lights,
+        seed=pictures.seed,
     )
     subjects = [
-        figures.RenderModel.of(path, mesh=mesh, translucency=translucency) for path in appearance
+        figures.RenderModel.of(path, mesh=scene.mesh, translucency=effort.translucency)
+        for path in appearance
     ]
-    if against is not None:
-        done = figures.draw_photograph(
-            subjects[0], against, view, lights[0].name, out, effort, calibration=calibration
+    if pictures.against is not None:
+        name, calibration = lights[0].name, scene.calibration
+        return figures.draw_photograph(
+            subjects[0], pictures.against, scene.view, name, out, costs, calibration=calibration
         )
-    else:
-        asked = figures.Asked(camera, lights, out, effort, stage.assumed)
-        if bases is None:
-            done = figures.draw(subjects[0], asked, components=components)
-        else:
-            done = figures.draw_bases(subjects, _ranks(bases), asked)
-    _tell(console, done)
+    asked = figures.Asked(camera, lights, out, costs, stage.assumed)
+    if pictures.bases is None:
+        return figures.draw(subjects[0], asked, components=pictures.components)
+    return figures.draw_bases(subjects, _ranks(pictures.bases), asked)
 
 
 def _ranks(text: str) -> list[int]:
-
     try:
         found = [int(part) for part in text.split(",")]
     except ValueError:
@@ -196,9 +234,8 @@ def _ranks(text: str) -> list[int]:
     return found
 
 
-def _tell(console: Console, done: dict[str, Any]) -> None:
-    for assumption in done["assumed"]:
-        console.say(f"assumed: {assumption}")
+def _report(console: Console, done: dict[str, Any]) -> None:
+    console.each("assumed", done["assumed"])
     if "bases" in done:
         for row in done["bases"]:
             gap = next(v for k, v in row.items() if k.startswith("surface_difference"))

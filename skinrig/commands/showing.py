@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import STDOUT_MARK, Json, Page, file_to_write
-from skinrig.console import Console
+from skinrig.commands.options import (
+    STDOUT_MARK,
+    Json,
+    Page,
+    argument,
+    expand,
+    file_to_write,
+    option,
+)
+from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
 MAX_PORT = 65_535
 
 
 def report(
-    paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
+    paths: Annotated[list[Path], argument("Folders that skinrig wrote.")],
     out: Annotated[
         Path,
         typer.Option(
@@ -62,67 +71,75 @@ def report(
     if not piped:
         talk.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
-    console.document(
-        "skinrig.report/1",
-        {
-            "path": out,
-            "bytes": size,
-            "checks": len(done.checks),
-            "missed": missed,
-            "compared": done.compared,
-        },
+    figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
+    console.document("skinrig.report/1", {**figures, "compared": done.compared})
+
+
+@dataclass(frozen=True, slots=True)
+class FaceOptions:
+    """Geometry and color of the face that is drawn."""
+
+    mesh: Annotated[
+        Path | None,
+        option(
+            "The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
+            "blend shapes or without."
+        ),
+    ] = None
+    landmarks: Annotated[
+        Path | None,
+        option(
+            "Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
+            "a simulation has its own."
+        ),
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        option(
+            "CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
+            "were made with, or what its session says of the sensor."
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class HeadOptions:
+    """The simulated head, and the size of all textures."""
+
+    preset: Annotated[str, option("Skin type of a simulated head: I to VI, palest or darkest.")] = (
+        "III"
     )
+    seed: Annotated[int, option("Seed of a simulated head.")] = 0
+    size: Annotated[int, option("Texels a side of the textures, 64 to 4096.")] = 2048
 
 
+@expand
 def view(
+    *,
     appearance: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
+        argument(
+            "Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
             "simulated head."
         ),
     ] = None,
     out: Page = Path("page.html"),
-    mesh: Annotated[
-        Path | None,
-        typer.Option(
-            help="The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
-            "blend shapes or without."
-        ),
-    ] = None,
-    landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            help="Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
-            "a simulation has its own."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
-            "were made with, or what its session says of the sensor."
-        ),
-    ] = None,
+    face: FaceOptions,
     port: Annotated[
         int | None,
-        typer.Option(
-            help="Serve the page and its large displacement on this port of this machine alone, 0: "
+        option(
+            "Serve the page and its large displacement on this port of this machine alone, 0: "
             "any free one, in place of writing it."
         ),
     ] = None,
     displacement: Annotated[
         Path | None,
-        typer.Option(
-            help="With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
+        option(
+            "With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
             "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
         ),
     ] = None,
-    preset: Annotated[
-        str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
-    ] = "III",
-    seed: Annotated[int, typer.Option(help="Seed of a simulated head.")] = 0,
-    size: Annotated[int, typer.Option(help="Texels a side of the textures, 64 to 4096.")] = 2048,
+    head: HeadOptions,
     json: Json = False,
 ) -> None:
     """Write one self-contained page that draws a face live: expressions, blood, light, traits.
@@ -140,16 +157,9 @@ def view(
         raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}")
     if displacement is not None and port is None:
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
-    scene = compose(
-        appearance or [],
-        mesh=mesh,
-        landmarks=landmarks,
-        calibration=calibration,
-        preset=preset,
-        seed=seed,
-        size=size,
-        progress=console.progress,
-    )
+    given = picked(face, "mesh", "landmarks", "calibration")
+    given |= picked(head, "preset", "seed", "size")
+    scene = compose(appearance or [], progress=console.progress, **given)
     document: dict[str, Any]
     if port is None:
         document = write(scene, out)
@@ -157,8 +167,7 @@ def view(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
             f"{document['blend_shapes']} blend shapes; open it in a browser"
         )
-    for what, why in scene.left_out:
-        console.say(f"left out: {what}: {why}")
+    console.left_out(scene.left_out)
     if port is None:
         console.document("skinrig.view/1", document)
     else:

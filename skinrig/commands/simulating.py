@@ -8,31 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skinrig.commands import completion
+from skinrig.commands import completion, options
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import (
-    AllBrackets,
-    Angles,
-    Consent,
-    ConsentExpires,
-    Directions,
-    Json,
-    Out,
-    Pairs,
-    Placements,
-    Resume,
-    Seed,
-    SequenceOptions,
-    Site,
-    Sites,
-    Size,
-    Steps,
-    Subject,
-    Width,
-    expand,
-    target_of,
-)
-from skinrig.console import Console, counted
+from skinrig.commands.options import expand, option, target_of
+from skinrig.console import Console, counted, picked
 from skinrig.next_steps import after_session
 
 if TYPE_CHECKING:
@@ -46,16 +25,14 @@ simulate_app = typer.Typer(
 
 States = Annotated[
     list[str] | None,
-    typer.Option(
-        help="State of the face, such as smile or exercise; repeatable.",
+    option(
+        "State of the face, such as smile or exercise; repeatable.",
         autocompletion=completion.states,
     ),
 ]
 OneState = Annotated[
     list[str] | None,
-    typer.Option(
-        help="State of the face, such as smile or exercise; one.", autocompletion=completion.states
-    ),
+    option("State of the face, such as smile or exercise; one.", autocompletion=completion.states),
 ]
 
 
@@ -63,16 +40,16 @@ OneState = Annotated[
 class SimulateOptions:
     """Options of every simulation."""
 
-    out: Out
-    size: Size = "small"
-    seed: Seed = 0
-    plan: Annotated[
-        Path | None, typer.Option(help="What is captured of the subject, by `skinrig plan`.")
-    ] = None
-    consent: Consent = None
-    consent_expires: ConsentExpires = None
-    resume: Resume = False
-    json: Json = False
+    out: options.Out
+    size: options.Size = "small"
+    seed: options.Seed = 0
+    plan: Annotated[Path | None, option("What is captured of the subject, by `skinrig plan`.")] = (
+        None
+    )
+    consent: options.Consent = None
+    consent_expires: options.ConsentExpires = None
+    resume: options.Resume = False
+    json: options.Json = False
 
     def ordered(self, subject: str, console: Console) -> dict[str, Any]:
         """Return what every order has, by name."""
@@ -86,26 +63,17 @@ class SimulateOptions:
         if not self.resume or self.consent or self.consent_expires is not None:
             name = pseudonym(subject, self.seed)
             person = subject_of(name, self.consent or SIMULATED_USES, self.consent_expires)
-        return {
-            "out": self.out,
-            "size": self.size,
-            "seed": self.seed,
-            "subject": subject,
-            "plan": None if self.plan is None else read_plan(self.plan),
-            "resume": self.resume,
-            "person": person,
-            "progress": console.progress,
-        }
+        plan = None if self.plan is None else read_plan(self.plan)
+        order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
+        return order | picked(self, "out", "size", "seed", "resume")
 
 
 @dataclass(frozen=True, slots=True)
 class FaceOptions:
     """Options of a simulated face."""
 
-    width: Annotated[int | None, typer.Option(help="Pixels across, instead of the size; even.")] = (
-        None
-    )
-    mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None
+    width: Annotated[int | None, option("Pixels across, instead of the size; even.")] = None
+    mesh: Annotated[Path | None, option("Face mesh, .npz or .obj.")] = None
     movement: Annotated[
         bool,
         typer.Option(
@@ -115,8 +83,8 @@ class FaceOptions:
     ] = True
     leave_out: Annotated[
         str | None,
-        typer.Option(
-            help="What of skin is not built although it changes pixels, joined by commas: lateral "
+        option(
+            "What of skin is not built although it changes pixels, joined by commas: lateral "
             "(or subsurface), interreflections, spectral, optics, relief_shadows."
         ),
     ] = None
@@ -125,12 +93,9 @@ class FaceOptions:
         """Return what orders of faces have, by name."""
         from skinrig.capturing.option_values import parse_names
 
-        return {
-            "width_px": self.width,
-            "mesh": self.mesh,
-            "movement": self.movement,
-            "leave_out": parse_names(self.leave_out) or (),
-        }
+        leave_out = parse_names(self.leave_out) or ()
+        order = {"width_px": self.width, "leave_out": leave_out}
+        return order | picked(self, "mesh", "movement")
 
 
 @simulate_app.command("flash", cls=RigCommand)
@@ -138,10 +103,10 @@ class FaceOptions:
 def simulate_flash(
     common: SimulateOptions,
     face: FaceOptions,
-    sequence: SequenceOptions,
-    subject: Subject = "III",
+    sequence: options.SequenceOptions,
+    subject: options.Subject = "III",
     target: Annotated[str | None, target_of("flash")] = None,
-    repeats: Pairs = 1,
+    repeats: options.Pairs = 1,
     state: States = None,
     nearer: Annotated[
         float,
@@ -153,9 +118,8 @@ def simulate_flash(
     ] = 0.0,
     relaxation: Annotated[
         float | None,
-        typer.Option(
-            help="Time constant of a sequence's blood, s; default 0.02, of exercise 40, of "
-            "alcohol 1200."
+        option(
+            "Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200."
         ),
     ] = None,
 ) -> None:
@@ -186,20 +150,16 @@ def simulate_dome(
     face: FaceOptions,
     subject: Annotated[
         str,
-        typer.Option(
-            help="Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
+        option(
+            "Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
             "simulated population.",
             autocompletion=completion.subjects,
         ),
     ] = "III",
     target: Annotated[str | None, target_of("dome")] = None,
-    lights: Annotated[
-        int | None, typer.Option(help="How many lights; default 48, full all 150.")
-    ] = None,
-    views: Annotated[
-        int | None, typer.Option(help="How many cameras; default 6, full all 16.")
-    ] = None,
-    move: Annotated[bool, typer.Option("--move", help="The face moves.")] = False,
+    lights: Annotated[int | None, option("How many lights; default 48, full all 150.")] = None,
+    views: Annotated[int | None, option("How many cameras; default 6, full all 16.")] = None,
+    move: Annotated[bool, option("The face moves.", "--move")] = False,
     state: OneState = None,
     wrapped: Annotated[
         bool,
@@ -251,7 +211,7 @@ def simulate_dome(
         wrapped=wrapped,
         subsurface=subsurface,
         interreflections=interreflections,
-        conditions=parse_amounts(condition, "--condition"),
+        conditions=parse_amounts(condition or (), "--condition", default=1.0),
     )
     _simulate(order, console, target)
 
@@ -260,16 +220,16 @@ def simulate_dome(
 @expand
 def simulate_gradient(
     common: SimulateOptions,
-    subject: Subject = "III",
+    subject: options.Subject = "III",
     target: Annotated[str | None, target_of("gradient")] = None,
-    width: Width = None,
-    site: Site = None,
-    angles: Angles = None,
-    steps: Steps = None,
+    width: options.Width = None,
+    site: options.Site = None,
+    angles: options.Angles = None,
+    steps: options.Steps = None,
     leave_out: Annotated[
         str | None,
-        typer.Option(
-            help="What of skin is not built although it changes pixels, joined by commas: shadows, "
+        option(
+            "What of skin is not built although it changes pixels, joined by commas: shadows, "
             "lateral, interreflections, optics."
         ),
     ] = None,
@@ -300,18 +260,18 @@ def simulate_probe(
     common: SimulateOptions,
     subject: Annotated[
         str,
-        typer.Option(
-            help="Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
+        option(
+            "Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
             "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
             "sigma_s', 1/mm, and AXIS in degrees.",
             autocompletion=completion.subjects,
         ),
     ] = "III",
     target: Annotated[str | None, target_of("probe")] = None,
-    sites: Sites = None,
-    repeats: Placements = 1,
-    angles: Directions = None,
-    all_brackets: AllBrackets = False,
+    sites: options.Sites = None,
+    repeats: options.Placements = 1,
+    angles: options.Directions = None,
+    all_brackets: options.AllBrackets = False,
 ) -> None:
     """Simulate the fibre probe: tissue at some sites, or a target.
 

@@ -19,6 +19,7 @@ from model.traits.vectors import MAX_P_VALUE, TraitVector
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
+from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import albedo as editing_albedo
@@ -28,7 +29,7 @@ from skinrig.editing import surface as editing_surface
 from skinrig.editing.albedo import AlbedoEdit
 from skinrig.editing.spots import SpotOrder
 from skinrig.editing.surface_mixtures import SurfaceMixtures
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 
@@ -94,8 +95,7 @@ class EditRequest:
                     "beyond there are no faces that it was learned from"
                 )
         for part in self.parts or ():
-            if part not in EDITABLE_PARTS:
-                raise EditError(f"parts: got {part!r}, expected of {', '.join(EDITABLE_PARTS)}")
+            one_of("parts", part, EDITABLE_PARTS, EditError)
         if self.iterations < 1:
             raise EditError(
                 f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
@@ -131,6 +131,8 @@ class _Work:
     """State of an edit under way."""
 
     face: Face
+    order: EditRequest
+    mask: Float32Array | None
     maps: dict[str, SkinMap]  # as edited so far
     files: dict[str, bytes]  # as edited so far
     record: dict[str, Any]
@@ -174,11 +176,11 @@ def edit(
     face = face_textures.read(path, order.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
-        "appearance": face_textures.digest(path / store.DOCUMENT_FILE),
+        "appearance": document_digest(path),
     }
     for name, file in (("mask", order.mask), ("landmarks", order.landmarks)):
         if file is not None:
-            inputs[name] = face_textures.digest(file)
+            inputs[name] = digest(file)
     if library is not None and library_hash:
         inputs["traits"] = library_hash
     done = edited(face, order, library, progress=progress)
@@ -196,28 +198,27 @@ def edited(
     """Edit an appearance in memory; see `edit`."""
     tell = progress or (lambda text: None)
     source = face.appearance
-    work = _Work(face, dict(source.maps), dict(source.files), {}, [], list(source.left_out))
     parts = _opened(order, library)
     shape = _texture_shape(source, face)
     mask = None if order.mask is None else masks.read(order.mask, shape)
+    maps, files = dict(source.maps), dict(source.files)
+    work = _Work(face, order, mask, maps, files, {}, [], list(source.left_out))
     asked = {name: amount for name, amount in order.traits.items() if amount}
     if asked and parts is not None:
-        chosen = _chosen(asked, parts, order, work)
+        chosen = _chosen(asked, parts, work)
         if chosen["albedo"]:
             tell(f"albedo: {', '.join(chosen['albedo'])}")
-            _edit_albedo(work, parts, chosen["albedo"], order, mask)
+            _edit_albedo(work, parts, chosen["albedo"])
         if chosen["surface"]:
             tell(f"lobes: {', '.join(chosen['surface'])}")
-            _edit_surface(work, parts, chosen["surface"], order, mask)
+            _edit_surface(work, parts, chosen["surface"])
     spots = [spot for spot in order.spots if spot.amount]
     if spots:
-        _edit_spots(work, spots, order, mask, tell)
-    changed = tuple(
-        sorted(
-            {n for n, m in work.maps.items() if source.maps.get(n) is not m}
-            | {n for n in source.maps if n not in work.maps}
-            | {n for n, c in work.files.items() if source.files.get(n) != c}
-        )
+        _edit_spots(work, spots, tell)
+    changed = sorted(
+        {n for n, m in work.maps.items() if source.maps.get(n) is not m}
+        | {n for n in source.maps if n not in work.maps}
+        | {n for n, c in work.files.items() if source.files.get(n) != c}
     )
     record = {
         "of": face.path.resolve().name,
@@ -228,28 +229,23 @@ def edited(
         "seed": order.seed,
         "iterations": order.iterations,
         "landmarks": face.marked_by,
-        "changed": list(changed),
+        "changed": changed,
         "warnings": list(work.warnings),
         **work.record,
     }
     before = source.parameters.get("edit")
     if before is not None:
         record["before"] = before
+    parameters = {**source.parameters, "edit": record}
     # the people whose traits were used are in the result, too
     used = () if library is None or not asked else (library,)
-    agreed = consent.merge_consent(source, *used)
+    if agreed := consent.merge_consent(source, *used):
+        parameters[consent.CONSENT_KEY] = agreed
+    left_out = tuple(work.left_out)
     appearance = dataclasses.replace(
-        source,
-        maps=work.maps,
-        files=work.files,
-        left_out=tuple(work.left_out),
-        parameters={
-            **source.parameters,
-            "edit": record,
-            **({consent.CONSENT_KEY: agreed} if agreed else {}),
-        },
+        source, maps=work.maps, files=work.files, left_out=left_out, parameters=parameters
     )
-    return Edited(appearance, changed, record, tuple(work.warnings))
+    return Edited(appearance, tuple(changed), record, tuple(work.warnings))
 
 
 def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | None:
@@ -267,12 +263,8 @@ def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | 
                 f"trait {name!r}: is not one of {', '.join(parts.traits)}{hint} "
                 "`skinrig fit traits` learns others"
             )
-    if order.region != "face" and order.region not in parts.albedo:
-        have = [r for r in parts.albedo if r != "face"]
-        raise EditError(
-            f"region: got {order.region!r}, expected face"
-            + (f" or {' or '.join(have)}" if have else "; these traits have no other region")
-        )
+    if order.region != "face":
+        one_of("region", order.region, dict.fromkeys(("face", *parts.albedo)), EditError)
     return parts
 
 
@@ -288,9 +280,10 @@ def _texture_shape(source: SkinAppearance, face: Face) -> tuple[int, int]:
 
 
 def _chosen(
-    asked: Mapping[str, float], parts: LibraryParts, order: EditRequest, work: _Work
+    asked: Mapping[str, float], parts: LibraryParts, work: _Work
 ) -> dict[str, dict[str, float]]:
     """Return which traits to use in which part."""
+    order = work.order
     have: dict[str, Mapping[str, TraitVector]] = {
         "albedo": parts.albedo[order.region].traits.traits if order.region in parts.albedo else {},
         "surface": {} if parts.surface is None else parts.surface.traits,
@@ -310,11 +303,11 @@ def _chosen(
                     work.left_out.append((f"{name} in {p}", f"{why}; --parts {p} edits it"))
             use = use or possible
         if not use:
+            known = ", ".join(p for p in EDITABLE_PARTS if name in have[p]) or "no part"
+            shown = ", ".join(p for p in EDITABLE_PARTS if missing[p] in work.maps)
             raise EditError(
                 f"trait {name!r}: none of the parts asked for can be edited by it; the traits have "
-                f"it in {', '.join(p for p in EDITABLE_PARTS if name in have[p]) or 'no part'}, "
-                "the appearance has "
-                f"{', '.join(p for p in EDITABLE_PARTS if missing[p] in work.maps)}"
+                f"it in {known}, the appearance has {shown}"
             )
         for p in use:
             out[p][name] = amount
@@ -322,29 +315,22 @@ def _chosen(
     return out
 
 
-def _edit_albedo(
-    work: _Work,
-    parts: LibraryParts,
-    amounts: Mapping[str, float],
-    order: EditRequest,
-    mask: Float32Array | None,
-) -> None:
+def _edit_albedo(work: _Work, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
+    order, mask = work.order, work.mask
     space = parts.albedo[order.region]
     chart = work.face.chart(parts.frame)
     source = work.maps["r_d"]
-    _say_unmarked(work, order)
+    _say_unmarked(work)
+
+    region = common_regions.region(order.region, parts.frame)
+    share = masks.feathered(order.region, parts.frame)
 
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
+        rng = np.random.default_rng([order.seed, stream])
+        how: dict[str, Any] = {"iterations": order.iterations, "rng": rng}
+        valid = face_textures.valid_of(source)
         return editing_albedo.edit_albedo(
-            values,
-            face_textures.valid_of(source),
-            chart,
-            space,
-            given,
-            region=common_regions.region(order.region, parts.frame),
-            share=masks.feathered(order.region, parts.frame),
-            iterations=order.iterations,
-            rng=np.random.default_rng([order.seed, stream]),
+            values, valid, chart, space, given, region=region, share=share, **how
         )
 
     found = one(source.values, amounts, 0)
@@ -371,18 +357,13 @@ def _edit_albedo(
     }
 
 
-def _edit_surface(
-    work: _Work,
-    parts: LibraryParts,
-    amounts: Mapping[str, float],
-    order: EditRequest,
-    mask: Float32Array | None,
-) -> None:
+def _edit_surface(work: _Work, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
+    order, mask = work.order, work.mask
     if parts.surface is None:
         return
     share = mask
     if order.region != "face":
-        _say_unmarked(work, order)
+        _say_unmarked(work)
         over = masks.on_texture(order.region, parts.frame, work.face.chart(parts.frame))
         share = over if mask is None else mask * over
     current = dataclasses.replace(work.face.appearance, maps=work.maps, files=work.files)
@@ -410,14 +391,8 @@ def _edit_surface(
     }
 
 
-def _edit_spots(
-    work: _Work,
-    spots: Sequence[SpotOrder],
-    order: EditRequest,
-    mask: Float32Array | None,
-    tell: Callable[[str], None],
-) -> None:
-    face = work.face
+def _edit_spots(work: _Work, spots: Sequence[SpotOrder], tell: Callable[[str], None]) -> None:
+    face, order, mask = work.face, work.order, work.mask
     if "r_d" not in work.maps:
         raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
     frame = editing_spots.spot_frame(face)
@@ -448,15 +423,15 @@ def _edit_spots(
                 f"{spot.kind}: are smaller ({least} mm) than a texel ({face.texel_mm():.2f} mm) "
                 "and only darken it by their share"
             )
-    _say_unmarked(work, order)
+    _say_unmarked(work)
     work.record["spots_done"] = told
 
 
-def _say_unmarked(work: _Work, order: EditRequest) -> None:
+def _say_unmarked(work: _Work) -> None:
     text = "the face has no landmarks: it was unrolled from its foremost point, regions are typical"
-    if not work.face.landmarks and (order.region != "face" or order.spots):
-        if text not in work.warnings:
-            work.warnings.append(text)
+    regional = work.order.region != "face" or work.order.spots
+    if not work.face.landmarks and regional and text not in work.warnings:
+        work.warnings.append(text)
 
 
 def _relative(a: Float32Array, b: Float32Array, good: BoolArray) -> float:

@@ -15,12 +15,14 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from model import color_table
 from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.errors import one_of
 
 DOME_CAMERA, DOME_ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
 """Of the dome's camera RGB."""
@@ -136,7 +138,7 @@ def draw(
     SpotError
         For another kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
     """
-    what = _kind(kind)
+    what = SPOT_KINDS[one_of("spots", kind, SPOT_KINDS, SpotError)]
     density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
     for name, value in (("amount", amount), ("density_per_cm2", density)):
         if not (np.isfinite(value) and value >= 0):
@@ -145,9 +147,10 @@ def draw(
     share = np.where(np.asarray(surface, np.bool_), np.asarray(mask, np.float64), 0.0)
     if not share.any():
         raise SpotError(f"mask of {kind}: no texel of the surface lies in it")
-    transmitted = _transmitted(
-        np.asarray(r_d, np.float64)[share > 0], what.melanin, amount, table or _table()
-    )
+    if table is None:
+        table = color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+    colors = np.asarray(r_d, np.float64)[share > 0]
+    transmitted = _transmitted(colors, what.melanin, amount, table)
     area = texel_area_mm2(place, np.asarray(surface, np.bool_))
     wanted = float((area * share).sum()) / 100.0 * density
     if wanted > MAX_SPOTS:
@@ -165,32 +168,12 @@ def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Arra
 
     Rims of islands, where a neighbor is missing, take the median.
     """
-    both = []
-    for axis in (0, 1):
-        step = np.zeros_like(position_mm)
-        along = np.moveaxis(step, axis, 0)
-        at = np.moveaxis(position_mm, axis, 0)
-        along[1:-1] = 0.5 * (at[2:] - at[:-2])
-        both.append(step)
-    whole = surface.copy()
-    for axis in (0, 1):
-        for shift in (-1, 1):
-            whole &= np.roll(surface, shift, axis)
-    whole[[0, -1]] = False
-    whole[:, [0, -1]] = False
+    both = [np.gradient(position_mm, axis=axis) for axis in (0, 1)]
+    cross = ndimage.generate_binary_structure(2, 1)
+    whole = ndimage.binary_erosion(surface, cross)
     area = np.linalg.norm(np.cross(both[0], both[1]), axis=-1)
     usual = float(np.median(area[whole])) if whole.any() else 1.0
     return np.where(surface, np.where(whole, np.minimum(area, 9.0 * usual), usual), 0.0)
-
-
-def _kind(kind: str) -> SpotKind:
-    if kind not in SPOT_KINDS:
-        raise SpotError(f"spots: got {kind!r}, expected one of {', '.join(SPOT_KINDS)}")
-    return SPOT_KINDS[kind]
-
-
-def _table() -> ColorTable:
-    return color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
 def _transmitted(

@@ -17,6 +17,7 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import pigment_spots, spot_removal
+from skinrig.errors import one_of
 from skinrig.traits import albedo_vectors
 
 
@@ -44,10 +45,7 @@ class SpotOrder:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and more than all spots removed."""
-        if self.kind not in pigment_spots.SPOT_KINDS:
-            raise SpotOrderError(
-                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.SPOT_KINDS)}"
-            )
+        one_of("spots", self.kind, pigment_spots.SPOT_KINDS, SpotOrderError)
         if not np.isfinite(self.amount) or self.amount < -1.0:
             raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
 
@@ -67,14 +65,14 @@ def added(
     face: Face, source: SkinMap, spot: SpotOrder, share: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots drawn in, and what was done, as JSON values."""
+    place, density = (face.position, face.surface), spot.density_per_cm2
     drawn = pigment_spots.draw(
         spot.kind,
         source.values,
-        face.position,
-        face.surface,
+        *place,
         share,
         amount=spot.amount,
-        density_per_cm2=spot.density_per_cm2,
+        density_per_cm2=density,
         rng=rng,
     )
     gain = _bled(drawn.gain, face.surface, share)
@@ -91,13 +89,8 @@ def removed(
     source: SkinMap, spot: SpotOrder, share: Float32Array, chart: Chart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots filled from around, and what was done, as JSON values."""
-    found = spot_removal.find(
-        source.values,
-        face_textures.valid_of(source),
-        chart,
-        pixel_mm=frame.pixel_mm,
-        range_mm=pigment_spots.SPOT_KINDS[spot.kind].range_mm,
-    )
+    valid, sizes = face_textures.valid_of(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
+    found = spot_removal.find(source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes)
     part = (np.float32(-spot.amount) * share * found.share)[..., None]
     wanted = source.values * (1 - part) + found.fill * part
     ratio = np.where(

@@ -68,16 +68,14 @@ def edit_surface(
         return SurfaceEdit(source, 0.0, {})
     new = np.asarray(found.weights).reshape(*shape, -1).astype(np.float32)
     noise = _noise(space, amounts)
-    maps = []
-    for k in range(new.shape[2]):
-        if k < len(source.maps):
-            old = source.maps[k]
-            values = np.where(part > 0, new[..., k], old.values)
-            maps.append(dataclasses.replace(old, values=values))
-        else:
-            valid = source.valid if source.maps[0].valid is not None else None
-            error = (noise * new[..., k]).astype(np.float32)
-            maps.append(SkinMap(new[..., k], "1", error, valid, "share of a lobe of a trait"))
+    maps = [
+        dataclasses.replace(old, values=np.where(part > 0, new[..., k], old.values))
+        for k, old in enumerate(source.maps)
+    ]
+    valid = source.valid if source.maps[0].valid is not None else None
+    for share_k in np.moveaxis(new, -1, 0)[len(maps) :]:
+        error = (noise * share_k).astype(np.float32)
+        maps.append(SkinMap(share_k, "1", error, valid, "share of a lobe of a trait"))
     edited = dataclasses.replace(source, maps=tuple(maps), mix=found.mix)
     counted = source.valid.reshape(-1) & (part.reshape(-1) > 0)
     moved, clipped = found.moved[counted], found.clipped[counted]

@@ -14,6 +14,7 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT_PREFIX
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, Float64Array
 
 OUTLIER_STRENGTH_RATIO: Final = 6.0
@@ -53,11 +54,7 @@ class SurfaceMixtures:
     @property
     def valid(self) -> BoolArray:
         """Texels where all shares are known, (H, W)."""
-        shape = self.maps[0].values.shape
-        good = np.ones(shape, np.bool_)
-        for one in self.maps:
-            good &= True if one.valid is None else one.valid
-        return good
+        return jointly_valid(*self.maps)
 
     def weights(self) -> Float64Array:
         """Return the shares at least 0, (H, W, K)."""

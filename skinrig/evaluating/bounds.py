@@ -8,6 +8,7 @@ from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float64Array
 
 
@@ -46,8 +47,7 @@ def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, F
     with np.errstate(invalid="ignore"):
         usable = (c_m > 0) & (c_m <= table.c_m_max) & (c_hd > 0) & (c_hd <= table.c_hd_max)
         usable &= (diffuse.values > 0).all(axis=-1)
-    if diffuse.valid is not None:
-        usable &= diffuse.valid
+    usable &= jointly_valid(diffuse)
     noise = (diffuse.stderr[usable] / diffuse.values[usable]).astype(np.float64) ** 2
     prior = shading_prior.of_faces().spread
     relative = relative_bounds(table, c_m[usable], c_hd[usable], noise, shading_spread=prior)

@@ -12,6 +12,7 @@ from model import metrics
 from model.facial_color import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, FloatArray
 
 PREDICTION_METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
@@ -122,7 +123,7 @@ def compare(
         if true is None or measured is None or true.values.shape != measured.values.shape:
             continue
         blend = rig.evaluate({state: 1.0})
-        seen = _valid(true) & _valid(measured) & blend.valid & (true.values > 0)
+        seen = jointly_valid(true, measured) & blend.valid & (true.values > 0)
         if not seen.any():
             continue
         neutral = rig.neutral.astype(np.float64)
@@ -140,18 +141,13 @@ def compare(
         change = appearance.maps.get(f"change_{state}")
         if change is None or rest is None or change.stderr is None:
             continue
-        both = seen & _valid(change) & _valid(rest)
+        both = seen & jointly_valid(change, rest)
         moved = true.values.astype(np.float64) - rest.values
         got = change.values.astype(np.float64)
-        changes.append(
-            ChangeError(
-                state,
-                float(moved[both].mean()),
-                float(got[both].mean()),
-                float(np.sqrt(np.mean((got - moved)[both] ** 2))),
-                metrics.coverage(got[both], change.stderr[both], moved[both]).share,
-            )
-        )
+        moved, got = moved[both], got[both]
+        rms = float(np.sqrt(np.mean((got - moved) ** 2)))
+        held = metrics.coverage(got, change.stderr[both], moved).share
+        changes.append(ChangeError(state, float(moved.mean()), float(got.mean()), rms, held))
     return states, changes
 
 
@@ -170,18 +166,5 @@ def _row(
     held = float("nan")
     if stderr is not None:
         held = metrics.coverage(found, stderr[seen].astype(np.float64), real).share
-    return StateError(
-        state,
-        way,
-        median,
-        interval,
-        float(np.sqrt(np.mean((found - real) ** 2))),
-        float(np.median(relative)),
-        held,
-        int(seen.sum()),
-    )
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+    rms, bias = float(np.sqrt(np.mean((found - real) ** 2))), float(np.median(relative))
+    return StateError(state, way, median, interval, rms, bias, held, int(seen.sum()))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.evaluating.bounds import cramer_rao
 
@@ -136,21 +138,13 @@ def compare(
                     f"shape {true_map.values.shape}, expected the same"
                 )
             skin = _skin(truth, true_map.values)
-            rows += [
-                _row(
-                    name,
-                    against,
-                    band,
-                    estimate,
-                    true_map.values,
-                    melanin,
-                    skin,
-                    rng,
-                    noise=appearance.maps.get(name + NOISE_STDERR),
-                    bound=bounds.get(name),
-                )
-                for band in (None, *MELANIN_RANGES)
-            ]
+            floors = appearance.maps.get(name + NOISE_STDERR), bounds.get(name)
+            for band in (None, *MELANIN_RANGES):
+                chosen = skin
+                if band is not None:
+                    chosen = skin & (melanin >= band[0]) & (melanin < band[1])
+                figures = _figures(estimate, true_map.values, chosen, rng, *floors)
+                rows.append(MapError(name=name, against=against, band=band, **figures))
     return [row for row in rows if row.pixels >= 20]
 
 
@@ -161,21 +155,16 @@ def _skin(truth: SkinAppearance, values: Float32Array) -> BoolArray:
     return skin
 
 
-def _row(
-    name: str,
-    against: str,
-    band: tuple[float, float] | None,
+def _figures(
     estimate: SkinMap,
     true_values: Float32Array,
-    melanin: Float32Array,
-    skin: BoolArray,
+    chosen: BoolArray,
     rng: np.random.Generator,
-    *,
     noise: SkinMap | None,
     bound: Float64Array | None,
-) -> MapError:
-    chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
-    valid = chosen if estimate.valid is None else chosen & estimate.valid
+) -> dict[str, Any]:
+    """Return the figures of a `MapError` over some pixels."""
+    valid = chosen & jointly_valid(estimate)
     pixels = int(np.count_nonzero(chosen))
     value = estimate.values[valid].astype(np.float64)
     true_value = true_values[valid].astype(np.float64)
@@ -193,17 +182,14 @@ def _row(
     if noise is not None:
         noise_held = metrics.coverage(value, noise.values[valid], true_value).share
     told = np.empty(0) if bound is None else bound[valid & np.isfinite(bound)]
-    return MapError(
-        name=name,
-        against=against,
-        band=band,
-        pixels=pixels,
-        masked=1.0 - valid.sum() / pixels if pixels else float("nan"),
-        median_relative=median,
-        interval=interval,
-        bias=float(np.median(relative)) if relative.size else float("nan"),
-        coverage=held,
-        median_stderr=spread,
-        noise_coverage=noise_held,
-        median_bound=float(np.median(told)) if told.size else float("nan"),
-    )
+    return {
+        "pixels": pixels,
+        "masked": 1.0 - valid.sum() / pixels if pixels else float("nan"),
+        "median_relative": median,
+        "interval": interval,
+        "bias": float(np.median(relative)) if relative.size else float("nan"),
+        "coverage": held,
+        "median_stderr": spread,
+        "noise_coverage": noise_held,
+        "median_bound": float(np.median(told)) if told.size else float("nan"),
+    }

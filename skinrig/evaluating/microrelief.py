@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +17,9 @@ from reconstruction.pipeline.gradient.stages import (
     KERNEL_FILE,
     STRAIN_FILE,
 )
-from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.appearances.contents import jointly_valid
+from skinrig.arrays import Float32Array, Float64Array
+from skinrig.evaluating.subsurface import document_of, number
 from skinrig.evaluating.surface import RAYLEIGH_68
 
 MAX_NORMAL_ERROR_DEG = 1.5
@@ -88,12 +88,6 @@ class StretchError:
         return self.found - self.truth
 
 
-def document_of(appearance: SkinAppearance, name: str) -> Mapping[str, Any] | None:
-    """Return one of the JSON files of an appearance, or None."""
-    blob = appearance.files.get(name)
-    return None if blob is None else json.loads(blob)
-
-
 def states_of(appearance: SkinAppearance) -> list[str]:
     """Return the names of the states that an appearance holds normals or heights of."""
     return sorted(
@@ -124,31 +118,22 @@ def compare(
         found, true = appearance.maps.get(f"normals_{state}"), truth.maps.get(f"normals_{state}")
         if found is None or true is None:
             continue
-        skin = _valid(true)
-        good = skin & _valid(found)
+        skin = jointly_valid(true)
+        good = skin & jointly_valid(found)
         seen = truth.maps.get(f"normals_seen_{state}", true)
         error = np.degrees(metrics.angular_error_rad(found.values[good], seen.values[good]))
         sharp = np.degrees(metrics.angular_error_rad(found.values[good], true.values[good]))
         stderr = np.degrees(_stderr(found)[good])
         middle, interval = metrics.median_with_interval(error, rng=rng)
         covered = error <= RAYLEIGH_68 * stderr
-        height_um, relief_um, height_coverage = _height(appearance, truth, state, pixel_um)
-        rows.append(
-            ReliefError(
-                state,
-                int(skin.sum()),
-                1.0 - float(good.sum()) / max(int(skin.sum()), 1),
-                float(error.mean()) if error.size else math.nan,
-                middle,
-                interval,
-                float(sharp.mean()) if sharp.size else math.nan,
-                float(np.median(stderr)) if stderr.size else math.nan,
-                float(covered.mean()) if covered.size else math.nan,
-                height_um,
-                relief_um,
-                height_coverage,
-            )
+        masked = 1.0 - float(good.sum()) / max(int(skin.sum()), 1)
+        off, unblurred, held = (
+            float(each.mean()) if each.size else math.nan for each in (error, sharp, covered)
         )
+        spread = float(np.median(stderr)) if stderr.size else math.nan
+        angles = (off, middle, interval, unblurred, spread, held)
+        heights = _height(appearance, truth, state, pixel_um)
+        rows.append(ReliefError(state, int(skin.sum()), masked, *angles, *heights))
     return rows
 
 
@@ -158,7 +143,7 @@ def _height(
     found, true = appearance.maps.get(f"height_{state}"), truth.maps.get(f"height_{state}")
     if found is None or true is None or not math.isfinite(pixel_um):
         return math.nan, math.nan, math.nan
-    good = _valid(found) & _valid(true)
+    good = jointly_valid(found) & jointly_valid(true)
     if not good.any():
         return math.nan, math.nan, math.nan
     relief = true_relief(appearance, truth, state)
@@ -176,7 +161,7 @@ def true_relief(appearance: SkinAppearance, truth: SkinAppearance, state: str) -
     """
     true, found = truth.maps[f"height_{state}"], appearance.maps[f"height_{state}"]
     pixel_um = float(str(appearance.parameters["pixel_um"]))
-    good = _valid(true) & _valid(found)
+    good = jointly_valid(true) & jointly_valid(found)
     return np.asarray(
         high_pass(true.values, pixel=pixel_um, cutoff=CUTOFF_UM, valid=good), np.float32
     )
@@ -197,15 +182,9 @@ def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[S
         gradient = np.asarray(true[name]["gradient"], float)
         angle = math.radians(float(state["angle_deg"]))
         axis = np.array([math.cos(angle), math.sin(angle)])
-        rows.append(
-            StretchError(
-                name,
-                _number(state["reading_ratio"]),
-                float(np.linalg.norm(gradient @ axis)),
-                _number(state["stretch_s"]),
-                _number(state["stretch_s_stderr"]),
-            )
-        )
+        reading, truth_s = number(state["reading_ratio"]), float(np.linalg.norm(gradient @ axis))
+        found, stderr = number(state["stretch_s"]), number(state["stretch_s_stderr"])
+        rows.append(StretchError(name, reading, truth_s, found, stderr))
     return rows
 
 
@@ -214,15 +193,11 @@ def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float
     fitted = document_of(appearance, KERNEL_FILE)
     if fitted is None:
         return []
+    fits = [fit for fit in fitted["fits"] if fit["valid"]]
+    distance = [(number(fit["distance_before"]), number(fit["distance"])) for fit in fits]
     return [
-        (
-            str(fit["name"]),
-            _number(fit["stretch_s"]),
-            _number(fit["distance_before"]),
-            _number(fit["distance"]),
-        )
-        for fit in fitted["fits"]
-        if fit["valid"]
+        (str(fit["name"]), number(fit["stretch_s"]), *both)
+        for fit, both in zip(fits, distance, strict=True)
     ]
 
 
@@ -237,10 +212,8 @@ def variances(
         Angle in degrees -> list of (stretch, its standard error, variance, its standard error), by
         stretch.
     """
-    histograms, strain = (
-        document_of(appearance, HISTOGRAM_FILE),
-        document_of(appearance, STRAIN_FILE),
-    )
+    histograms = document_of(appearance, HISTOGRAM_FILE)
+    strain = document_of(appearance, STRAIN_FILE)
     if histograms is None or strain is None:
         return {}
     stretch = {s["name"]: s for s in strain["states"] if s["valid"]}
@@ -249,24 +222,10 @@ def variances(
         state = stretch.get(entry["name"])
         if state is None or entry["variance_s"] is None:
             continue
-        found.setdefault(float(state["angle_deg"]), []).append(
-            (
-                _number(state["stretch_s"]),
-                _number(state["stretch_s_stderr"]),
-                _number(entry["variance_s"]),
-                _number(entry["variance_s_stderr"]),
-            )
-        )
+        along = number(state["stretch_s"]), number(state["stretch_s_stderr"])
+        spread = number(entry["variance_s"]), number(entry["variance_s_stderr"])
+        found.setdefault(float(state["angle_deg"]), []).append((*along, *spread))
     return {angle: sorted(rows) for angle, rows in sorted(found.items())}
-
-
-def _number(value: object) -> float:
-    return math.nan if value is None else float(str(value))
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def _stderr(skin_map: SkinMap) -> Float64Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
 from reconstruction.pipeline.dome.lobes import weight_names
 from reconstruction.surface.estimates import transmitted
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
 from skinrig.evaluating.surface import MAX_MATCH_DISTANCE_MM
@@ -212,8 +212,7 @@ def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float6
 
     if "normals_refined" not in appearance.maps:
         return flat("normals")
-    valid = appearance.maps["normals_refined"].valid
-    good = np.ones(len(texels), bool) if valid is None else valid.reshape(-1)[texels]
+    good = jointly_valid(appearance.maps["normals_refined"]).reshape(-1)[texels]
     return np.where(good[:, None], flat("normals_refined"), flat("normals"))
 
 
@@ -232,23 +231,17 @@ def spheres(
     own = _texels_for(texels, appearance, truth)
     out: list[tuple[str, Float64Array, Float64Array | None]] = []
     for name, texel, image in zip(names, own, images, strict=True):
-        drawn = None
+        at, drawn = np.array([texel]), None
+
+        def reflect(
+            light: Float64Array, view: Float64Array, at: NDArray[np.intp] = at
+        ) -> Float64Array:
+            return predict(appearance, basis, at, light[None], view[None])[0]
+
         if texel >= 0:
-            at = np.array([texel])
-            estimate = partial(_reflected, appearance, basis, at)
-            drawn, _ = sphere(estimate, normal_at(appearance, at)[0])
+            drawn, _ = sphere(reflect, normal_at(appearance, at)[0])
         out.append((str(name), np.asarray(image, np.float64), drawn))
     return out
-
-
-def _reflected(
-    appearance: SkinAppearance,
-    basis: BrdfBasis,
-    at: NDArray[np.intp],
-    to_light: Float64Array,
-    to_camera: Float64Array,
-) -> Float64Array:
-    return predict(appearance, basis, at, to_light[None], to_camera[None])[0]
 
 
 def _texels_for(
@@ -258,11 +251,7 @@ def _texels_for(
     from scipy.spatial import cKDTree
 
     place = appearance.maps["position"]
-    known = np.logical_and.reduce(
-        [np.ones(place.values.shape[:2], bool)]
-        + [m.valid for m in (place, appearance.maps["r_d"]) if m.valid is not None]
-    )
-    texel = np.flatnonzero(known)
+    texel = np.flatnonzero(jointly_valid(place, appearance.maps["r_d"]))
     if not len(texel):
         return np.full(len(wanted), -1, np.intp)
     tree = cKDTree(place.values.reshape(-1, 3)[texel])

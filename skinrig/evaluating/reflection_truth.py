@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.skin import SkinAppearance
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 TEST_FILE: Final = "reflection_test.npz"
@@ -59,7 +60,7 @@ def make_test(
     """
     place = truth.maps["position"]
     size = place.values.shape[0]
-    valid = np.ones(place.values.shape[:2], bool) if place.valid is None else place.valid
+    valid = jointly_valid(place)
     chosen = rng.permutation(np.flatnonzero(valid))[:points]
     all_normals = truth.maps["normals"].values.reshape(-1, 3).astype(np.float64)
 
@@ -132,10 +133,8 @@ def sphere(
     to_camera = _turned(np.array([0.0, 0.0, 1.0]), outward, normal)
     image = np.zeros((SPHERE_PX, SPHERE_PX, 3))
     lit = shade > 0
-    image[
-        np.flatnonzero(inside.reshape(-1))[lit] // SPHERE_PX,
-        np.flatnonzero(inside.reshape(-1))[lit] % SPHERE_PX,
-    ] = np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
+    seen = np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
+    image.reshape(-1, 3)[np.flatnonzero(inside)[lit]] = seen
     return image, inside
 
 

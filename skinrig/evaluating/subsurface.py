@@ -117,16 +117,10 @@ def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[
                 continue
             error = np.abs(found / real - 1.0)[good]
             inside = np.abs(found - real) <= np.hypot(stderr, noise)
-            rows.append(
-                ProfileError(
-                    name_of(entry),
-                    channel,
-                    float(np.median(error)),
-                    float(error.max()),
-                    int(good.sum()),
-                    float(inside[good].mean()),
-                )
-            )
+            median, worst = float(np.median(error)), float(error.max())
+            held = float(inside[good].mean())
+            name = name_of(entry)
+            rows.append(ProfileError(name, channel, median, worst, int(good.sum()), held))
     return rows
 
 
@@ -141,19 +135,9 @@ def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitE
         for fit in entry["fits"]:
             sigma_tr = float(true["sigma_tr_per_mm"][CHANNEL_NAMES.index(fit["channel"])])
             low, high = numbers(fit["interval_per_mm"]).tolist()
-            rows.append(
-                FitError(
-                    name_of(entry),
-                    fit["channel"],
-                    fit["method"],
-                    str(true["kind"]),
-                    sigma_tr,
-                    number(fit["sigma_tr_per_mm"]),
-                    number(fit["sigma_tr_stderr"]),
-                    (low, high),
-                    bool(fit["valid"]),
-                )
-            )
+            known_by = (name_of(entry), fit["channel"], fit["method"], str(true["kind"]))
+            found = number(fit["sigma_tr_per_mm"]), number(fit["sigma_tr_stderr"])
+            rows.append(FitError(*known_by, sigma_tr, *found, (low, high), bool(fit["valid"])))
     return rows
 
 
@@ -180,16 +164,9 @@ def by_method(rows: Sequence[FitError]) -> list[MethodError]:
         if not chosen:
             continue
         error = np.array([row.relative for row in chosen])
-        found.append(
-            MethodError(
-                method,
-                len(chosen),
-                float(np.median(np.abs(error))),
-                float(np.abs(error).max()),
-                float(error.mean()),
-                float(np.mean([row.covered for row in chosen])),
-            )
-        )
+        median, worst = float(np.median(np.abs(error))), float(np.abs(error).max())
+        bias, held = float(error.mean()), float(np.mean([row.covered for row in chosen]))
+        found.append(MethodError(method, len(chosen), median, worst, bias, held))
     return found
 
 

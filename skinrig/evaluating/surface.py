@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.evaluating import skin_bands
 
 MAX_MATCH_DISTANCE_MM = 3.0
 """Farther than this from the true surface a point has no truth."""
@@ -22,6 +24,11 @@ MAX_EVALUATED_PIXEL_MM = 1.1
 """Size of a pixel on the face up to which the limit of normals is promised: coarser ones average
 eyelids, nostrils and lips over more than they are wide."""
 MAX_ALBEDO_ERROR = 0.03
+
+Banded = tuple[str, str, str, int, float, float, float]
+"""Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
+MIN_POINTS = 20
+"""Of a band that is told."""
 
 # of an error with the same deviation in two directions, the length that 68.27 % stay below
 RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
@@ -115,10 +122,10 @@ def match(
     for name, side in (("appearance", appearance), ("truth", truth)):
         if "position" not in side.maps:
             raise SurfaceTruthError(f"{name}: has no map 'position', which texels are matched by")
-    rows, columns = np.nonzero(_valid(appearance.maps["position"]))
+    rows, columns = np.nonzero(jointly_valid(appearance.maps["position"]))
     place = appearance.maps["position"].values[rows, columns]
     true_place = truth.maps["position"]
-    usable = _valid(true_place)
+    usable = jointly_valid(true_place)
     if "mask" in truth.maps:
         usable = usable & (truth.maps["mask"].values > 0.5)
     # a texel whose nearest true one does not count, under a brow, has no truth either
@@ -170,7 +177,7 @@ def errors_at(
     """
     estimate = appearance.maps[name]
     values = estimate.values[pairs.rows, pairs.columns].astype(np.float64)
-    good = _valid(estimate)[pairs.rows, pairs.columns]
+    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
     true_name = "normals" if name in NORMAL_MAPS else name
     true_values = _flat(truth.maps[true_name])[pairs.truth]
     if name in NORMAL_MAPS:
@@ -182,10 +189,40 @@ def errors_at(
     return np.where(good, error, np.nan)
 
 
+def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Banded]:
+    """Return errors of normals and R_d by skin color, from light to dark; R_d, mean of channels.
+
+    Parameters
+    ----------
+    appearance, truth
+        As for `section`; a truth without "r_d" has no color to tell bands by.
+    """
+    if "r_d" not in truth.maps:
+        return []
+    pairs = match(appearance, truth)
+    true_color = truth.maps["r_d"].values.reshape(-1, 3)[pairs.truth].astype(np.float64)
+    bands = skin_bands.bands_of(skin_bands.typology_angle_deg(true_color))
+    rows: list[Banded] = []
+    for key in ("r_d", *NORMAL_MAPS):
+        if key not in appearance.maps or (key != "r_d" and "normals" not in truth.maps):
+            continue
+        error = np.abs(errors_at(key, appearance, truth, pairs))
+        for band in skin_bands.TYPOLOGY_NAMES:
+            own = error[bands == band]
+            told = own[np.isfinite(own)]
+            if len(own) < MIN_POINTS or not len(told):
+                continue
+            unit = "%" if key == "r_d" else "°"
+            masked = 100.0 * (1.0 - len(told) / len(own))
+            middle, high = np.percentile(told, [50, 95])
+            rows.append((key, unit, band, len(own), masked, float(middle), float(high)))
+    return rows
+
+
 def _angles(
     name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
 ) -> SurfaceError:
-    good = _valid(estimate)[pairs.rows, pairs.columns]
+    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
     normals = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
     angle = metrics.angular_error_rad(normals, _flat(truth.maps["normals"])[pairs.truth][good])
     stderr = None
@@ -203,7 +240,7 @@ def _angles(
 def _channels(
     name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
 ) -> list[SurfaceError]:
-    good = _valid(estimate)[pairs.rows, pairs.columns]
+    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
     values = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
     true_values = _flat(truth.maps[name])[pairs.truth][good]
     rows = []
@@ -248,11 +285,6 @@ def _row(
         coverage=held,
         median_stderr=spread,
     )
-
-
-def _valid(skin_map: SkinMap) -> BoolArray:
-    shape = skin_map.values.shape[:2]
-    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
 
 
 def _flat(skin_map: SkinMap) -> Float64Array:

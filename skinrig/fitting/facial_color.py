@@ -13,15 +13,16 @@ import numpy as np
 from model import store
 from model.facial_color import FacialColorError
 from model.facial_color import document as facial_color_document
-from model.skin import SkinMap
 from reconstruction.correspondence import landmark_table
 from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from reconstruction.pipeline.flash import state_images
 from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBloodError
 from reconstruction.pipeline.flash.state_images import Landmarks, Subject
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import jointly_valid
 from skinrig.appearances.dynamic import FACIAL_COLOR, Part
 from skinrig.appearances.state_truth import truth_of_state
+from skinrig.console import picked
 
 
 class FacialColorInputError(ValueError):
@@ -71,13 +72,8 @@ def fit_facial_color(
     subject = state_images.read(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
     try:
-        found = facial_color_fit.fit(
-            subject,
-            radius_px=radius_px,
-            landmarks=marks,
-            stored_size=stored_size,
-            progress=progress,
-        )
+        how: dict[str, Any] = {"radius_px": radius_px, "stored_size": stored_size}
+        found = facial_color_fit.fit(subject, landmarks=marks, progress=progress, **how)
     except (FacialColorError, UnknownBloodError) as error:
         if subject.has_white:
             raise
@@ -90,11 +86,7 @@ def fit_facial_color(
     for state, change in found.changes.items():
         maps[f"change_{state}"] = change
         maps[f"hemoglobin_{state}"] = found.hemoglobin[state]
-    truths = {
-        state: folder.name
-        for state, folder in _truths(subject, sessions).items()
-        if folder is not None
-    }
+    truths = {state: at.name for state, at in _truths(subject, sessions).items() if at is not None}
     dynamic_appearance.add(
         out,
         FACIAL_COLOR,
@@ -109,16 +101,13 @@ def fit_facial_color(
                 "alignment": facial_color_fit.alignment_document(found),
                 "repeatability": facial_color_fit.repeats_document(found),
                 "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
-                "camera": subject.camera,
-                "illuminant": subject.illuminant,
+                **picked(subject, "camera", "illuminant"),
                 "assumed": list(subject.assumed),
                 "consent": [dict(one) for one in subject.consent],
                 "truth": truths,
             },
-            inputs=subject.inputs,
-            source=subject.source,
             left_out=(*found.left_out, *unmarked),
-            seed=subject.seed,
+            **picked(subject, "inputs", "source", "seed"),
         ),
     )
     return found
@@ -130,30 +119,15 @@ def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
     neutral = found.hemoglobin["neutral"]
     errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
     for state, change in found.changes.items():
-        both = _both(change, neutral)
+        both = jointly_valid(change, neutral)
         level = float(neutral.values[both].mean()) if both.any() else float("nan")
         mean = float(change.values[both].mean()) if both.any() else float("nan")
         scale = found.rig.states[state]
         alignment = errors.get(state)
         error = "" if alignment is None else f"{np.median(alignment.error_px[alignment.valid]):.2f}"
-        rows.append(
-            (
-                state,
-                f"{100 * mean:+.3f}",
-                f"{100 * mean / level:+.1f}",
-                f"{np.median(scale.scale[scale.valid]):.3f}",
-                error,
-            )
-        )
+        by = f"{np.median(scale.scale[scale.valid]):.3f}"
+        rows.append((state, f"{100 * mean:+.3f}", f"{100 * mean / level:+.1f}", by, error))
     return rows
-
-
-def _both(a: SkinMap, b: SkinMap) -> Any:
-    good = np.ones(a.values.shape[:2], bool)
-    for one in (a, b):
-        if one.valid is not None:
-            good &= one.valid
-    return good
 
 
 def _landmarks(
@@ -176,8 +150,7 @@ def _landmarks(
         words = "tables"
     elif subject.source == "simulated":
         for state, place in _truths(subject, sessions).items():
-            told = {} if place is None else store.read_document(place).parameters
-            points = told.get("landmarks_px")
+            points = place and store.read_document(place).parameters.get("landmarks_px")
             if place is not None and isinstance(points, dict):
                 found[state] = {n: _point(place, n, value) for n, value in points.items()}
         words = "the simulation's own"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, source_of
 from skinrig.appearances.dynamic import MICROSTRUCTURE, Part
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -72,7 +72,7 @@ class SiteFit:
 
 
 def fit_microstructure(
-    appearances: Sequence[Path], *, out: Path, paper_table: bool = False, on_message: Any = None
+    appearances: Sequence[Path], *, out: Path, paper_table: bool = False
 ) -> dict[str, SiteFit]:
     """Fit the microstructure part of a dynamic appearance.
 
@@ -86,8 +86,6 @@ def fit_microstructure(
     paper_table
         Take the paper's forehead table where fewer kernels were fitted than a table needs,
         instead of refusing.
-    on_message
-        Called with lines of text.
 
     Raises
     ------
@@ -106,9 +104,9 @@ def fit_microstructure(
     files = {
         f"kernel_table_{site}.json": fit.table.to_json().encode() for site, fit in fits.items()
     }
-    everything = [one for group in by_site.values() for one in group]
+    everything = [one for group in by_site.values() for _, one in group]
     inputs = {
-        f"{site} {number}": hashlib.sha256((path / store.DOCUMENT_FILE).read_bytes()).hexdigest()
+        f"{site} {number}": document_digest(path)
         for site, group in by_site.items()
         for number, (path, _) in enumerate(group)
     }
@@ -117,7 +115,6 @@ def fit_microstructure(
         for site, fit in fits.items()
         if fit.kernels == 0
     )
-    sources = {one.source for _, one in everything}
     dynamic_appearance.add(
         out,
         MICROSTRUCTURE,
@@ -126,19 +123,14 @@ def fit_microstructure(
             files=files,
             parameters={
                 "sites": {site: fit.document() for site, fit in fits.items()},
-                "consent": consent.merge_consent(*(one for _, one in everything)),
+                "consent": consent.merge_consent(*everything),
             },
             inputs=inputs,
-            source="simulated" if "simulated" in sources else "measured",
+            source=source_of(*everything),
             left_out=left_out,
-            seed=everything[0][1].seed,
+            seed=everything[0].seed,
         ),
     )
-    if on_message is not None:
-        for site, fit in fits.items():
-            low, high = fit.table.stretch_range
-            how = f"{fit.kernels} kernels" if fit.kernels else "the paper's forehead table"
-            on_message(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
     return fits
 
 

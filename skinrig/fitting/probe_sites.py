@@ -15,6 +15,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float32Array, Float64Array
 
 FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
@@ -115,7 +116,7 @@ def place(
     """
     measured = _measured(probe)
     height, width = position.values.shape[:2]
-    known = np.ones((height, width), bool) if position.valid is None else position.valid
+    known = jointly_valid(position)
     if not known.any():
         raise ProbeSiteError("position: got no valid texel, expected those of a face")
     given: dict[str, tuple[float, float]] = {}
@@ -150,12 +151,8 @@ def place(
     if not sites:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out)
         raise ProbeSiteError(f"sites: got none on the face: {why}")
-    assumed: tuple[str, ...] = ()
-    if guessed:
-        assumed = (
-            f"{', '.join(guessed)} of the probe lie where a mean face has them, measured from the "
-            "tip of the nose",
-        )
+    how = "of the probe lie where a mean face has them, measured from the tip of the nose"
+    assumed = (f"{', '.join(guessed)} {how}",) if guessed else ()
     chart = _Chart.of(at_mm[known], sites)
     found_map = _interpolated(chart, sites)
     spread = chart.lay(found_map, at_mm)
@@ -261,10 +258,7 @@ class _Chart:
         share = self.coordinates(points_mm) / self.size_mm
         x = np.clip(share[..., 0] * GRID_SIDE - 0.5, 0.0, GRID_SIDE - 1.0)
         y = np.clip((1.0 - share[..., 1]) * GRID_SIDE - 0.5, 0.0, GRID_SIDE - 1.0)
-        i, j = (
-            np.minimum(y.astype(np.intp), GRID_SIDE - 2),
-            np.minimum(x.astype(np.intp), GRID_SIDE - 2),
-        )
+        i, j = (np.minimum(at.astype(np.intp), GRID_SIDE - 2) for at in (y, x))
         p, q = (y - i)[..., None], (x - j)[..., None]
         upper = both[i, j] * (1.0 - q) + both[i, j + 1] * q
         lower = both[i + 1, j] * (1.0 - q) + both[i + 1, j + 1] * q

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ from model.skin_reflectance import TRANSLUCENCY_MAP, SkinReflectance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
 from skinrig import consent
+from skinrig.appearances.contents import assumed_by, digest, document_digest, source_of, versions
 from skinrig.errors import UsageError
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import PlacedTranslucency
@@ -75,26 +74,24 @@ def fit_reflectance(
         if given is not None and given.resolve() == out.resolve():
             raise ReflectanceInputError(f"{out}: is one of the inputs; name another --out")
     surface = store.read(dome)
-    inputs = {"dome": _digest(dome)}
+    inputs = {"dome": document_digest(dome)}
     placed = None
-    assumed = list(_assumed(surface))
+    assumed = assumed_by(surface)
     left_out = list(surface.left_out)
     files = dict(surface.files)
-    sources = {surface.source}
-    agreed = consent.merge_consent(surface)
+    made_of = [surface]
     if probe is not None:
         measured = store.read(probe)
-        inputs["probe"] = _digest(probe)
-        sources.add(measured.source)
-        agreed = consent.merge_consent(surface, measured)
+        inputs["probe"] = document_digest(probe)
+        made_of.append(measured)
         try:
             placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
         except ValueError as error:
             raise ReflectanceInputError(f"{probe}: {error}") from error
         depth = placed.map
         if landmarks is not None:
-            inputs["landmarks"] = hashlib.sha256(landmarks.read_bytes()).hexdigest()
-        assumed += [f"probe: {text}" for text in _assumed(measured)] + list(placed.assumed)
+            inputs["landmarks"] = digest(landmarks)
+        assumed += [f"probe: {text}" for text in assumed_by(measured)] + list(placed.assumed)
         left_out += [(f"translucency of {what}", why) for what, why in placed.left_out]
         files[SUBSURFACE_FILE] = measured.files[SUBSURFACE_FILE]
     else:
@@ -103,16 +100,16 @@ def fit_reflectance(
     model = skin_reflectance.assemble(surface, translucency=depth)
     appearance = SkinAppearance(
         maps={**surface.maps, TRANSLUCENCY_MAP: depth},
-        source="simulated" if "simulated" in sources else "measured",
+        source=source_of(*made_of),
         parameters={
             **surface.parameters,
             "assumed": assumed,
-            consent.CONSENT_KEY: agreed,
+            consent.CONSENT_KEY: consent.merge_consent(*made_of),
             "appearances": [path.name for path in (dome, probe) if path is not None],
             REFLECTANCE_KEY: _record(placed),
         },
         inputs={**surface.inputs, **inputs},
-        versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+        versions=versions(),
         left_out=tuple(left_out),
         files=files,
         seed=surface.seed,
@@ -174,15 +171,6 @@ def _position(surface: SkinAppearance) -> SkinMap:
             "session"
         )
     return surface.maps["position"]
-
-
-def _assumed(appearance: SkinAppearance) -> tuple[str, ...]:
-    told = appearance.parameters.get("assumed", ())
-    return tuple(str(text) for text in told) if isinstance(told, list | tuple) else ()
-
-
-def _digest(folder: Path) -> str:
-    return hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
 
 
 def _record(placed: PlacedTranslucency | None) -> dict[str, object]:

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from model import store
 from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace
 from model.traits.storage import TraitLibrary
@@ -21,6 +20,7 @@ from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig import consent
 from skinrig.appearances import face_textures
+from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
@@ -139,8 +139,7 @@ def fit_traits(
                 n: v.astype(float).tolist() for n, v in {**table.binary, **table.continuous}.items()
             },
             landmarks=sorted({face.marked_by for face in faces}),
-            inputs={"labels": face_textures.digest(labels)}
-            | {f.name: face_textures.digest(f.path / store.DOCUMENT_FILE) for f in faces},
+            inputs={"labels": digest(labels)} | {f.name: document_digest(f.path) for f in faces},
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from reconstruction.wrinkles.fit import WrinkleFit, fit
 from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import document_digest, jointly_valid, source_of
 from skinrig.appearances.dynamic import WRINKLES, Part
 from skinrig.arrays import BoolArray, Float32Array
 
@@ -51,7 +51,6 @@ def fit_wrinkles(
     masks: Sequence[Path] | None = None,
     size: int = 256,
     mask_size: int = 64,
-    smoothing_mm: float = SMOOTHING_MM,
     seed: int = 0,
 ) -> FittedWrinkles:
     """Fit the wrinkle part of a dynamic appearance.
@@ -68,8 +67,6 @@ def fit_wrinkles(
         Two RGBA pictures of the zones; None: zones are found in the data.
     size, mask_size
         Texels a side of wrinkle map and masks.
-    smoothing_mm
-        Of the shape that wrinkles are seen against.
     seed
         Of the search for zones.
 
@@ -90,29 +87,28 @@ def fit_wrinkles(
             f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
         )
     unchecked = _check_textures({state: one for state, (_, one) in read.items()})
-    measured = {state: _normals(folder, one, smoothing_mm) for state, (folder, one) in read.items()}
+    measured = {state: _normals(folder, one) for state, (folder, one) in read.items()}
     shapes = {state: one.normals.shape for state, one in measured.items()}
     if len(set(shapes.values())) > 1:
         told = ", ".join(f"{state} {shape[:2]}" for state, shape in shapes.items())
         raise WrinkleInputError(f"appearances: textures of sizes {told}, expected one size")
     neutral = measured.pop("neutral")
     side = min(neutral.normals.shape[:2])
-    found_zones = None
+    zones = None
     stack: Any
     if masks is None:
         small = min(mask_size, side)
-        found_zones = fit_zones(
+        rng, height = (
+            np.random.default_rng(seed),
             amplitudes(neutral, measured, size=(small, small)),
-            zones=N_ZONES,
-            rng=np.random.default_rng(seed),
         )
-        stack = found_zones.masks
+        zones = fit_zones(height, zones=N_ZONES, rng=rng)
+        stack = zones.masks
     else:
         stack = _read_masks(masks)
     found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
     folders = [folder for folder, _ in read.values()]
-    sources = {one.source for _, one in read.values()}
     dynamic_appearance.add(
         out,
         WRINKLES,
@@ -124,20 +120,17 @@ def fit_wrinkles(
                 "appearances": [folder.name for folder in folders],
                 "explained": found.explained,
                 "rounds": found.rounds,
-                "zones": "given" if found_zones is None else "found in the data",
-                "rank_one_share": None if found_zones is None else found_zones.rank_one_share,
-                "distinct_zones": None if found_zones is None else found_zones.distinct,
-                "smoothing_mm": smoothing_mm,
+                "zones": "given" if zones is None else "found in the data",
+                "rank_one_share": None if zones is None else zones.rank_one_share,
+                "distinct_zones": None if zones is None else zones.distinct,
+                "smoothing_mm": SMOOTHING_MM,
                 "consent": consent.merge_consent(*(one for _, one in read.values())),
                 "truth": {
                     state: one.parameters.get("truth", "") for state, (_, one) in read.items()
                 },
             },
-            inputs={
-                state: hashlib.sha256((folder / store.DOCUMENT_FILE).read_bytes()).hexdigest()
-                for state, (folder, _) in read.items()
-            },
-            source="simulated" if "simulated" in sources else "measured",
+            inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
+            source=source_of(*(one for _, one in read.values())),
             left_out=tuple(
                 (state, "whether its texture is that of the others: no mesh lies beside its maps")
                 for state in unchecked
@@ -145,7 +138,7 @@ def fit_wrinkles(
             seed=read["neutral"][1].seed,
         ),
     )
-    return FittedWrinkles(found, found_zones)
+    return FittedWrinkles(found, zones)
 
 
 def _state_of(given: Path) -> tuple[str, Path]:
@@ -193,14 +186,12 @@ def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:
     return found
 
 
-def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> NormalMaps:
+def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     """Return normals in the texture's frame."""
     maps = appearance.maps
     if "normals_tangent" in maps:
         tangent = maps["normals_tangent"]
-        shape = tangent.values.shape[:2]
-        valid = np.ones(shape, bool) if tangent.valid is None else tangent.valid
-        return _as_maps(tangent.values, tangent.stderr, valid)
+        return _as_maps(tangent.values, tangent.stderr, jointly_valid(tangent))
     name = next((name for name in NORMAL_MAPS if name in maps), None)
     if name is None or "position" not in maps:
         raise WrinkleInputError(
@@ -208,13 +199,8 @@ def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> N
             "with `skinrig reconstruct SESSION --want normals_refined`"
         )
     normals, position = maps[name], maps["position"]
-    valid = np.ones(normals.values.shape[:2], bool)
-    for each in (normals, position):
-        if each.valid is not None:
-            valid &= each.valid
-    found = tangent_normals(
-        normals.values, position.values, valid, stderr=normals.stderr, smoothing_mm=smoothing_mm
-    )
+    valid = jointly_valid(normals, position)
+    found = tangent_normals(normals.values, position.values, valid, stderr=normals.stderr)
     return _as_maps(found.normals, found.stderr, found.valid)
 
 

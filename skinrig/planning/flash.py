@@ -7,31 +7,28 @@ report; what noise leaves beside the model error is what the knobs can change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
-from model import store
+from model.skin import SkinAppearance
 from reconstruction.chromophores.detectability import detectable
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import flash
 from skinrig.evaluating.bounds import relative_bounds
+from skinrig.planning import plans
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
     CONFIRM_PX,
     Observation,
     simulate_observation,
 )
-from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
-from skinrig.simulating.simulation import simulate_session
+from skinrig.planning.plans import Choice, PlanRequest
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
 """Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
@@ -58,7 +55,7 @@ class Prediction:
 
     def median(self, name: str) -> float:
         """Return the predicted median relative error."""
-        return median_of_normals(self.sigma[name][self.valid[name]])
+        return plans.median_of_normals(self.sigma[name][self.valid[name]])
 
     def valid_share(self, name: str) -> float:
         """Return the share of the skin that keeps an estimate."""
@@ -104,36 +101,24 @@ def predict(observation: Observation, *, repeats: int, power: float, darks: int)
     return Prediction(sigma, valid, observation.skin)
 
 
-def choose(
-    rig: Rig,
-    wants: Mapping[str, float],
-    *,
-    subject: str = "III",
-    seed: int = 0,
-    valid_share: float = 0.9,
-) -> Choice:
+def choose(rig: Rig, asked: PlanRequest) -> Choice:
     """Choose the quickest plan, and of those the one with the least light, for a face.
 
     Parameters
     ----------
     rig
         The flash rig.
-    wants
-        By name: "melanin" and "hemoglobin", medians of the relative error over the face, percent;
-        empty: the forecast of the rig's own plan.
-    subject, seed
-        The face that is forecast.
-    valid_share
-        Of the skin that most light and most frames give an estimate, so much must keep one.
+    asked
+        Wants by name: "melanin" and "hemoglobin", medians of the relative error over the face,
+        percent; empty: the forecast of the rig's own plan. The share is of the skin that most light
+        and most frames give an estimate.
     """
-    observation = simulate_observation(rig, subject, seed=seed)
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
     best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
-    if not wants:
-        plan = flash_plan(rig)
+    if not asked.wants:
         whole = {"repeats": 1, "power": 1.0, "darks": 4, "parallel": True}
-        return _choice(rig, observation, plan, whole, wants)
+        return _choice(rig, observation, flash_plan(rig), whole, asked)
     path = []
-    chosen: dict[str, Any] = {}
     for settings in _candidates(rig):
         found = predict(observation, **settings)
         if settings["power"] == POWER_CHOICES[-1]:
@@ -141,49 +126,28 @@ def choose(
                 {name: float(settings[name]) for name in ("repeats", "darks")}
                 | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
             )
-        chosen = settings
-        if _good(found, best, wants, valid_share):
-            return _choice(
-                rig, observation, crossed_plan(rig, **chosen), chosen, wants, path=tuple(path)
-            )
+        if _good(found, best, asked):
+            plan = crossed_plan(rig, **settings)
+            return _choice(rig, observation, plan, settings, asked, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
-    reasons = _out_of_reach(best, observation, wants, valid_share)
+    reasons = _out_of_reach(best, observation, asked)
     # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
-    told = [name for name in wants if np.isfinite(best.median(name))]  # less tells nothing as well
-    for settings in _candidates(rig) if told else ():
+    told = [name for name in asked.wants if np.isfinite(best.median(name))]
+    for settings in _candidates(rig) if told else ():  # less tells nothing as well
         now = predict(observation, **settings)
         if all(now.median(name) <= 1.05 * best.median(name) for name in told):
             least = settings
             break
-    return _choice(
-        rig,
-        observation,
-        crossed_plan(rig, **least),
-        least,
-        wants,
-        path=tuple(path),
-        reasons=reasons,
-    )
+    plan = crossed_plan(rig, **least)
+    return _choice(rig, observation, plan, least, asked, path=tuple(path), reasons=reasons)
 
 
-def forecast(
-    rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
-) -> Choice:
-    """Return what a plan of the flash rig will give, in its first state.
-
-    Parameters
-    ----------
-    rig
-        The flash rig.
-    plan
-        With crossed frames of a subject.
-    wants, subject, seed
-        As in `choose`.
-    """
+def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
+    """Return what a plan of the flash rig with crossed frames will give, in its first state."""
     shots = [step for step in plan.steps if step.kind == "subject"]
     crossed = [step for step in shots if step.index.get("polarizer") == "crossed"]
     if not crossed:
-        raise PlanningError("plan: got no crossed frame of a subject, expected at least one")
+        raise plans.PlanningError("plan: got no crossed frame of a subject, expected at least one")
     own = [step for step in crossed if step.index.get("state") == crossed[0].index.get("state")]
     powers = [float(step.settings.get("power", 1.0)) for step in own]
     settings = {
@@ -192,54 +156,29 @@ def forecast(
         "darks": sum(step.kind == "dark" for step in plan.steps),
         "parallel": len(shots) > len(crossed),
     }
-    return _choice(rig, simulate_observation(rig, subject, seed=seed), plan, settings, wants)
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    return _choice(rig, observation, plan, settings, asked)
 
 
-def confirm(
-    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Simulate a face under a choice, and the calibration, reconstruct, compare with the truth."""
-    width = min(choice.rig.views[0].width_px, CONFIRM_PX)
-    calibration = out / "calibration"
-    for kind, target in (("sensor", "flat"), ("white", "white"), ("polarization", "malus")):
-        progress(f"simulate {target}")
-        session = out / f"session-{target}"
-        simulate_session("flash", session, target=target, seed=seed, width_px=width)
-        calibrate(kind, [session], calibration)
-    progress(f"simulate the face {subject}")
-    done = simulate_session(
-        "flash", out / "session-face", subject=subject, seed=seed, width_px=width, plan=choice.plan
-    )
-    progress("reconstruct")
-    pipeline.reconstruct(
-        done.session,
-        want=CHROMOPHORE_NAMES,
-        out=out / "appearance",
-        calibration=calibration,
-        truth=done.truth.name if done.truth else "",
-    )
-    rows = flash.compare(
-        store.read(out / "appearance"),
-        store.read(out / "truth-face"),
-        rng=np.random.default_rng(seed),
-    )
-    found = {row.name: row for row in rows if row.band is None and row.against == "blurred"}
-    out_rows = []
-    for one in choice.forecasts:
-        if one.name not in found:
-            continue
-        median = 100.0 * found[one.name].median_relative
-        out_rows.append(
-            {
-                "name": one.name,
-                "unit": one.unit,
-                "median": median,
-                "forecast": one.value,
-                "within": one.interval[0] <= median <= one.interval[1],
-                "valid_share": 1.0 - found[one.name].masked,
-            }
-        )
-    return out_rows
+def rehearsal(choice: Choice) -> plans.Rehearsal:
+    """Return the flash rig's targets, at the forecast's pixels."""
+    width = {"width_px": min(choice.rig.views[0].width_px, CONFIRM_PX)}
+    target_of = {"sensor": "flat", "white": "white", "polarization": "malus"}
+    calibrations = tuple((kind, (target,)) for kind, target in target_of.items())
+    targets = dict.fromkeys(target_of.values(), width)
+    return plans.Rehearsal(targets, calibrations, CHROMOPHORE_NAMES, width)
+
+
+def measured(
+    _: Choice, appearance: SkinAppearance, truth: SkinAppearance, seed: int
+) -> dict[str, tuple[float, float]]:
+    """Return median error, percent, and valid share of the chromophores over the face."""
+    rows = flash.compare(appearance, truth, rng=np.random.default_rng(seed))
+    return {
+        row.name: (100.0 * row.median_relative, 1.0 - row.masked)
+        for row in rows
+        if row.band is None and row.against == "blurred"
+    }
 
 
 def crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
@@ -272,13 +211,11 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     )
 
 
-def _good(
-    found: Prediction, best: Prediction, wants: Mapping[str, float], valid_share: float
-) -> bool:
+def _good(found: Prediction, best: Prediction, asked: PlanRequest) -> bool:
     return all(
         100.0 * found.median(name) <= value
-        and found.valid_share(name) >= valid_share * best.valid_share(name)
-        for name, value in wants.items()
+        and found.valid_share(name) >= asked.valid_share * best.valid_share(name)
+        for name, value in asked.wants.items()
     )
 
 
@@ -287,7 +224,7 @@ def _choice(
     observation: Observation,
     plan: Plan,
     settings: Mapping[str, Any],
-    wants: Mapping[str, float],
+    asked: PlanRequest,
     *,
     path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
@@ -295,76 +232,50 @@ def _choice(
     parallel = bool(settings.get("parallel", False))
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(observation, **own)
-    full = flash_plan(rig, repeats=max(int(own["repeats"]), 1))
-    forecasts = tuple(
-        Forecast(
-            name,
-            "%",
-            100.0 * found.median(name),
-            interval_of(100.0 * found.median(name), FORECAST_RELATIVE_SD[name]),
-            wants.get(name),
-        )
-        for name in CHROMOPHORE_NAMES
+    medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
+    forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
+    left_out = plans.left_out_of(
+        (
+            not parallel,
+            f"{own['repeats']} parallel frames",
+            "the crossed ones alone hold the light that melanin and hemoglobin color; the "
+            "parallel ones add the gloss",
+        ),
+        (
+            own["darks"] < 4,
+            f"{4 - own['darks']} of 4 dark frames",
+            "at this exposure the black level that the camera states is off by less than the noise",
+        ),
+        (
+            own["power"] < 1.0,
+            f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
+            plans.why_less(reasons),
+        ),
     )
-    left_out = []
-    if not parallel:
-        left_out.append(
-            (
-                f"{own['repeats']} parallel frames",
-                "the crossed ones alone hold the light that melanin and hemoglobin color; the "
-                "parallel ones add the gloss",
-            )
-        )
-    if own["darks"] < 4:
-        left_out.append(
-            (
-                f"{4 - own['darks']} of 4 dark frames",
-                "at this exposure the black level that the camera states is off by less than the "
-                "noise",
-            )
-        )
-    if own["power"] < 1.0:
-        left_out.append(
-            (
-                f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
-                "what is left errs by at most a twentieth more"
-                if reasons
-                else "what is left reaches what is wanted",
-            )
-        )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
-    pops = len([power for power in powers if power > 0])
+    pops = sum(power > 0 for power in powers)
     energy = sum(light.energy_ws or 0.0 for light in rig.lights)
-    light: dict[str, Any] = {
+    flashes: dict[str, Any] = {
         "pops": pops,
         "flash_ws": energy * sum(powers),
         "pops_per_min_limit": rig.max_pops_per_min,
         "flashes_per_s": min(rig.max_pops_per_min / 60.0, pops / max(plan.estimated_s(rig), 1e-9)),
     }
-    return Choice(
-        rig,
-        plan,
-        forecasts,
-        plan.estimated_s(rig),
-        full.estimated_s(rig),
-        {
-            **own,
-            "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
-            "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
-        },
-        tuple(left_out),
-        path,
-        reasons,
-        light,
-    )
+    knobs = {
+        **own,
+        "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
+        "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
+    }
+    full_s = flash_plan(rig, repeats=max(int(own["repeats"]), 1)).estimated_s(rig)
+    return Choice(rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes)
 
 
 def _out_of_reach(
-    best: Prediction, observation: Observation, wants: Mapping[str, float], valid_share: float
+    best: Prediction, observation: Observation, asked: PlanRequest
 ) -> tuple[str, ...]:
     """Say why no number of frames gives what is wanted."""
     out = []
-    for name, value in wants.items():
+    for name, value in asked.wants.items():
         now = 100.0 * best.median(name)
         if now <= value:
             continue
@@ -379,6 +290,6 @@ def _out_of_reach(
             f"{name}: {REPEAT_CHOICES[-1]} frames at full power leave {now:.3g} %, of which the "
             f"model error alone, without any noise, leaves {model:.3g} %; {why}"
         )
-    if not out and not _good(best, best, wants, valid_share):
+    if not out and not _good(best, best, asked):
         out.append("valid_share: too little of the skin keeps an estimate")
     return tuple(out)

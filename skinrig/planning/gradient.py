@@ -9,10 +9,8 @@ told beside.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,17 +18,17 @@ from capture.plan import Plan, PlanError
 from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
-from model import metrics, store
+from model import metrics
+from model.skin import SkinAppearance
 from reconstruction.gradient_normals import estimate_roughness, from_patterns
 from reconstruction.gradient_normals.patterns import MissingPatterns, require
 from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
-from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.stages import SMOOTH_PX
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float32Array
-from skinrig.calibrating.calibrate import calibrate
+from skinrig.planning import plans
 from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
-from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
-from skinrig.simulating.simulation import simulate_session
+from skinrig.planning.plans import Choice, PlanRequest
 
 PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
@@ -46,7 +44,7 @@ MAX_SIGNAL_FRACTION = 0.98
 UNMODELED_TILT_RAD = math.radians(0.2)
 """Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
 is assumed; see docs/planning.md."""
-FORECAST_RELATIVE_SD = 0.2
+FORECAST_RELATIVE_SD = {"normals": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
@@ -104,50 +102,35 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
-    return Prediction(
-        median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD)),
-        median_of_rayleigh(tilt),
-        float(valid.mean()),
-    )
+    median_rad = median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD))
+    return Prediction(median_rad, median_of_rayleigh(tilt), float(valid.mean()))
 
 
-def choose(
-    rig: Rig,
-    wants: Mapping[str, float],
-    *,
-    subject: str = "III",
-    seed: int = 0,
-    valid_share: float = 0.9,
-) -> Choice:
+def choose(rig: Rig, asked: PlanRequest) -> Choice:
     """Choose the quickest scan of the neutral skin that reaches what is wanted.
 
     Parameters
     ----------
     rig
         The gradient sphere.
-    wants
-        By name: "normals" in degrees, the median over the patch as the lens shows it; empty: the
-        forecast of the rig's own plan.
-    subject, seed
-        The skin that is forecast.
-    valid_share
-        Of the patch so much must have normals.
+    asked
+        Wants by name: "normals" in degrees, the median over the patch as the lens shows it; empty:
+        the forecast of the rig's own plan. The share is of the patch.
     """
-    observation = simulate_observation(rig, subject, seed=seed)
-    if not wants:
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    if not asked.wants:
         plan = gradient_plan(rig)
-        return _choice(rig, observation, plan, setting_of(plan), wants)
+        return _choice(rig, observation, plan, setting_of(plan), asked)
     tried: list[tuple[Setting, Plan, Prediction]] = []
-    target = math.radians(wants.get("normals", 90.0))
-    best: Prediction | None = None
+    target = math.radians(asked.wants.get("normals", 90.0))
     for setting, plan in candidates(rig, observation):
         found = predict(observation, setting)
         tried.append((setting, plan, found))
-        best = found if best is None or found.median_rad < best.median_rad else best
-        if found.median_rad <= target and found.valid_share >= valid_share:
+        if found.median_rad <= target and found.valid_share >= asked.valid_share:
             break
-    if best is None:
-        raise PlanningError("rig: got limits that no pattern keeps to")
+    if not tried:
+        raise plans.PlanningError("rig: got limits that no pattern keeps to")
+    best = min((found for _, _, found in tried), key=lambda found: found.median_rad)
     path = tuple(
         {
             "patterns": float(len(one.patterns)),
@@ -167,66 +150,34 @@ def choose(
         setting, plan, found = next(
             one for one in tried if one[2].median_rad <= 1.05 * best.median_rad
         )
-    return _choice(rig, observation, plan, setting, wants, found=found, path=path, reasons=reasons)
+    return _choice(rig, observation, plan, setting, asked, found=found, path=path, reasons=reasons)
 
 
-def forecast(
-    rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
-) -> Choice:
+def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     """Return what a plan of the gradient sphere will give, in its neutral state."""
-    return _choice(
-        rig, simulate_observation(rig, subject, seed=seed), plan, setting_of(plan), wants
-    )
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    return _choice(rig, observation, plan, setting_of(plan), asked)
 
 
-def confirm(
-    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Simulate the neutral skin under a choice, and the calibration, reconstruct, compare."""
-    width = min(choice.rig.views[0].width_px, 128)
-    calibration = out / "calibration"
-    progress("simulate flat and ball")
-    simulate_session("gradient", out / "session-flat", target="flat", seed=seed, width_px=width)
-    simulate_session("gradient", out / "session-ball", target="ball", seed=seed)
-    calibrate("sensor", [out / "session-flat"], calibration)
-    for kind in ("lights", "polarization"):
-        calibrate(kind, [out / "session-ball"], calibration)
-    progress(f"simulate the skin {subject}")
-    done = simulate_session(
-        "gradient",
-        out / "session-face",
-        subject=subject,
-        seed=seed,
-        width_px=width,
-        plan=choice.plan,
-    )
-    progress("reconstruct")
-    pipeline.reconstruct(
-        done.session,
-        want=("normals",),
-        out=out / "appearance",
-        calibration=calibration,
-        truth=done.truth.name if done.truth else "",
-    )
-    appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
+def rehearsal(choice: Choice) -> plans.Rehearsal:
+    """Return the gradient sphere's targets, skin and flat field on few pixels."""
+    width = {"width_px": min(choice.rig.views[0].width_px, 128)}
+    of_ball = tuple((kind, ("ball",)) for kind in ("lights", "polarization"))
+    calibrations = (("sensor", ("flat",)), *of_ball)
+    return plans.Rehearsal({"flat": width, "ball": {}}, calibrations, ("normals",), width)
+
+
+def measured(
+    choice: Choice, appearance: SkinAppearance, truth: SkinAppearance, _: int
+) -> dict[str, tuple[float, float]]:
+    """Return median error, degrees, and valid share of the neutral skin's normals."""
     state = next(name for name in map(state_of, choice.plan.steps) if name is not None)
     made = appearance.maps[f"normals_{state}"]
     known = np.asarray(truth.maps[f"normals_seen_{state}"].values, np.float64)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
-    good = np.ones(known.shape[:2], bool) if made.valid is None else made.valid
+    good = jointly_valid(made)[inner]
     error = np.degrees(metrics.angular_error_rad(made.values, known))[inner]
-    median = float(np.median(error[good[inner]]))
-    one = choice.forecasts[0]
-    return [
-        {
-            "name": one.name,
-            "unit": one.unit,
-            "median": median,
-            "forecast": one.value,
-            "within": one.interval[0] <= median <= one.interval[1],
-            "valid_share": float(good[inner].mean()),
-        }
-    ]
+    return {"normals": (float(np.median(error[good])), float(good.mean()))}
 
 
 def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tuple[Setting, Plan]]:
@@ -240,14 +191,13 @@ def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tup
         Skin that must not be saturated; None: any.
     """
     angle = _angles(rig)[0]
+    rates = {} if observation is None else observation.rates
+    brightest = max((float(np.quantile(rate, 0.999)) for rate in rates.values()), default=0.0)
     found: list[tuple[float, int, Setting, Plan]] = []
     for patterns in PATTERN_SETS:
         for share in EXPOSURE_CHOICES:
             exposure_s = share * EXPOSURE_S
-            if (
-                observation is not None
-                and _brightest(observation, exposure_s) > MAX_SIGNAL_FRACTION
-            ):
+            if exposure_s * brightest > MAX_SIGNAL_FRACTION:
                 continue
             for darks in (0, 2):
                 try:
@@ -273,13 +223,13 @@ def setting_of(plan: Plan) -> Setting:
 
     Raises
     ------
-    PlanningError
+    plans.PlanningError
         Where its pictures do not tell light and three gradients, in both polarizations.
     """
     shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
     if not neutral:
-        raise PlanningError("plan: got no neutral state of skin, expected one")
+        raise plans.PlanningError("plan: got no neutral state of skin, expected one")
     state = state_of(neutral[0])
     own = [step for step in neutral if state_of(step) == state]
     sets = [
@@ -291,7 +241,7 @@ def setting_of(plan: Plan) -> Setting:
             lit = dict.fromkeys(names - {"dark"})
             require(lit, polarizer=polarizer, purpose="normals")
     except MissingPatterns as error:
-        raise PlanningError(f"plan: {error}") from error
+        raise plans.PlanningError(f"plan: {error}") from error
     both = sets[0] & sets[1]
     darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
     first = own[0].settings
@@ -305,14 +255,10 @@ def setting_of(plan: Plan) -> Setting:
 
 def _angles(rig: Rig) -> Sequence[float]:
     if rig.caliper is None:
-        raise PlanningError(
+        raise plans.PlanningError(
             f"rig: got {rig.name!r} without a caliper, expected one that holds skin"
         )
     return rig.caliper.angles_deg
-
-
-def _brightest(observation: Observation, exposure_s: float) -> float:
-    return exposure_s * max(float(np.quantile(rate, 0.999)) for rate in observation.rates.values())
 
 
 def _choice(
@@ -320,7 +266,7 @@ def _choice(
     observation: Observation,
     plan: Plan,
     setting: Setting,
-    wants: Mapping[str, float],
+    asked: PlanRequest,
     *,
     found: Prediction | None = None,
     path: tuple[Mapping[str, float], ...] = (),
@@ -328,69 +274,48 @@ def _choice(
 ) -> Choice:
     found = predict(observation, setting) if found is None else found
     full = gradient_plan(rig)
-    value = math.degrees(found.median_rad)
-    predicted = Forecast(
-        "normals", "deg", value, interval_of(value, FORECAST_RELATIVE_SD), wants.get("normals")
-    )
-    left_out = []
+    medians = {"normals": math.degrees(found.median_rad)}
+    predicted = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
-    if missing:
-        left_out.append(
-            (
-                f"patterns {', '.join(missing)}",
-                "full light and three gradients are told without them; they would lower the noise",
-            )
-        )
     states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
-    if len(states) < len(every):
-        left_out.append(
-            (
-                f"{len(every) - len(states)} of {len(every)} states of strain",
-                "normals are wanted of neutral skin",
-            )
-        )
-    if setting.exposure_s < EXPOSURE_S:
-        left_out.append(
-            (
-                f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms "
-                "exposed",
-                "what is left errs by at most a twentieth more"
-                if reasons
-                else "what is left reaches what is wanted",
-            )
-        )
-    if not setting.darks:
-        left_out.append(
-            ("dark frames", "at this exposure the fixed pattern of the sensor is below its noise")
-        )
-    lost = math.degrees(observation.lost_rad)
+    left_out = plans.left_out_of(
+        (
+            bool(missing),
+            f"patterns {', '.join(missing)}",
+            "full light and three gradients are told without them; they would lower the noise",
+        ),
+        (
+            len(states) < len(every),
+            f"{len(every) - len(states)} of {len(every)} states of strain",
+            "normals are wanted of neutral skin",
+        ),
+        (
+            setting.exposure_s < EXPOSURE_S,
+            f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
+            plans.why_less(reasons),
+        ),
+        (
+            not setting.darks,
+            "dark frames",
+            "at this exposure the fixed pattern of the sensor is below its noise",
+        ),
+    )
     reasons += (
         "normals are those that the lens shows; the relief's own are "
-        f"{lost:.2g}° off them, which no pattern brings back",
+        f"{math.degrees(observation.lost_rad):.2g}° off them, which no pattern brings back",
     )
-    return Choice(
-        rig,
-        plan,
-        (predicted,),
-        plan.estimated_s(rig),
-        full.estimated_s(rig),
-        {
-            "patterns": list(setting.patterns),
-            "polarizers": ["parallel", "crossed"],
-            "states": sorted(str(name) for name in states),
-            "exposure_s": round(setting.exposure_s, 6),
-            "dwell_s": next(
-                round(float(s.settings["dwell_s"]), 6) for s in plan.steps if state_of(s)
-            ),
-            "darks": setting.darks,
-            "level": setting.level,
-            "valid_share": found.valid_share,
-        },
-        tuple(left_out),
-        path,
-        reasons,
-        light_of(plan, rig),
-    )
+    dwell_s = next(float(s.settings["dwell_s"]) for s in plan.steps if state_of(s))
+    knobs = {
+        "patterns": list(setting.patterns),
+        "polarizers": ["parallel", "crossed"],
+        "states": sorted(str(name) for name in states),
+        "exposure_s": round(setting.exposure_s, 6),
+        "dwell_s": round(dwell_s, 6),
+        "darks": setting.darks,
+        "level": setting.level,
+        "valid_share": found.valid_share,
+    }
+    return Choice(rig, plan, predicted, full.estimated_s(rig), knobs, left_out, path, reasons)
 
 
 def _why(best: Prediction, observation: Observation) -> str:

@@ -11,7 +11,7 @@ import difflib
 import importlib
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
-from skinrig.errors import UsageError
+from skinrig.console import picked
+from skinrig.errors import UsageError, one_of
 from skinrig.written_units import written
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -68,6 +69,40 @@ class Forecast:
         """Whether the forecast keeps to what was asked for."""
         return self.wanted is None or self.value <= self.wanted
 
+    def document(self) -> dict[str, Any]:
+        """Return this as JSON values."""
+        named = {"name": self.name, "unit": self.unit, "median": self.value}
+        return {**named, **picked(self, "interval", "wanted", "reached")}
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What a plan is chosen, or forecast, for."""
+
+    wants: Mapping[str, float] = field(default_factory=dict)
+    """Medians to reach, in the units of :data:`WANTED_UNITS`; empty: the rig's own plan."""
+    subject: str = "III"
+    """Preset of the simulated face that is forecast."""
+    seed: int = 0
+    """Of that face."""
+    valid_share: float = 0.9
+    """Of what the whole rig gives an estimate, so much must keep one."""
+    most_lights: int | None = None
+    """Largest number of lights, of a dome."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What is simulated, and how it is calibrated, to confirm a choice."""
+
+    targets: Mapping[str, Mapping[str, Any]]
+    """Options of each calibration target's session."""
+    calibrations: tuple[tuple[str, tuple[str, ...]], ...]
+    """Kind, and the targets that it is made from."""
+    want: tuple[str, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the subject's session, besides the plan."""
+
 
 @dataclass(frozen=True, slots=True)
 class Choice:
@@ -77,8 +112,6 @@ class Choice:
     """With the lights and views of the plan only."""
     plan: Plan
     forecasts: tuple[Forecast, ...]
-    seconds: float
-    """Of the capture, as the box's times add up."""
     full_seconds: float
     """Of the rig's whole plan."""
     knobs: Mapping[str, Any]
@@ -89,8 +122,19 @@ class Choice:
     """What each step of the choice bought."""
     reasons: tuple[str, ...] = ()
     """Why what is wanted is not reached, or what the forecast rests on."""
-    light: Mapping[str, Any] = field(default_factory=dict)
-    """Flicker and dose, see `skinrig.capturing.light_safety.light_figures`."""
+    flashes: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of flashes, where the rig has no LEDs."""
+
+    @property
+    def seconds(self) -> float:
+        """Time of the capture, as the box's times add up."""
+        return self.plan.estimated_s(self.rig)
+
+    @property
+    def light(self) -> Mapping[str, Any]:
+        """Flicker and dose, see `skinrig.capturing.light_safety.light_figures`, or flashes."""
+        leds = self.rig.leds is not None or self.rig.probe is not None
+        return light_figures(self.plan, self.rig) if leds else self.flashes
 
     @property
     def reached(self) -> bool:
@@ -103,25 +147,10 @@ class Choice:
             "schema": SCHEMA,
             "rig": self.rig.name,
             "reached": self.reached,
-            "forecasts": [
-                {
-                    "name": one.name,
-                    "unit": one.unit,
-                    "median": one.value,
-                    "interval": list(one.interval),
-                    "wanted": one.wanted,
-                    "reached": one.reached,
-                }
-                for one in self.forecasts
-            ],
-            "knobs": dict(self.knobs),
-            "seconds": self.seconds,
-            "full_seconds": self.full_seconds,
+            "forecasts": [one.document() for one in self.forecasts],
+            **picked(self, "knobs", "seconds", "full_seconds"),
             "saved_seconds": self.full_seconds - self.seconds,
-            "left_out": [list(item) for item in self.left_out],
-            "path": [dict(step) for step in self.path],
-            "reasons": list(self.reasons),
-            "light": dict(self.light),
+            **picked(self, "left_out", "path", "reasons", "light"),
         }
 
 
@@ -152,9 +181,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     >>> read_wants("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
-    units = WANTED_UNITS.get(rig)
-    if units is None:
-        raise PlanningError(f"rig: got {rig!r}, expected one of {', '.join(WANTED_UNITS)}")
+    units = WANTED_UNITS[one_of("rig", rig, WANTED_UNITS, PlanningError)]
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):
@@ -185,21 +212,41 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     return wants
 
 
-def light_of(plan: Plan, rig: Rig) -> Mapping[str, Any]:
-    """Return flicker and dose of a plan where its rig has LEDs, else nothing."""
-    return light_figures(plan, rig) if rig.leds is not None or rig.probe is not None else {}
+def forecasts_of(
+    medians: Mapping[str, float], spread: Mapping[str, float], asked: PlanRequest, rig: str
+) -> tuple[Forecast, ...]:
+    """Return the forecasts of medians by name, each off by a relative spread."""
+    return tuple(
+        Forecast(
+            name,
+            WANTED_UNITS[rig][name],
+            value,
+            interval_of(value, spread[name]),
+            asked.wants.get(name),
+        )
+        for name, value in medians.items()
+    )
+
+
+def left_out_of(*rows: tuple[bool, str, str]) -> tuple[tuple[str, str], ...]:
+    """Return what is left out and why, of rows that say first whether it is."""
+    return tuple((what, why) for left, what, why in rows if left)
+
+
+def why_less(reasons: Sequence[str]) -> str:
+    """Return why less light will do, where there are reasons why the wish is out of reach."""
+    if reasons:
+        return "what is left errs by at most a twentieth more"
+    return "what is left reaches what is wanted"
 
 
 def choose(
     rig_name: str,
     want: str,
     *,
-    subject: str = "III",
-    seed: int = 0,
     width_px: int | None = None,
-    most_lights: int | None = None,
-    valid_share: float = 0.9,
     forecast: Path | None = None,
+    **request: Any,
 ) -> Choice:
     """Choose the smallest plan of a rig that reaches what is wanted.
 
@@ -209,24 +256,21 @@ def choose(
         Out of :data:`WANTED_UNITS`.
     want
         See `read_wants`.
-    subject, seed
-        The simulated face that is forecast.
     width_px
         Pixels across the cameras; None: the rig's own.
-    most_lights
-        See `skinrig.planning.dome.choose`.
-    valid_share
-        Of what the whole rig gives an estimate, so much must keep one.
     forecast
         A plan, JSON, of which only the forecast is asked for.
+    request
+        Fields of `PlanRequest`.
 
     Raises
     ------
     PlanningError
         For what cannot be read or planned.
     """
-    wants = read_wants(want, rig_name)
-    own = _planner(rig_name)
+    asked = PlanRequest(read_wants(want, rig_name), **request)
+    most_lights = asked.most_lights
+    own = planner(rig_name)
     rig = load_rig(rig_name)
     if width_px is not None:
         if rig_name == "probe":
@@ -241,39 +285,17 @@ def choose(
         plan = read_plan(forecast)
         if plan.rig != rig.name:
             raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
-        found: Choice = own.forecast(rig, plan, wants, subject=subject, seed=seed)
-        return found
-    options: dict[str, Any] = {"most_lights": most_lights} if rig_name == "dome" else {}
-    chosen: Choice = own.choose(
-        rig, wants, subject=subject, seed=seed, valid_share=valid_share, **options
-    )
-    return chosen
+        found: Choice = own.forecast(rig, plan, asked)
+    else:
+        found = own.choose(rig, asked)
+    return found
 
 
-def confirmed(
-    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Simulate a choice, reconstruct it, and compare what came out with the forecast.
+def planner(rig_name: str) -> Any:
+    """Return the module that plans for a rig.
 
-    Parameters
-    ----------
-    choice
-        Of `choose`.
-    out
-        Folder for sessions, calibration, maps.
-    subject, seed
-        The simulated face.
-    progress
-        Is told each step.
+    It has `choose`, `forecast`, and for a confirmation `rehearsal` and `measured`.
     """
-    rows: list[dict[str, Any]] = _planner(choice.rig.name).confirm(
-        choice, out, subject=subject, seed=seed, progress=progress
-    )
-    return rows
-
-
-def _planner(rig_name: str) -> Any:
-    """Return the module that plans for a rig: its `choose`, `forecast` and `confirm`."""
     return importlib.import_module(f"skinrig.planning.{rig_name}")
 
 

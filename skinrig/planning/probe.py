@@ -9,8 +9,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,38 +16,13 @@ from capture.plan import Plan, PlanError
 from capture.plan.probe import MAX_EXPOSURE_S, N_BRACKETS, exposure_series_s, probe_plan
 from capture.plan.suction import placement_of
 from capture.rig import Rig
-from model import store
-from reconstruction.pipeline import recipes as pipeline
+from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
-from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface
-from skinrig.planning.plans import (
-    PERCENT_BY_SITE,
-    Choice,
-    Forecast,
-    PlanningError,
-    light_of,
-    median_of_normals,
-)
+from skinrig.planning import plans
+from skinrig.planning.plans import Choice, PlanRequest
 from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
 from skinrig.planning.probe_observation import Observation, simulate_observation
-from skinrig.simulating.simulation import simulate_session
-
-__all__ = [
-    "Memory",
-    "Observation",
-    "Prediction",
-    "Setting",
-    "candidates",
-    "choose",
-    "confirm",
-    "forecast",
-    "predict",
-    "setting_of",
-    "simulate_observation",
-    "without_sites",
-]
-
 
 MIN_EXPOSURE_S = exposure_series_s()[0]
 """Of the rig's own series: the nearest fibre must not saturate in it."""
@@ -61,34 +34,23 @@ REPEAT_CHOICES = (1, 2, 4)
 DARK_CHOICES = (1, 2)
 
 
-def choose(
-    rig: Rig,
-    wants: Mapping[str, float],
-    *,
-    subject: str = "III",
-    seed: int = 0,
-    valid_share: float = 0.9,
-) -> Choice:
+def choose(rig: Rig, asked: PlanRequest) -> Choice:
     """Choose the quickest plan that reaches what is wanted.
 
     Parameters
     ----------
     rig
         The probe's.
-    wants
-        By name: "sigma_tr" in percent, the median of the relative error over sites and colors;
-        empty: the forecast of the rig's own plan.
-    subject, seed
-        The skin that is forecast.
-    valid_share
-        Of the fits that the rig's own plan makes valid, so many must stay so.
+    asked
+        Wants by name: "sigma_tr" in percent, the median of the relative error over sites and
+        colors; empty: the forecast of the rig's own plan. The share is of the fits that this plan
+        makes valid.
     """
-    observation = simulate_observation(rig, subject, seed=seed)
-    own = probe_plan(rig)
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    own, wants, valid_share = probe_plan(rig), asked.wants, asked.valid_share
     if not wants:
-        return _choice(
-            rig, observation, own, setting_of(own), predict(observation, setting_of(own)), wants
-        )
+        setting = setting_of(own)
+        return _choice(rig, observation, own, setting, predict(observation, setting), wants)
     target = wants.get("sigma_tr", math.inf) / 100.0
     memory: Memory = {}
     whole = predict(observation, setting_of(own), memory=memory)
@@ -99,7 +61,7 @@ def choose(
             found.valid_share >= valid_share * whole.valid_share
             and found.median <= target
             # a site that is left out must be told by the others as well as is wanted
-            and (not left.size or median_of_normals(left) <= target)
+            and (not left.size or plans.median_of_normals(left) <= target)
         )
 
     tried: list[tuple[Setting, Plan, Prediction]] = []
@@ -130,57 +92,31 @@ def choose(
             one for one in tried if one[2].median <= 1.05 * best and one[2].valid_share >= least
         )
     found = predict(observation, setting, memory=memory)
-    return _choice(rig, observation, plan, setting, found, wants, path=path, reasons=reasons)
+    choice = _choice(rig, observation, plan, setting, found, wants)
+    return replace(choice, path=path, reasons=reasons)
 
 
-def forecast(
-    rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
-) -> Choice:
+def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
     """Return what a plan of the probe will give at its sites."""
     setting = setting_of(plan)
-    observation = simulate_observation(rig, subject, seed=seed, sites=setting.sites)
-    return _choice(rig, observation, plan, setting, predict(observation, setting), wants)
+    observation = simulate_observation(rig, asked.subject, seed=asked.seed, sites=setting.sites)
+    return _choice(rig, observation, plan, setting, predict(observation, setting), asked.wants)
 
 
-def confirm(
-    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Simulate the skin of a choice and the phantom, reconstruct, compare with the truth."""
-    progress("simulate phantom")
-    simulate_session("probe", out / "session-phantom", target="phantom", seed=seed)
-    calibrate("fibre", [out / "session-phantom"], out / "calibration")
-    progress(f"simulate the skin {subject}")
-    done = simulate_session(
-        "probe", out / "session-face", subject=subject, seed=seed, plan=choice.plan
-    )
-    progress("reconstruct")
-    pipeline.reconstruct(
-        done.session,
-        want=("subsurface",),
-        out=out / "appearance",
-        calibration=out / "calibration",
-        truth=done.truth.name if done.truth else "",
-    )
-    rows = [
-        row
-        for row in subsurface.compare_fits(
-            store.read(out / "appearance"), store.read(out / "truth-face")
-        )
-        if row.method == METHOD_NAMES[0]
-    ]
+def rehearsal(_: Choice) -> plans.Rehearsal:
+    """Return the probe's phantom."""
+    return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
+
+
+def measured(
+    _choice: Choice, appearance: SkinAppearance, truth: SkinAppearance, _: int
+) -> dict[str, tuple[float, float]]:
+    """Return median error, percent, and valid share of sigma_tr over sites and colors."""
+    fits = subsurface.compare_fits(appearance, truth)
+    rows = [row for row in fits if row.method == METHOD_NAMES[0]]
     good = [abs(row.relative) for row in rows if row.valid]
     median = 100.0 * float(np.median(good)) if good else math.inf
-    one = choice.forecasts[0]
-    return [
-        {
-            "name": one.name,
-            "unit": one.unit,
-            "median": median,
-            "forecast": one.value,
-            "within": one.interval[0] <= median <= one.interval[1],
-            "valid_share": len(good) / max(len(rows), 1),
-        }
-    ]
+    return {"sigma_tr": (median, len(good) / max(len(rows), 1))}
 
 
 def candidates(rig: Rig, observation: Observation) -> Iterator[tuple[Setting, Plan]]:
@@ -245,15 +181,17 @@ def setting_of(plan: Plan) -> Setting:
 
     Raises
     ------
-    PlanningError
+    plans.PlanningError
         Where nothing is measured on skin, or no dark frame is there.
     """
     shots = [step for step in plan.steps if step.kind == "fibres"]
     darks = [step for step in plan.steps if step.kind == "dark"]
     if not shots:
-        raise PlanningError("plan: got no series on skin, expected at least one")
+        raise plans.PlanningError("plan: got no series on skin, expected at least one")
     if not darks:
-        raise PlanningError("plan: got no frame without light, expected some: the dark current")
+        raise plans.PlanningError(
+            "plan: got no frame without light, expected some: the dark current"
+        )
     placements = list(dict.fromkeys(placement_of(step) for step in shots))
     sites = tuple(dict.fromkeys(str(step.index["site"]) for step in shots))
     first = [step for step in shots if placement_of(step) == placements[0]]
@@ -274,72 +212,61 @@ def _choice(
     setting: Setting,
     found: Prediction,
     wants: Mapping[str, float],
-    *,
-    path: tuple[Mapping[str, float], ...] = (),
-    reasons: tuple[str, ...] = (),
 ) -> Choice:
-    full = probe_plan(rig, repeats=setting.repeats)
     value = 100.0 * found.median
     low, high = found.interval()
-    predicted = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
-    left_out = []
-    if len(setting.exposures_s) < N_BRACKETS:
-        left_out.append(
-            (
-                f"{N_BRACKETS - len(setting.exposures_s)} of {N_BRACKETS} exposures of a series",
-                "wider steps still show every fibre unsaturated and above the noise",
-            )
-        )
-    if setting.exposures_s[-1] < 0.99 * MAX_EXPOSURE_S:
-        left_out.append(
-            (
-                f"exposures above {setting.exposures_s[-1]:.3g} s",
-                "what the farthest fibres would add does not show beside misfit and certificate",
-            )
-        )
-    for k, site in enumerate(observation.sites):
-        if not found.measured[k]:
-            left_out.append(
-                (
-                    f"the {site}",
-                    f"the other sites and people in general tell its sigma_tr to "
-                    f"{100.0 * float(np.median(found.sigma[k])):.2g} %",
-                )
-            )
-    if "angle" not in {name for step in plan.steps for name in step.index if step.index[name]}:
-        left_out.append(
-            ("further directions of the head", "sigma_tr is wanted, not how it changes with them")
-        )
-    by_site = {
-        site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
-        for k, site in enumerate(observation.sites)
-    }
-    return Choice(
-        rig,
-        plan,
-        (predicted,),
-        plan.estimated_s(rig),
-        full.estimated_s(rig),
-        {
-            "sites": list(setting.sites),
-            "repeats": setting.repeats,
-            "directions": 1,
-            "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
-            "darks": setting.darks,
-            "valid_share": found.valid_share,
-            PERCENT_BY_SITE: by_site,
-        },
-        tuple(left_out),
-        path,
-        reasons,
-        light_of(plan, rig),
+    predicted = plans.Forecast(
+        "sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr")
     )
+    fewer = N_BRACKETS - len(setting.exposures_s)
+    unmeasured = [(k, site) for k, site in enumerate(observation.sites) if not found.measured[k]]
+    turned = {name for step in plan.steps for name in step.index if step.index[name]}
+    left_out = plans.left_out_of(
+        (
+            fewer > 0,
+            f"{fewer} of {N_BRACKETS} exposures of a series",
+            "wider steps still show every fibre unsaturated and above the noise",
+        ),
+        (
+            setting.exposures_s[-1] < 0.99 * MAX_EXPOSURE_S,
+            f"exposures above {setting.exposures_s[-1]:.3g} s",
+            "what the farthest fibres would add does not show beside misfit and certificate",
+        ),
+        *(
+            (
+                True,
+                f"the {site}",
+                "the other sites and people in general tell its sigma_tr to "
+                f"{100.0 * float(np.median(found.sigma[k])):.2g} %",
+            )
+            for k, site in unmeasured
+        ),
+        (
+            "angle" not in turned,
+            "further directions of the head",
+            "sigma_tr is wanted, not how it changes with them",
+        ),
+    )
+    knobs = {
+        "sites": list(setting.sites),
+        "repeats": setting.repeats,
+        "directions": 1,
+        "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
+        "darks": setting.darks,
+        "valid_share": found.valid_share,
+        plans.PERCENT_BY_SITE: {
+            site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
+            for k, site in enumerate(observation.sites)
+        },
+    }
+    full_s = probe_plan(rig, repeats=setting.repeats).estimated_s(rig)
+    return Choice(rig, plan, (predicted,), full_s, knobs, left_out)
 
 
 def _why(observation: Observation, whole: Prediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
-    stays = 100.0 * median_of_normals(whole.misfit)
-    calibration = 100.0 * median_of_normals(whole.common)
+    stays = 100.0 * plans.median_of_normals(whole.misfit)
+    calibration = 100.0 * plans.median_of_normals(whole.common)
     return (
         f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
         f"layers unlike any homogeneous medium and the calibration (the phantom's certificate, far "

@@ -167,16 +167,8 @@ def _fits(
     memory: Memory,
 ) -> Sequence[Any]:
     """Return the fits of each site's profile as a plan would read it, or without its noise."""
-    read = [
-        reading_variance(
-            observation,
-            observation.reflectance[k],
-            setting.exposures_s,
-            setting.darks,
-            setting.level,
-        )
-        for k in places
-    ]
+    how = (setting.exposures_s, setting.darks, setting.level)
+    read = [reading_variance(observation, observation.reflectance[k], *how) for k in places]
     # of the readings' noise a fit without it asks only which fibres are read at all
     told = np.array(read) if noise else np.isfinite(read)
     count = len(setting.exposures_s)
@@ -211,15 +203,9 @@ def _fitted(
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
         told = (value, observation.phantom, value / observation.phantom)
         doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
-        reflectance = FiberReflectance(
-            names,
-            radius,
-            value,
-            variance + gain * value**2 + doubt,
-            np.concatenate([value * observation.common, shared]),
-            valid,
-            ~valid,
-        )
+        common = np.concatenate([value * observation.common, shared])
+        variance += gain * value**2 + doubt
+        reflectance = FiberReflectance(names, radius, value, variance, common, valid, ~valid)
         head = Measurement(Placement(observation.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
         profiles.append(Profile(head, reflectance))
     return fit_profiles(profiles, observation.probe) if profiles else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -26,9 +27,10 @@ from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals, target_scene
 from rigsim.subject.head_motion import head_motion
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.targets import make_target
+from skinrig.console import picked
+from skinrig.errors import one_of
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
-from skinrig.simulating import subject_records
-from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
+from skinrig.simulating import driving
 from skinrig.simulating.orders import (
     DomeOrder,
     OptionsError,
@@ -59,20 +61,17 @@ TRACKING_EVERY = 24
 
 def simulate_dome(order: DomeOrder) -> Simulated:
     """Simulate a capture with the dome; see `simulation.simulate`."""
-    _check_state(order)
+    one_of("state", order.state, STATE_NAMES, SimulationError)
     conditions = _conditions(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None
     plan = planned or _plan(rig, order.target, order.size)
-    light = announce_light(plan, rig, order)
-    asked = _asked(order, rig) | ({"conditions": conditions} if conditions else {})
+    light = driving.announce_light(plan, rig, order)
+    asked = _asked(order, rig, conditions)
     scene = _scene(rig, order, plan)
-    session = open_session(order, plan, rig, asked, scene)
-    try:
+    session = driving.open_session(order, plan, rig, asked, scene)
+    with driving.released_on_error(session):
         scan = _attach_scan(session, scene, order) if order.target is None else {}
-    except BaseException:
-        session.release()
-        raise
 
     def prompt(world: Any, text: str) -> None:
         # "pose 3" and "sphere 1": the operator puts the target there
@@ -80,55 +79,41 @@ def simulate_dome(order: DomeOrder) -> Simulated:
 
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or light["open_eyes"] != "allowed"
-    rig_seconds = drive(order, session, rig, scene, prompt, eyes="closed" if safe else "open")
+    rig_seconds = driving.drive(
+        order, session, rig, scene, prompt, eyes="closed" if safe else "open"
+    )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
         appearance = scene.truth_appearance()
         parameters = appearance.parameters | scan | {"landmarks_mm": _landmarks(scene.subject)}
-        write_truth(
+        driving.write_truth(
             truth,
             order,
             session,
             dataclasses.replace(appearance, parameters=parameters),
             files=_truth_files(scene, appearance, order.seed),
-            state=order.state,
-            movement=order.movement,
-            subsurface=scene.subsurface,
-            interreflections=scene.interreflections,
+            **picked(order, "state", "movement"),
+            **picked(scene, "subsurface", "interreflections"),
         )
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
-def _asked(order: DomeOrder, rig: Rig) -> dict[str, Any]:
+def _asked(order: DomeOrder, rig: Rig, conditions: Mapping[str, float]) -> dict[str, Any]:
     """Return the settings of a simulation as its session's manifest keeps them."""
-    asked = {
-        "rig": "dome",
+    asked: dict[str, Any] = {
         "width_px": rig.views[0].width_px,
-        "subject": subject_records.of_manifest(order.subject),
-        "target": order.target or "",
         "mesh": str(order.mesh or ""),
         "lights": len(rig.lights),
         "views": len(rig.views),
-        "move": order.move,
-        "state": order.state,
-        "movement": order.movement,
-        "wrapped": order.wrapped,
         "plan": "" if order.plan is None else order.plan.to_json(),
+        **picked(order, "move", "state", "movement", "wrapped"),
     }
     if order.target is None:
-        asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
-        if order.leave_out:
-            asked["leave_out"] = list(order.leave_out)
-    return asked
-
-
-def _check_state(order: DomeOrder) -> None:
-    """Raise for a state that no face has."""
-    if order.state not in STATE_NAMES:
-        raise SimulationError(
-            f"state: got {order.state!r}, expected one of {', '.join(STATE_NAMES)}"
-        )
+        asked |= picked(order, "subsurface", "interreflections")
+    if conditions:
+        asked["conditions"] = conditions
+    return driving.asked_of(order, **asked)
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
@@ -255,14 +240,12 @@ def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]
 def _rig(order: DomeOrder) -> Rig:
     """Return the dome with the lights, cameras and pixels of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
-    if order.plan is None:
-        return small_dome(
-            load_rig("dome"),
-            lights=order.lights or LIGHT_COUNTS[order.size],
-            views=order.views or VIEW_COUNTS[order.size],
-            width_px=width_px,
-        )
     dome = load_rig("dome")
+    if order.plan is None:
+        lights, views = LIGHT_COUNTS[order.size], VIEW_COUNTS[order.size]
+        return small_dome(
+            dome, lights=order.lights or lights, views=order.views or views, width_px=width_px
+        )
     lit = {name for step in order.plan.steps for name in lights_of(step)}
     seen = {name for step in order.plan.steps for name in step.cameras}
     return dome.subset(
@@ -274,7 +257,6 @@ def _rig(order: DomeOrder) -> Rig:
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-
     few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else TARGET_POSES
     return dome_calibration_plan(
         rig,
@@ -287,7 +269,6 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-
     built = build(rig, seed=order.seed)
     if order.target == "dark":
         return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
-from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
@@ -20,14 +20,63 @@ from rigsim.world import World
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
-from skinrig.simulating.orders import SIMULATED_USES, Order, Simulated, SimulationError
-from skinrig.simulating.resumption import refusals
-from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.exposure_log import SceneLog
+from skinrig.simulating.orders import (
+    SIMULATED_USES,
+    Order,
+    Simulated,
+    SimulationError,
+    truth_folder,
+)
+from skinrig.simulating.resumption import refusals, shots_made
+
+Log = TypeVar("Log", bound=SceneLog)
 
 
 def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
     """Return what a scene builds and what not, as its manifest and `Simulated` hold it."""
     return tuple(scene.needs.document())
+
+
+def asked_of(order: Order, **own: Any) -> dict[str, Any]:
+    """Return the settings of a simulation as its session's manifest keeps them.
+
+    Parameters
+    ----------
+    order
+        What every rig's order has.
+    own
+        Settings of the rig.
+    """
+    asked: dict[str, Any] = {
+        "rig": order.rig,
+        "subject": subject_records.of_manifest(order.subject),
+        "target": order.target or "",
+    }
+    if order.plan is not None:
+        asked["plan"] = order.plan.to_json()
+    if order.leave_out:
+        asked["leave_out"] = list(order.leave_out)
+    return asked | own
+
+
+@contextmanager
+def released_on_error(session: Session) -> Iterator[None]:
+    """Release a session where what follows fails."""
+    try:
+        yield
+    except BaseException:
+        session.release()
+        raise
+
+
+def open_logged(
+    order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any], scene: Any, kind: type[Log]
+) -> tuple[Session, Log]:
+    """Open the session of an order, and the log that stands before its scene."""
+    session = open_session(order, plan, rig, asked, scene)
+    with released_on_error(session):
+        return session, kind(scene, truth_folder(order.out), resume=order.resume, session=session)
 
 
 def open_session(
@@ -130,12 +179,10 @@ def drive(
     scene: Any,
     prompt: Callable[[Any, str], None] | None = None,
     *,
-    eyes: Eyes = "open",
-    force_limit_n: float | None = None,
-    run_id: str = "",
-    all_brackets: bool = False,
     signal: Callable[[Any, str], None] | None = None,
     begun_s: float | None = None,
+    run_id: str | None = None,
+    **run: Any,
 ) -> float:
     """Run a session's plan through the drivers, on a world registered under its id, and close it.
 
@@ -149,19 +196,16 @@ def drive(
         What the cameras see first.
     prompt
         Called with the world and what the operator is asked for; None: nobody is needed.
-    eyes
-        What is said of the subject's eyes.
-    force_limit_n
-        Of a caliper, N.
-    run_id
-        Begins the tokens of this run.
-    all_brackets
-        Of a probe.
     signal
         Called with the world and what the subject of a sequence is asked for, at the time.
     begun_s
         The host's time at which the world begins, s since 1970; None: the host's clock is not the
         world's, but this computer's.
+    run_id
+        See `capture.acquire.Operator`; None: a new one.
+    run
+        Further arguments of `capture.acquire.run_plan`: ``eyes``, ``force_limit_n``,
+        ``all_brackets``.
 
     Returns
     -------
@@ -195,9 +239,7 @@ def drive(
             cameras=cameras,
             session=session,
             operator=operator,
-            eyes=eyes,
-            force_limit_n=force_limit_n,
-            all_brackets=all_brackets,
+            **run,
         )
         session.close()
         return float(world.now)

@@ -7,10 +7,11 @@ and no session may contain it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from capture.session import FrameRecord, Session
 from skinrig.simulating.orders import SimulationError
 
 
@@ -49,18 +50,18 @@ class ExposureLog:
 
 
 class SceneLog(ExposureLog):
-    """A scene whose exposures are logged, each with the number of its run.
+    """A scene that notes what its exposures met, with the number of the run, beside the session.
 
     Parameters
     ----------
     scene
         What the cameras see.
-    path
-        The log.
+    truth
+        Where the truth will be; the log lies beside it until then.
     resume
         Whether the session was begun before.
-    captured
-        Whether the session has frames already.
+    session
+        Open.
 
     Raises
     ------
@@ -68,16 +69,23 @@ class SceneLog(ExposureLog):
         When frames were captured before and their log is gone.
     """
 
-    lost = "what was captured before"
+    suffix: ClassVar[str]
+    """Of the log's name."""
+    kinds: ClassVar[tuple[str, ...]]
+    """Of frames whose exposures are logged."""
+    max_lag_s: ClassVar[float]
+    """Between an entry and the frame that it is of."""
+    lost: ClassVar[str] = "what was captured before"
     """What has no truth without the log."""
 
-    def __init__(self, scene: Any, path: Path, *, resume: bool, captured: bool) -> None:
-        super().__init__(path, resume=resume)
+    def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
+        super().__init__(truth.with_name(f".{truth.name}.{self.suffix}.jsonl"), resume=resume)
         self._scene = scene
         entries = self.read()
-        if captured and not entries:
+        if not entries and any(session.frames(kind) for kind in self.kinds):
             raise SimulationError(
-                f"{path}: is gone, and with it the truth of {self.lost}; simulate the session anew"
+                f"{self._path}: is gone, and with it the truth of {self.lost}; simulate the "
+                "session anew"
             )
         self._run = 1 + max((int(entry["run"]) for entry in entries), default=0)
 
@@ -86,6 +94,23 @@ class SceneLog(ExposureLog):
         """Begins the tokens of this run."""
         return f"sim{self._run}"
 
-    def note(self, time_s: float, met: Mapping[str, Any]) -> None:
-        """Append what an exposure of this run met."""
-        self.add({"run": self._run, "t_s": time_s, **met})
+    def exposure(self, view_name: str, *, pops: Sequence[Any], **exposed: Any) -> Any:
+        """Expose the scene, and note what is lit."""
+        met = self.met(exposed) if pops else None
+        if met is not None:
+            self.add({"run": self._run, "t_s": pops[0].t_on_s, **met})
+        return self._scene.exposure(view_name, pops=pops, **exposed)
+
+    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
+        """Return what is noted of an exposure; None: nothing."""
+        raise NotImplementedError
+
+    def at(
+        self, entries: Sequence[Mapping[str, Any]], run_id: str, record: FrameRecord, what: str
+    ) -> Mapping[str, Any]:
+        """Return the entry of a frame, of a run."""
+        run, time_s = int(run_id.removeprefix("sim")), float(record.line.t_box_s or 0.0)
+        for entry in entries:
+            if entry["run"] == run and abs(entry["t_s"] - time_s) < self.max_lag_s:
+                return entry
+        raise SimulationError(f"{self._path}: tells nothing of the {what}")

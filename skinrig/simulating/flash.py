@@ -12,8 +12,10 @@ from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.console import picked
+from skinrig.errors import one_of
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, finish, open_session
+from skinrig.simulating.driving import asked_of, drive, finish, open_session
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_mm, truth_of
 from skinrig.simulating.orders import FlashOrder, Simulated, SimulationError, truth_folder
 from skinrig.simulating.sequence import simulate_sequence
@@ -24,28 +26,18 @@ def simulate_flash(order: FlashOrder) -> Simulated:
     if order.sequence is not None:
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states
-    if target is None:
-        unknown = [state for state in states if state not in STATE_NAMES]
-        if unknown:
-            raise SimulationError(
-                f"state: got {unknown[0]!r}, expected one of {', '.join(STATE_NAMES)}"
-            )
+    for state in states if target is None else ():
+        one_of("state", state, STATE_NAMES, SimulationError)
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    asked = {
-        "rig": "flash",
-        "width_px": width,
-        "subject": subject_records.of_manifest(order.subject),
-        "target": target or "",
-        "mesh": str(order.mesh or ""),
-        "states": list(states),
-        "repeats": order.repeats,
-        "movement": order.movement,
-        **({} if order.plan is None else {"plan": order.plan.to_json()}),
-        **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
-        **({"nearer_mm": order.nearer_mm} if order.nearer_mm else {}),
-    }
+    asked = asked_of(
+        order,
+        width_px=width,
+        mesh=str(order.mesh or ""),
+        states=list(states),
+        **picked(order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])),
+    )
     # what cannot be built must fail before a folder is made
     plan = order.plan or _plan(rig, order)
     scenes = _scenes(rig, order, plan)
@@ -77,7 +69,6 @@ def _plan(rig: Rig, order: FlashOrder) -> Plan:
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
-
     seed = order.seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     power = max(powers, default=0.0) or 1.0

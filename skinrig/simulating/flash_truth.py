@@ -14,8 +14,6 @@ from skinrig.arrays import BoolArray
 from skinrig.simulating.orders import SimulationError
 
 WIDTHS_PX = {"small": 768, "full": 3024}
-
-
 MAX_STANCE_FRACTION = 0.5
 """Of the camera's distance: how far off the tile's place a face may stand, either way. Far beyond
 what a lens of f/11 shows with any sharpness."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, cast
 
 from capture.plan import Plan
@@ -25,10 +24,9 @@ from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.motion import PatchMotion
 from rigsim.skin_patch.stretch import size_for
 from rigsim.world.taped_skin import GripState
-from skinrig.simulating import subject_records
-from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
+from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
-from skinrig.simulating.orders import GradientOrder, Simulated, SimulationError, truth_folder
+from skinrig.simulating.orders import GradientOrder, Simulated, truth_folder
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
@@ -39,7 +37,6 @@ STRETCH_RANGE = (0.66, 1.4)
 """No simulated skin goes further before it buckles or comes off."""
 MAX_SHIFT_MM = 0.3
 """How far the patch may come to lie off the middle: five standard deviations of its motion."""
-MAX_LOG_LAG_S = 0.05
 
 
 def simulate_gradient(order: GradientOrder) -> Simulated:
@@ -48,18 +45,14 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
     plan = _plan(rig, order)
-    light = announce_light(plan, rig, order)
-    asked = {
-        "rig": "gradient",
-        "width_px": rig.views[0].width_px,
-        "subject": subject_records.of_manifest(order.subject),
-        "target": order.target or "",
-        "site": order.site or DEFAULT_SITE,
-        "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
-        "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
-        **({} if order.plan is None else {"plan": order.plan.to_json()}),
-        **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
-    }
+    light = driving.announce_light(plan, rig, order)
+    asked = driving.asked_of(
+        order,
+        width_px=rig.views[0].width_px,
+        site=order.site or DEFAULT_SITE,
+        angles=",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
+        steps="" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
+    )
     scene = make_scene(
         rig,
         order.target,
@@ -69,21 +62,16 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
         plan=plan,
         without=order.scene_switches(),
     )
-    session = open_session(order, plan, rig, asked, scene)
-    try:
-        log = GripLog(scene, truth_folder(order.out), resume=order.resume, session=session)
-    except BaseException:
-        session.release()
-        raise
-    rig_seconds = drive(
+    session, log = driving.open_logged(order, plan, rig, asked, scene, GripLog)
+    rig_seconds = driving.drive(
         order, session, rig, log, eyes="closed", force_limit_n=FORCE_LIMIT_N, run_id=log.run_id
     )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
+        driving.write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
     log.remove()
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _plan(rig: Rig, order: GradientOrder) -> Plan:
@@ -146,41 +134,15 @@ def make_scene(
 
 
 class GripLog(SceneLog):
-    """A scene that notes what the caliper held at every exposure, beside the session.
+    """A scene that notes what the caliper held at every exposure, beside the session."""
 
-    Parameters
-    ----------
-    scene
-        What the cameras see.
-    truth : Path
-        Where the truth will be; the log lies beside it until then.
-    resume : bool
-        Whether the session was begun before.
-    session : Session
-        Open.
-
-    Raises
-    ------
-    SimulationError
-        When frames were captured before and their log is gone.
-    """
-
+    suffix, kinds, max_lag_s = "grips", ("gradient",), 0.05
     lost = "the states captured before"
 
-    def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
-        path = truth.with_name(f".{truth.name}.grips.jsonl")
-        captured = bool(session.frames("gradient"))
-        super().__init__(scene, path, resume=resume, captured=captured)
-
-    def exposure(
-        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int, grip: Any
-    ) -> Any:
-        """Expose the scene, and note the grip of what is lit."""
-        if pops and grip.attached:
-            self.note(pops[0].t_on_s, {"grip": dataclasses.asdict(grip)})
-        return self._scene.exposure(
-            view_name, pops=pops, exposure_s=exposure_s, seed=seed, grip=grip
-        )
+    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
+        """Return the grip of what is lit."""
+        grip = exposed["grip"]
+        return {"grip": dataclasses.asdict(grip)} if grip.attached else None
 
     def grips(self, session: Session) -> list[Any]:
         """Return what was held in each state that the session has, in the plan's order."""
@@ -188,19 +150,13 @@ class GripLog(SceneLog):
         found = []
         for name, steps in states(session.plan):
             ids = {step.id for step in steps}
-            lit = [
+            lit = (
                 record
                 for record in session.frames("gradient")
                 if record.step_id in ids and record.settings["pattern"] != "dark"
-            ]
-            if not lit:
-                continue
-            run = int(str(lit[0].actual["token"]).partition(".")[0].removeprefix("sim"))
-            time_s = float(lit[0].line.t_box_s or 0.0)
-            near = [
-                e for e in entries if e["run"] == run and abs(e["t_s"] - time_s) < MAX_LOG_LAG_S
-            ]
-            if not near:
-                raise SimulationError(f"{self._path}: tells nothing of the state {name}")
-            found.append(GripState(**near[0]["grip"]))
+            )
+            if (first := next(lit, None)) is not None:
+                run_id = str(first.actual["token"]).partition(".")[0]
+                entry = self.at(entries, run_id, first, f"state {name}")
+                found.append(GripState(**entry["grip"]))
         return found

@@ -15,7 +15,7 @@ from capture.plan.gradient import GradientTarget
 from capture.plan.probe import ProbeTarget
 from capture.session import Subject
 from skinrig.capturing.sequences import SequenceOrder
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.simulating.leaving_out import left_out_of
 
 PICTURE_SIZES = ("small", "full")
@@ -52,6 +52,11 @@ class Simulated:
     effects: tuple[Mapping[str, Any], ...] = ()
     """What the scene built and what not, with reasons, see `rigsim.needs.effects.Effect`."""
 
+    @property
+    def truth_name(self) -> str:
+        """Name of the truth's folder; empty without one."""
+        return self.truth.name if self.truth else ""
+
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
@@ -59,8 +64,7 @@ class Simulated:
 
 def require_size(size: str) -> None:
     """Raise for a size that no simulation has."""
-    if size not in PICTURE_SIZES:
-        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(PICTURE_SIZES)}")
+    one_of("size", size, PICTURE_SIZES, SimulationError)
 
 
 def truth_folder(session: Path) -> Path:
@@ -124,20 +128,21 @@ class Order:
         width_px = getattr(self, "width_px", None)
         if width_px is not None and width_px < MIN_WIDTH_PX:
             raise SimulationError(f"width: got {width_px}, expected {MIN_WIDTH_PX} pixels or more")
-        if self.target is not None and self.target not in self.targets:
-            expected = ", ".join(self.targets)
-            raise SimulationError(f"target: got {self.target!r}, expected one of {expected}")
+        if self.target is not None:
+            one_of("target", self.target, self.targets, SimulationError)
         self.check()
         self.scene_switches()
 
     def check(self) -> None:
         """Raise where options do not go together."""
-        if self.plan is None:
-            return
-        if self.plan.rig != self.rig:
-            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
-        if self.not_at_rest is not None:
+        self.check_rig_of_plan()
+        if self.plan is not None and self.not_at_rest is not None:
             raise OptionsError("plan: is for a subject; targets and sequences have their own")
+
+    def check_rig_of_plan(self) -> None:
+        """Raise for a plan of another rig."""
+        if self.plan is not None and self.plan.rig != self.rig:
+            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
 
     @property
     def not_at_rest(self) -> str | None:
@@ -270,8 +275,7 @@ class DomeOrder(Order):
             )
         if self.plan is not None and (self.lights, self.views) != (None, None):
             raise OptionsError("lights, views: a plan names its own; leave them out")
-        if self.plan is not None and self.plan.rig != self.rig:
-            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
+        self.check_rig_of_plan()
         if self.target is None:
             return
         if self.state != "neutral":
@@ -365,8 +369,7 @@ def order_for(rig: str, **options: Any) -> Order:
     >>> order_for("dome", out=Path("session"), lights=12).rig
     'dome'
     """
-    if rig not in ORDER_BY_RIG:
-        raise SimulationError(f"rig: got {rig!r}, expected one of {', '.join(ORDER_BY_RIG)}")
+    one_of("rig", rig, ORDER_BY_RIG, SimulationError)
     own = {one.name for one in fields(ORDER_BY_RIG[rig])}
     foreign = {one.name: one for kind in ORDER_BY_RIG.values() for one in fields(kind)}
     for name in sorted(options.keys() & foreign.keys() - own):

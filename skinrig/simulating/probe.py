@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from capture.plan import Plan
@@ -24,14 +23,12 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import ProbeScene, Probing
 from rigsim.scenes.probe.truth import appearance as ground_truth
 from skinrig.capturing.plan_choice import directions_of
-from skinrig.simulating import subject_records
-from skinrig.simulating.driving import announce_light, drive, finish, open_session, write_truth
+from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
 
 TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
-MAX_LOG_LAG_S = 1e-3
 
 
 def simulate_probe(order: ProbeOrder) -> Simulated:
@@ -42,38 +39,30 @@ def simulate_probe(order: ProbeOrder) -> Simulated:
     """
     rig = load_rig("probe")
     plan = _plan(rig, order)
-    asked = {
-        "rig": "probe",
-        "size": order.size,
-        "subject": subject_records.of_manifest(order.subject),
-        "target": order.target or "",
-        "sites": ",".join(order.sites or PROBE_SITES),
-        "repeats": order.repeats,
-        "angles": directions_of(order.angles),
-        "all_brackets": order.all_brackets,
-        **({} if order.plan is None else {"plan": order.plan.to_json()}),
-    }
+    asked = driving.asked_of(
+        order,
+        size=order.size,
+        sites=",".join(order.sites or PROBE_SITES),
+        repeats=order.repeats,
+        angles=directions_of(order.angles),
+        all_brackets=order.all_brackets,
+    )
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
-    light = announce_light(plan, rig, order)
-    session = open_session(order, plan, rig, asked, scene)
-    try:
-        log = HeadLog(scene, truth_folder(order.out), resume=order.resume, session=session)
-    except BaseException:
-        session.release()
-        raise
+    light = driving.announce_light(plan, rig, order)
+    session, log = driving.open_logged(order, plan, rig, asked, scene, HeadLog)
     # nobody has to place the head: the box is told where it is, and with it the world
-    rig_seconds = drive(
+    rig_seconds = driving.drive(
         order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
     )
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
         appearance = ground_truth(scene, log.probings(session))
-        write_truth(truth, order, session, appearance, subject=order.subject)
+        driving.write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
-    return finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
@@ -133,61 +122,25 @@ class HeadLog(SceneLog):
     """A scene that notes under which suction the head was lit, beside the session.
 
     The gauge that a session records has a zero of its own; the truth needs the actual suction.
-
-    Parameters
-    ----------
-    scene
-        What the camera sees.
-    truth : Path
-        Where the truth will be; the log lies beside it until then.
-    resume : bool
-        Whether the session was begun before.
-    session : Session
-        Open.
-
-    Raises
-    ------
-    SimulationError
-        When frames were captured before and their log is gone.
     """
 
-    def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
-        path = truth.with_name(f".{truth.name}.heads.jsonl")
-        captured = any(session.frames(kind) for kind in ("fibres", PHANTOM_SITE))
-        super().__init__(scene, path, resume=resume, captured=captured)
+    suffix, kinds, max_lag_s = "heads", ("fibres", PHANTOM_SITE), 1e-3
 
-    def exposure(
-        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int, head: Any
-    ) -> Any:
-        """Expose the scene, and note the suction of what is lit."""
-        if pops:
-            self.note(pops[0].t_on_s, {"suction_mbar": head.suction_mbar})
-        return self._scene.exposure(
-            view_name, pops=pops, exposure_s=exposure_s, seed=seed, head=head
-        )
+    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the suction of what is lit."""
+        return {"suction_mbar": exposed["head"].suction_mbar}
 
     def probings(self, session: Session) -> list[Any]:
         """Return the placements that the session has series of, in the plan's order."""
         entries = self.read()
-        by_run: dict[int, list[tuple[float, float]]] = {}
-        for entry in entries:
-            row = (float(entry["t_s"]), float(entry["suction_mbar"]))
-            by_run.setdefault(int(entry["run"]), []).append(row)
         frames = {record.step_id: record for record in session.frames()}
         suctions: dict[Placement, list[float]] = {}
         for placement, steps in all_series(session.plan):
             for step in steps:
-                if step.kind == "mask" or step.id not in frames:
-                    continue
-                record = frames[step.id]
-                run = int(str(record.actual["run"]).removeprefix("sim"))
-                time_s = float(record.line.t_box_s or 0.0)
-                near = [
-                    mbar for t_s, mbar in by_run.get(run, []) if abs(t_s - time_s) < MAX_LOG_LAG_S
-                ]
-                if not near:
-                    raise SimulationError(f"{self._path}: tells nothing of the step {step.id}")
-                suctions.setdefault(placement, []).append(near[0])
+                if step.kind != "mask" and (record := frames.get(step.id)) is not None:
+                    run_id = str(record.actual["run"])
+                    entry = self.at(entries, run_id, record, f"step {step.id}")
+                    suctions.setdefault(placement, []).append(float(entry["suction_mbar"]))
         return [
             Probing(place.site, place.repeat, place.angle_deg, sum(found) / len(found))
             for place, found in suctions.items()

@@ -88,9 +88,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
         course: Any = PromptedCourse(sequence.state, seed=seed, **known)
     else:
         course = EventCourse(sequence.state, constant_s)
-    texels = (
-        TEXTURE_TEXELS_BY_WIDTH[0] if width <= MAX_COARSE_WIDTH_PX else TEXTURE_TEXELS_BY_WIDTH[1]
-    )
+    texels = TEXTURE_TEXELS_BY_WIDTH[int(width > MAX_COARSE_WIDTH_PX)]
     subject = subject_file.load_subject(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
@@ -153,10 +151,8 @@ def _write_truth(
     radius_px = DISC_RADIUS_FRACTION * session.rig.views[0].width_px / 2
     places = {pose: landmarks_at_superpixels(scene.landmarks_px(pose)) for pose in poses}
     points = {
-        pose: {
-            name: places[pose][of] for name, of in COURSE_LANDMARKS.items() if of in places[pose]
-        }
-        for pose in poses
+        pose: {name: at[of] for name, of in COURSE_LANDMARKS.items() if of in at}
+        for pose, at in places.items()
     }
     frames = []
     for record in session.frames("subject"):
@@ -164,15 +160,8 @@ def _write_truth(
         met = flashes.get(str(actual.get("token")))
         if met is None:
             continue
-        frames.append(
-            {
-                "step": record.step_id,
-                "time_s": actual.get("time_s"),
-                "phase_s": actual.get("phase_s"),
-                "level": met["level"],
-                "pose": met["pose"],
-            }
-        )
+        times = {"time_s": actual.get("time_s"), "phase_s": actual.get("phase_s")}
+        frames.append({"step": record.step_id, **times, "level": met["level"], "pose": met["pose"]})
     for pose in poses:
         chosen = [frame for frame in frames if frame["pose"] == pose]
         maps = scene.hemoglobin(pose, [float(frame["level"]) for frame in chosen])

@@ -21,13 +21,13 @@ from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.world.serve import serve
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.orders import OptionsError, SimulationError, require_size
-from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.resumption import shots_made
 from skinrig.simulating.subject_records import unused_subject_keys
 
 if TYPE_CHECKING:
@@ -66,9 +66,7 @@ class ServeOrder:
             raise UsageError(f"--tcp: got {self.tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
 
 
-def serve_rig(
-    rig_name: str, order: ServeOrder, console: Console, *, seconds: float | None = None
-) -> None:
+def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
 
     A dome is served with all its lights and cameras at either size: who captures from it uses the
@@ -84,23 +82,14 @@ def serve_rig(
         What is served.
     console
         With ``as_json`` the addresses are one JSON document, with the next step.
-    seconds
-        How long; None serves until Ctrl-C.
     """
     rig = load_rig(rig_name)
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
         raise OptionsError("site: only the gradient rig knows of it; leave it out")
     rig, scene = _served(rig, order)
-    with serve(
-        rig,
-        pty=order.pty,
-        tcp=order.tcp,
-        allow_remote=order.allow_remote,
-        seed=order.seed,
-        scene=scene,
-        shots_made=made,
-    ) as served:
+    asked = picked(order, "pty", "tcp", "allow_remote", "seed")
+    with serve(rig, scene=scene, shots_made=made, **asked) as served:
         after = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": after}
@@ -110,7 +99,7 @@ def serve_rig(
                 print(f"{name} {url}", flush=True)
         print(f"next: {after}\nCtrl-C ends it", file=sys.stderr)
         try:
-            served.wait(seconds)
+            served.wait()
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
             if console.as_json:  # its one document stands there already
@@ -165,7 +154,6 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
-
     scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
     scene.radiance("crossed")
@@ -173,13 +161,11 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
-
     person = subject_file.load_subject(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
-
     try:
         tissue = subject_file.tissue(subject, seed=seed)
     except probe_tissue.TissueError as error:

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 from typing import Any
 
-from skinrig.simulating.orders import (
-    DomeOrder,
-    FlashOrder,
-    GradientOrder,
-    Order,
-    ProbeOrder,
-    Simulated,
-    order_for,
-)
+from skinrig.simulating.orders import Order, Simulated, order_for
 
 
 def simulate(order: Order) -> Simulated:
@@ -29,24 +22,10 @@ def simulate(order: Order) -> Simulated:
     SimulationError
         For what the rig cannot simulate.
     """
-    match order:
-        case FlashOrder():
-            from skinrig.simulating.flash import simulate_flash
-
-            return simulate_flash(order)
-        case DomeOrder():
-            from skinrig.simulating.dome import simulate_dome
-
-            return simulate_dome(order)
-        case GradientOrder():
-            from skinrig.simulating.gradient import simulate_gradient
-
-            return simulate_gradient(order)
-        case ProbeOrder():
-            from skinrig.simulating.probe import simulate_probe
-
-            return simulate_probe(order)
-    raise TypeError(f"order: got {type(order).__name__}, expected one of a rig's")
+    # a module a rig, so that a run loads what its own rig needs
+    rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
+    done: Simulated = getattr(rig, f"simulate_{order.rig}")(order)
+    return done
 
 
 def simulate_session(rig: str, out: str | Path, **options: Any) -> Simulated:

@@ -21,6 +21,7 @@ from model.traits import TraitSpace, histogram_transport
 from model.traits.feasible_sets import Free, Histograms
 from model.traits.vectors import Contrast
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.errors import one_of
 
 VectorKind = Literal["quantiles", "histograms"]
 
@@ -55,10 +56,7 @@ class AlbedoTraits:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and vectors of another length."""
-        if self.kind not in VECTOR_KINDS:
-            raise AlbedoVectorError(
-                f"vectors: got {self.kind!r}, expected {' or '.join(VECTOR_KINDS)}"
-            )
+        one_of("vectors", self.kind, VECTOR_KINDS, AlbedoVectorError)
         if len(self.traits.center) != self.texture.size:
             raise AlbedoVectorError(
                 f"vectors: got {len(self.traits.center)} numbers, expected {self.texture.size}"
@@ -113,10 +111,8 @@ class AlbedoTraits:
 def encoded(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
     given = np.asarray(r_d, np.float64)
-    if kind == "histograms":
+    if one_of("vectors", kind, VECTOR_KINDS, AlbedoVectorError) == "histograms":
         return given
-    if kind != "quantiles":
-        raise AlbedoVectorError(f"vectors: got {kind!r}, expected {' or '.join(VECTOR_KINDS)}")
     return np.asarray(np.log(np.maximum(given, MIN_REFLECTANCE)))
 
 

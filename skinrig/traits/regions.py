@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from model.traits import storage as trait_storage
 from model.traits.storage import TraitLibrary
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from skinrig.traits.albedo_vectors import VECTOR_KINDS, AlbedoTraits, VectorKind
+from skinrig.appearances.contents import digest
+from skinrig.errors import one_of
+from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 
 SURFACE_SPACE: Final = "surface"
 ALBEDO_SPACE: Final = "albedo"
@@ -95,9 +97,8 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
         When its albedo traits come without the texture space that they are of.
     """
     told = library.parameters
-    kind = told.get("vectors", "histograms")
-    if kind not in VECTOR_KINDS:
-        raise TraitLibraryError(f"vectors: got {kind!r}, expected {' or '.join(VECTOR_KINDS)}")
+    stated = told.get("vectors", "histograms")
+    kind = one_of("vectors", stated, get_args(VectorKind), TraitLibraryError)
     frame = (
         CommonFrame.from_document(told["frame"])
         if isinstance(told.get("frame"), dict)
@@ -139,7 +140,7 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
         When none comes with it.
     """
     if path is not None:
-        return trait_storage.load(path), hashlib.sha256(path.read_bytes()).hexdigest()
+        return trait_storage.load(path), digest(path)
     packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE)
     if not packaged.is_file():
         raise TraitLibraryError(

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
-from reconstruction.correspondence import common_parameterization
+from reconstruction.correspondence import common_parameterization as parameterization
 from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
 from rigsim.light import surface_brdf
 from rigsim.population import conditions as skin_conditions
@@ -113,12 +113,8 @@ def mean_mixture(
     shape = (len(points), pairs)
     light, view = directions(shape, rng=rng), directions(shape, rng=rng)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    f = np.stack(
-        [
-            surface_brdf.evaluate(one, n, to, at)[0]
-            for one, n, to, at in zip(points, up, light, view, strict=True)
-        ]
-    ).astype(np.float64)
+    each = zip(points, up, light, view, strict=True)
+    f = np.stack([surface_brdf.evaluate(*one)[0] for one in each]).astype(np.float64)
     cosine = light[..., 2:]
     sigma = noise * (f * cosine + 0.02 / np.pi) / cosine
     f += sigma * rng.standard_normal(f.shape)
@@ -196,12 +192,8 @@ def lobe_changes(
 ) -> dict[str, LobeChange]:
     """Return the mean changes by several traits; see `lobe_change`."""
     light, view = directions((pairs,), rng=rng), directions((pairs,), rng=rng)
-    through = np.array(
-        [
-            surface_brdf.boundary_transmittance(one[2], other[2])
-            for one, other in zip(light, view, strict=True)
-        ]
-    )
+    heights = zip(light[:, 2], view[:, 2], strict=True)
+    through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])
     streams = [int(n) for n in rng.integers(2**31, size=len(before))]
 
     def mean(people: Sequence[Member]) -> Float64Array:
@@ -250,19 +242,19 @@ class CommonFaces:
         by_head = {person.head: person for person in members}
         faces = {head: person.face(size) for head, person in by_head.items()}
         marks = {head: face.landmarks_mm() for head, face in faces.items()}
-        names, places = common_parameterization.common_landmarks(list(marks.values()))
+        names, places = parameterization.common_landmarks(list(marks.values()))
         unrolled = [
-            common_parameterization.Cylinder(marks[head]["nose tip"]).unroll(
+            parameterization.Cylinder(marks[head]["nose tip"]).unroll(
                 face.atlas.position_mm[face.atlas.covered]
             )
             for head, face in faces.items()
         ]
-        frame = common_parameterization.frame_around(names, places, unrolled, size=common)
+        frame = parameterization.frame_around(names, places, unrolled, size=common)
         charts = {
-            head: common_parameterization.chart(
+            head: parameterization.chart(
                 face.atlas.position_mm,
                 face.atlas.covered,
-                common_parameterization.correspond(marks[head], frame),
+                parameterization.correspond(marks[head], frame),
                 frame,
             )
             for head, face in faces.items()

@@ -35,7 +35,8 @@ from skinrig.benchmarks.intervals.trials import (
     valid_of,
 )
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.evaluating.microrelief import compare_stretch, document_of, true_relief
+from skinrig.evaluating.microrelief import compare_stretch, true_relief
+from skinrig.evaluating.subsurface import document_of
 from skinrig.simulating.simulation import simulate_session
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}

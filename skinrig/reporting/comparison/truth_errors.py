@@ -10,7 +10,7 @@ import numpy as np
 from model.skin import SkinAppearance
 from skinrig.evaluating import flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
-from skinrig.evaluating.surface_bands import errors_by_band
+from skinrig.evaluating.surface import errors_by_band
 from skinrig.written_units import unit_sign
 
 

@@ -9,7 +9,7 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
-from skinrig.evaluating.subsurface import number
+from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import page
 from skinrig.reporting.map_names import state_words
 
@@ -28,7 +28,7 @@ def section(
     checks
         A judgement is added to it.
     """
-    document = evaluation.document_of(appearance, KERNEL_FILE)
+    document = document_of(appearance, KERNEL_FILE)
     if document is None or not document["fits"]:
         return
     fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])

@@ -14,6 +14,7 @@ from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
+from skinrig.evaluating.subsurface import document_of
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import state_words
 from skinrig.reporting.sections import kernel
@@ -166,7 +167,7 @@ def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
 def _strain(
     name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
 ) -> Iterator[page.Block]:
-    document = evaluation.document_of(appearance, STRAIN_FILE)
+    document = document_of(appearance, STRAIN_FILE)
     if document is None:
         return
     errors = [] if truth is None else evaluation.compare_stretch(appearance, truth)
@@ -180,7 +181,7 @@ def _strain(
 
 
 def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
-    document = evaluation.document_of(appearance, HISTOGRAM_FILE)
+    document = document_of(appearance, HISTOGRAM_FILE)
     if document is None:
         return
     states = sorted(document["states"], key=lambda state: _by_step(state["name"]))

@@ -12,7 +12,7 @@ from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX, FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
-from skinrig.evaluating.surface_bands import Banded, errors_by_band
+from skinrig.evaluating.surface import Banded, errors_by_band
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import heading, words
 from skinrig.written_units import unit_sign

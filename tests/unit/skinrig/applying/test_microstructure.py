@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -45,7 +46,7 @@ def test_a_patch_stretched_along_x_is_convolved_with_the_tables_kernels(rng):
     assert report.pixel_um == pytest.approx(1000.0 / 128.0, rel=1e-6)
     assert report.outside_share == 0.0
     assert report.covered_share == report.changed_share == 1.0
-    json.dumps(report.to_dict())
+    json.dumps(dataclasses.asdict(report))
 
 
 def test_neutral_weights_give_the_neutral_relief_to_the_bit(rng):

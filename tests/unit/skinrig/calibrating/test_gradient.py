@@ -11,11 +11,8 @@ from capture.calibration import store
 from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
-from skinrig.calibrating.gradient import (
-    GradientCalibratingError,
-    calibrate_gradient,
-    of_a_gradient_sphere,
-)
+from skinrig.calibrating.gradient import calibrate_gradient, of_a_gradient_sphere
+from skinrig.calibrating.outcome import CalibratingError
 
 RIG = load_rig("gradient").cropped(128)
 MADE = date(2026, 11, 21)
@@ -68,14 +65,14 @@ def test_a_monochrome_sensor_is_calibrated_by_levels_instead_of_a_flashs_power(t
 
 def test_sessions_without_the_target_are_told_how_to_make_one(tmp_path):
     for kind, target in (("lights", "ball"), ("polarization", "ball"), ("sensor", "flat")):
-        with pytest.raises(GradientCalibratingError, match=f"--target {target}"):
+        with pytest.raises(CalibratingError, match=f"--target {target}"):
             calibrate_gradient(kind, [Shelf()], tmp_path, MADE)
 
 
 def test_a_ball_that_was_never_lit_is_no_ball(tmp_path):
     dark = {"pattern": "dark", "level": 0.0, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", dark, np.full((128, 128), 64, np.uint16))]
-    with pytest.raises(GradientCalibratingError, match="level above 0"):
+    with pytest.raises(CalibratingError, match="level above 0"):
         calibrate_gradient("lights", [Shelf(frames=frames)], tmp_path, MADE)
 
 
@@ -83,12 +80,12 @@ def test_two_balls_two_rigs_and_other_kinds_are_refused(tmp_path):
     lit = {"pattern": "full", "level": 0.1, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", lit, np.full((128, 128), 64, np.uint16))]
     two = [Shelf(frames=frames, name="A"), Shelf(frames=frames, name="B")]
-    with pytest.raises(GradientCalibratingError, match="has moved"):
+    with pytest.raises(CalibratingError, match="has moved"):
         calibrate_gradient("lights", two, tmp_path, MADE)
     other = Shelf(dataclasses.replace(RIG, name="other"))
-    with pytest.raises(GradientCalibratingError, match="expected one rig"):
+    with pytest.raises(CalibratingError, match="expected one rig"):
         calibrate_gradient("lights", [Shelf(), other], tmp_path, MADE)
-    with pytest.raises(GradientCalibratingError, match="white"):
+    with pytest.raises(CalibratingError, match="white"):
         calibrate_gradient("white", [Shelf()], tmp_path, MADE)
 
 

@@ -10,7 +10,7 @@ from model import store
 from model.skin import SkinMap
 from model.skin_reflectance import lobes_of
 from model.traits.storage import load
-from skinrig.appearances import face_textures
+from skinrig.appearances import contents, face_textures
 from skinrig.cli import main
 from skinrig.drawing import png
 from skinrig.editing import edit as editing
@@ -58,9 +58,7 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     assert store.read(out).files == store.read(paths[0]).files
     record = store.read(out).parameters["edit"]
     assert record["traits"] == {"tan": 0.0, "oily": 0.0}
-    assert store.read(out).inputs["appearance"] == face_textures.digest(
-        paths[0] / store.DOCUMENT_FILE
-    )
+    assert store.read(out).inputs["appearance"] == contents.digest(paths[0] / store.DOCUMENT_FILE)
 
 
 def test_a_tan_darkens_by_what_it_did_in_the_population_and_only_the_albedo(source, library):

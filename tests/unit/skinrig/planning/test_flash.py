@@ -98,7 +98,7 @@ def test_where_no_light_tells_hemoglobin_none_is_left_out_as_if_it_were_reached(
         return replace(found, valid={**found.valid, "hemoglobin": none})
 
     monkeypatch.setattr(flash, "predict", blind)
-    told = flash.choose(rig, {"hemoglobin": 20.0})
+    told = flash.choose(rig, plans.PlanRequest({"hemoglobin": 20.0}))
     assert told.knobs["power"] == 1.0
     assert told.reasons
     assert not any("reaches" in why for _, why in told.left_out)
@@ -110,7 +110,7 @@ def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, 
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
     )
     with pytest.raises(plans.PlanningError, match="no crossed frame"):
-        flash.forecast(rig, bare, {})
+        flash.forecast(rig, bare, plans.PlanRequest())
     file = tmp_path / "plan.json"
     file.write_text(json.dumps(whole.to_json()))
     assert main(["plan", "gradient", "--forecast", str(file)]) == 3

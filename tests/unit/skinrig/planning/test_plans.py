@@ -38,7 +38,7 @@ def test_a_number_that_cannot_be_wanted_is_told_as_it_was_written():
 def test_errors_by_site_are_told_with_their_colors():
     rig = load_rig("flash")
     knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
-    choice = plans.Choice(rig, flash_plan(rig), (), 1.0, 2.0, knobs, ())
+    choice = plans.Choice(rig, flash_plan(rig), (), 2.0, knobs, ())
     told = plans.lines(choice)
     assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
 
@@ -51,7 +51,7 @@ def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
 def test_a_quantity_that_keeps_no_estimate_is_said_to_and_not_given_an_infinite_error():
     rig = load_rig("flash")
     told = plans.Forecast("hemoglobin", "%", math.inf, (math.inf, math.inf), 20.0)
-    choice = plans.Choice(rig, flash_plan(rig), (told,), 1.0, 2.0, {}, ())
+    choice = plans.Choice(rig, flash_plan(rig), (told,), 2.0, {}, ())
     first = plans.lines(choice)[0]
     assert "inf" not in first
     assert "hemoglobin keeps no estimate" in first

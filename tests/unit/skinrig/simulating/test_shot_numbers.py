@@ -9,7 +9,7 @@ from capture.devices.camera import Exposure, Trigger, open_camera
 from capture.rig import load_rig
 from capture.session import Session
 from rigsim.world.serve import serve
-from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.resumption import shots_made
 from skinrig.simulating.simulation import simulate_session
 
 

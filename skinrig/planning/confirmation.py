@@ -1,0 +1,67 @@
+"""A choice simulated, reconstructed and compared with its forecast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from model import store
+from reconstruction.pipeline import recipes as pipeline
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.planning.plans import Choice, planner
+from skinrig.simulating.simulation import simulate_session
+
+
+def confirmed(
+    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Simulate a choice, reconstruct it, and compare what came out with the forecast.
+
+    Parameters
+    ----------
+    choice
+        Of `skinrig.planning.plans.choose`.
+    out
+        Folder for sessions, calibration, maps.
+    subject, seed
+        The simulated face.
+    progress
+        Is told each step.
+    """
+    rig = planner(choice.rig.name)
+    steps = rig.rehearsal(choice)
+    for target, options in steps.targets.items():
+        progress(f"simulate {target}")
+        shown = out / f"session-{target}"
+        simulate_session(choice.rig.name, shown, target=target, seed=seed, **options)
+    calibration = out / "calibration"
+    for kind, targets in steps.calibrations:
+        calibrate(kind, [out / f"session-{target}" for target in targets], calibration)
+    progress(f"simulate the skin {subject}")
+    done = simulate_session(
+        choice.rig.name,
+        out / "session-face",
+        subject=subject,
+        seed=seed,
+        plan=choice.plan,
+        **steps.options,
+    )
+    progress("reconstruct")
+    pipeline.reconstruct(
+        done.session,
+        want=steps.want,
+        out=out / "appearance",
+        calibration=calibration,
+        truth=done.truth_name,
+    )
+    appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
+    measured = rig.measured(choice, appearance, truth, seed)
+    rows = []
+    for one in choice.forecasts:
+        if one.name in measured:
+            median, share = measured[one.name]
+            low, high = one.interval
+            found = {"median": median, "forecast": one.value, "within": low <= median <= high}
+            rows.append({"name": one.name, "unit": one.unit, **found, "valid_share": share})
+    return rows
