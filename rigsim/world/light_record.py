@@ -12,8 +12,6 @@ from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.boxes.probe import SourceLight
 
-__all__ = ["FlashPop", "LedPulse", "Light", "LightRecord", "PatternLight", "SourceLight"]
-
 Light = FlashPop | LedPulse | PatternLight | SourceLight
 """Light out of a box: a pop of the flash, or a stretch of an LED's, a pattern's or a fibre's."""
 
