@@ -114,21 +114,6 @@ class Hits:
     lens: LensPicture | None = None
     """How the lens spreads the rows' light; None: it is sharp everywhere."""
 
-    @property
-    def megabytes(self) -> float:
-        """Memory held by the rows."""
-        arrays = (
-            self.pixel,
-            self.first,
-            self.position_mm,
-            self.normal,
-            self.prim,
-            self.slot,
-            self.uv,
-            self.surface,
-        )
-        return sum(array.nbytes for array in arrays) / 1e6
-
     def scatter(self, rows: Float32Array) -> Float32Array:
         """Average rows over each pixel's covered part, shape (H, W, C); zero elsewhere."""
         count = np.diff(self.first)

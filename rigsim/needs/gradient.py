@@ -23,7 +23,7 @@ from rigsim.needs.effects import (
     decide,
     unmodeled,
 )
-from rigsim.needs.flash import (
+from rigsim.needs.face import (
     INTERREFLECTION_EFFECT,
     LATERAL_EFFECT,
     RELIEF_EFFECT,

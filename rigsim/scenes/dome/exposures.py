@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.scenes.exposing import LitLight, full_power_s
+from rigsim.scenes.exposing import Kept, LitLight, full_power_s
 from rigsim.sensor import Sensor, expose
 
 LED_POWER_DEVIATION: Final = 0.001
@@ -44,7 +44,10 @@ class Exposures:
     def __init__(self, dome: BuiltDome, *, seed: int) -> None:
         self._dome = dome
         self._seed = seed
-        self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+        # a capture comes back to each light in its next pass
+        self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
+            lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
+        )
 
     def expose(
         self,
@@ -87,18 +90,7 @@ class Exposures:
             if energy > 0.0:
                 middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
                 led = self._dome.answering(pulse.led)
-                light += np.float32(energy) * self._frame(view, led, middle, render)
+                light += np.float32(energy) * self._frames.get(
+                    (view.name, led, middle), partial(render, view, led, middle)
+                )
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
-
-    def _frame(
-        self, view: View, light: int, t_s: float, render: Callable[[View, int, float], Float32Array]
-    ) -> Float32Array:
-        key = (view.name, light, t_s)
-        if key not in self._frames:
-            # a capture comes back to each light in its next pass
-            most = max(KEPT_FRAMES, KEPT_FRAME_BYTES // (12 * view.width_px * view.height_px))
-            while len(self._frames) >= most:
-                self._frames.popitem(last=False)
-            self._frames[key] = render(view, light, t_s)
-        self._frames.move_to_end(key)
-        return self._frames[key]

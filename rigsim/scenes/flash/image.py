@@ -16,12 +16,12 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.olat import pixel_order
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.subsurface_radiance import SubsurfaceRadiance, spread_through_pigment, toward
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
 from rigsim.render.depth_of_field import LensPicture, LensSpread, before_focus
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
-from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
 RAYS_PER_BAND: Final = 1 << 21
@@ -157,17 +157,15 @@ class Look:
         dict
             Textures of shape (N, N[, 3]).
         """
-        melanin, blood = subject.melanin, subject.hemoglobin(state)
         camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
+        skin = SeenSkin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
-        blurred = spread_through_pigment(
-            subject, state, glow.reflectance, even, glow.kernels, camera, light
-        )
-        nearest = skin_color(camera, light).nearest(blurred, melanin, blood)
+        blurred = spread_through_pigment(skin, glow.reflectance, even, glow.kernels)
+        melanin, blood = skin.color.nearest(blurred, subject.melanin, skin.blood)
         return {
             "reflectance_blurred": blurred,
-            "melanin_blurred": nearest[0],
-            "hemoglobin_blurred": nearest[1],
+            "melanin_blurred": melanin,
+            "hemoglobin_blurred": blood,
         }
 
     def at_maps(

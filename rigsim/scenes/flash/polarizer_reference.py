@@ -7,6 +7,7 @@ traced, and both images come from it by closed forms.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from rigsim.as_built.polarizers import absorbing_axis
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.subsurface_radiance import toward
 from rigsim.render import Caster, g_buffer, look_at, radiance
+from rigsim.render.scene_radiance import perspective
 from rigsim.render.variant import choose_variant
 
 SPHERE_RADIUS_MM: Final = 80.0
@@ -179,21 +181,7 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 8},
-        "sensor": {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1e4,
-            "to_world": look_at(place, view.target_mm, up),
-            "film": {
-                "type": "hdrfilm",
-                "width": view.width_px,
-                "height": view.height_px,
-                "pixel_format": "luminance",
-                "rfilter": {"type": "box"},
-            },
-        },
+        "sensor": perspective(view, "luminance", up=up),
         "analyser": _film(place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg),
         "ball": {
             "type": "sphere",
@@ -224,8 +212,6 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
 
 def reference_rig(width_px: int) -> tuple[Rig, View]:
     """Return the flash rig and its camera cut to a square that the sphere fills."""
-    import dataclasses
-
     rig = load_rig("flash")
     view = rig.views[0]
     pixel_um = 2.2 * SPHERE_RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3

@@ -23,9 +23,9 @@ from rigsim.as_built.polarizers import Polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.light.lobe_moments import led_moments
-from rigsim.light.plastic import plastic_scale
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import Caster, MovedLight, look_at
+from rigsim.render import Caster, MovedLight
+from rigsim.render.scene_radiance import matt_plastic, perspective, plastic_scale, rough_metal
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA
@@ -181,51 +181,14 @@ def describe(
     """
     view = scene.rig.views[0]
     r_d = PATCH_ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
-    inside = {
-        "type": "plastic",
-        "int_ior": ETA,
-        "ext_ior": 1.0,
-        "specular_reflectance": 0.0,
-        "diffuse_reflectance": {"type": "rgb", "value": [float(r_d)] * 3},
-    }
+    inside = matt_plastic(ETA, {"type": "rgb", "value": [float(r_d)] * 3})
+    facets = rough_metal("ggx", ETA, float(np.median(scene.skin.alpha)))
+    glossy = {"type": "blendbsdf", "weight": 0.5, "inside": inside, "surface": facets}
     description: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
-        "sensor": {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1e4,
-            "to_world": look_at(view.position_mm, view.target_mm, view.up),
-            "sampler": {"type": "stratified", "sample_count": 4},
-            "film": {
-                "type": "hdrfilm",
-                "width": view.width_px,
-                "height": view.height_px,
-                "pixel_format": "luminance",
-                "rfilter": {"type": "box"},
-            },
-        },
-        "patch": {
-            "type": "mesh",
-            "mesh": relief_mesh(scene),
-            "bsdf": {
-                "type": "blendbsdf",
-                "weight": 0.5,
-                "inside": inside,
-                # a conductor without absorption reflects as a dielectric does
-                "surface": {
-                    "type": "roughconductor",
-                    "distribution": "ggx",
-                    "alpha": float(np.median(scene.skin.alpha)),
-                    "eta": ETA,
-                    "k": 0.0,
-                },
-            }
-            if gloss
-            else inside,
-        },
+        "sensor": perspective(view, "luminance", sampler="stratified"),
+        "patch": {"type": "mesh", "mesh": relief_mesh(scene), "bsdf": glossy if gloss else inside},
     }
     shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
     name = "light"  # the entry that `MovedLight` moves, to where it is

@@ -124,13 +124,6 @@ def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float
     return np.array([_amplitude(scene, Waves(float(p), slope)) / scale for p in periods_um])
 
 
-def resolved_period_um(least: float = 0.1) -> float:
-    """Return the period at which a part ``least`` of slopes is left, um, by interpolation."""
-    periods = np.array([60.0, 45.0, 36.0, 30.0, 26.0, 23.0, 21.0, 19.0])
-    left = slope_transfer(periods.tolist())
-    return float(1.0 / np.interp(least, left[::-1], 1.0 / periods[::-1]))
-
-
 def _amplitude(scene: WavyScene, waves: Waves) -> float:
     scene.show(waves)
     moments = scene.moments(NEUTRAL)

@@ -12,23 +12,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from capture.rig import Rig, RigError
+from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
 from rigsim.light.lobe_moments import Surface
-from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, Noise, SceneEffects
-from rigsim.needs.flash import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
+from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
-from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
+from rigsim.scenes.exposing import Kept, LitLight, RigScene, SceneError, full_power_s
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
 from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -83,7 +82,7 @@ class Pattern(LitLight, Protocol):
         """What each LED gave of what the pattern asks of it; empty: all of it."""
 
 
-class GradientScene:
+class GradientScene(RigScene):
     """One patch of skin or one target in the gradient rig.
 
     Parameters
@@ -93,8 +92,6 @@ class GradientScene:
     subject
         A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in the
         patch's place) or "dark" (a cap on the lens).
-    compensation
-        How stretched skin narrows, see `rigsim.skin_patch.stretch.deform`.
     films
         The polarizing films; None takes the rig's own, which its serial numbers decide.
     sphere
@@ -124,7 +121,6 @@ class GradientScene:
         rig: Rig,
         subject: MicroSkin | TargetName,
         *,
-        compensation: Literal["volume", "none"] | float = "volume",
         films: Polarizers | None = None,
         sphere: BuiltSphere | None = None,
         motion: PatchMotion | None = None,
@@ -144,22 +140,24 @@ class GradientScene:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if sectors < 4 or sectors % 4:
             raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
-        self.rig, self.subject, self.compensation = rig, subject, compensation
+        self.rig, self.subject = rig, subject
         self.films = draw_polarizers(rig) if films is None else films
         self.sphere = nominal_sphere(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
-        self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
+        self._lighting: Kept[tuple[float, ...], Lighting] = Kept(lambda _: KEPT_LIGHTINGS)
         # behind two ideal films, one of which the unit of radiance holds already
         white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
         # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
         self.unit = GRADIENT_METER_RATE_PER_S / (0.5 * white)
-        self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
-        self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
+        self._pictures: Kept[tuple[object, ...], Float32Array] = Kept(
+            lambda picture: KEPT_IMAGE_BYTES // picture.nbytes
+        )
+        self._reliefs: Kept[tuple[float, float], StretchedSkin] = Kept(lambda _: KEPT_RELIEFS)
         self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
-        self.needs: EffectSelection = gradient_needs(
+        self.needs = gradient_needs(
             rig,
             subject,
             self.sphere,
@@ -170,17 +168,10 @@ class GradientScene:
             effects=effects,
         )
         """What is built, what is not, and why."""
-        self.shadows, self.optics = (
-            self.needs.builds(SHADOW_EFFECT),
-            self.needs.builds(OPTICS_EFFECT),
-        )
+        self.shadows = self.needs.builds(SHADOW_EFFECT)
+        self.optics = self.needs.builds(OPTICS_EFFECT)
         self.lateral = self.needs.builds(LATERAL_EFFECT)
         self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
 
     @property
     def lens(self) -> Lens:
@@ -189,7 +180,7 @@ class GradientScene:
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the camera's sensor."""
-        self._check_view(view_name)
+        self._camera(view_name)
         return self._sensor
 
     # pictures -----------------------------------------------------------------------------------
@@ -316,7 +307,7 @@ class GradientScene:
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        self._check_view(view_name)
+        self._camera(view_name)
         rng = np.random.default_rng([self.seed, seed])
         light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
         for pop in pops:
@@ -365,14 +356,7 @@ class GradientScene:
         """Return the skin in a state, in its own frame."""
         skin = self.skin
         key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
-        if key not in self._reliefs:
-            while len(self._reliefs) >= KEPT_RELIEFS:
-                self._reliefs.popitem(last=False)
-            self._reliefs[key] = deform(
-                skin, stretch=key[0], angle_deg=key[1], compensation=self.compensation
-            )
-        self._reliefs.move_to_end(key)
-        return self._reliefs[key]
+        return self._reliefs.get(key, lambda: deform(skin, stretch=key[0], angle_deg=key[1]))
 
     def pose(self, grip: Grip) -> Pose:
         """Return where the skin lies in a state, drift and jumps aside."""
@@ -381,13 +365,6 @@ class GradientScene:
         return self.motion.pose(grip.angle_deg, grip.step)
 
     # inside -------------------------------------------------------------------------------------
-
-    def _check_view(self, name: str | None) -> None:
-        if name is not None:
-            try:
-                self.rig.view(name)
-            except RigError as error:
-                raise SceneError(str(error)) from error
 
     @property
     def skin(self) -> MicroSkin:
@@ -441,17 +418,16 @@ class GradientScene:
             key: tuple[object, ...] = (*held, grip.attached, grip.buckled, *jump_mm, shares)
         else:
             key = (self.subject, shares)
-        if key not in self._pictures:
+
+        def make() -> Float32Array:
             if isinstance(self.subject, MicroSkin) and grip is not None:
                 picture = self._render(grip, jump_mm, shares)
             else:
                 picture = self._target(shares)
             picture *= np.float32(self.unit)
-            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_IMAGE_BYTES:
-                self._pictures.popitem(last=False)
-            self._pictures[key] = picture
-        self._pictures.move_to_end(key)
-        return self._pictures[key]
+            return picture
+
+        return self._pictures.get(key, make)
 
     def _render(
         self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
@@ -479,10 +455,9 @@ class GradientScene:
         shares
             What each LED gives of what the sphere says; empty: all of it.
         """
-        if shares not in self._lighting:
-            while len(self._lighting) >= KEPT_LIGHTINGS:
-                self._lighting.popitem(last=False)
-            self._lighting[shares] = light_skin(
+
+        def make() -> Lighting:
+            return light_skin(
                 self.skin,
                 self._lit(shares),
                 self.optical_surface(float(np.median(self.skin.alpha))),
@@ -492,8 +467,8 @@ class GradientScene:
                 lateral=self.lateral,
                 furrow_sectors=FURROW_SECTORS if self.interreflections else 0,
             )
-        self._lighting.move_to_end(shares)
-        return self._lighting[shares]
+
+        return self._lighting.get(shares, make)
 
     def _lit(self, shares: tuple[float, ...]) -> BuiltSphere:
         if not shares:
