@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from capture.devices.wire import Code
+from rigsim.package_data import package_table
 
 _NUMBER_PATTERN = re.compile(r"-?[0-9]{1,9}(\.[0-9]{1,9})?")
 _WORD_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,48}")
@@ -78,14 +76,10 @@ class Command:
     """What it does, in one line."""
 
 
-@cache
-def _manuals() -> dict[str, dict[str, dict[str, Any]]]:
-    return tomllib.loads((files("rigsim") / "data" / "box_commands.toml").read_text("utf-8"))
-
-
 def command_table(kind: str, acts: Mapping[str, Act]) -> dict[str, Command]:
     """Return the commands of a kind of box, in its manual's order, each with what it does."""
-    return {header: Command(acts[header], **row) for header, row in _manuals()[kind].items()}
+    rows = package_table("box_commands")[kind]
+    return {header: Command(acts[header], **row) for header, row in rows.items()}
 
 
 def number(text: str, low: float, high: float, unit: str) -> float:

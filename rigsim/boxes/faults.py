@@ -11,9 +11,10 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from capture.documents import near_miss
+from rigsim.package_data import package_table
 
 Probability: TypeAlias = float
 """From 0 to 1."""
@@ -225,54 +226,4 @@ class FaultKind:
     """What is promised then."""
 
 
-FAULT_CATALOG: tuple[FaultKind, ...] = (
-    FaultKind(1, "byte lost", ("drop",), "retried, done once"),
-    FaultKind(2, "bit flipped", ("flip",), "NAK or retried, done once"),
-    FaultKind(3, "line cut or glued to the next", ("glue", "cut"), "retried, done once"),
-    FaultKind(4, "answer late, after the timeout", ("late", "late_s"), "stale answers thrown away"),
-    FaultKind(5, "answer lost after the act", ("lose_answer",), "answer replayed, done once"),
-    FaultKind(6, "line twice", ("duplicate",), "done once"),
-    FaultKind(7, "babble or boot banner at any time", ("babble",), "thrown away"),
-    FaultKind(8, "reset when the port is opened", ("reset_on_open", "boot_s"), "hello waits"),
-    FaultKind(9, "reset without a word", ("reset_after", "brownout"), "BoxRebooted, dark"),
-    FaultKind(10, "cable pulled", ("unplug_after", "replug_after"), "LinkLost, reopen"),
-    FaultKind(11, "two hosts on one port", (), "PortBusy for the second"),
-    FaultKind(12, "box takes no bytes", ("stall_after", "stall_s"), "retried or PortTimeout"),
-    FaultKind(13, "host frozen or killed with a light on", (), "dark within the lease"),
-    FaultKind(14, "wrong box or firmware", ("serial", "protocol"), "WrongDevice"),
-    FaultKind(
-        15,
-        "lamp or LED dead or weak, driver too hot",
-        ("lamp_dead", "led_dead", "led_weak", "heat"),
-        "refused -240 or 102, dead LEDs named; weak ones are left to calibration",
-    ),
-    FaultKind(16, "flash not charged, or misfire", ("slow_charge", "misfire"), "-213 or -240"),
-    FaultKind(
-        17,
-        "stepper stalls, home missed, force trip, force sensor dead, stop opened",
-        ("jaw_stall", "home_missed", "skin_stiff", "force_dead", "interlock_after"),
-        "the move ends and says why, or is refused 106, 107 or -240; no force beyond its limit",
-    ),
-    FaultKind(
-        18,
-        "pump leaks or is dead, head comes off, gauge dead, shutter stuck, camera warm",
-        (
-            "pump_leak",
-            "pump_dead",
-            "head_lifts_after",
-            "gauge_dead_after",
-            "shutter_stuck",
-            "shutter_jam",
-            "camera_warms_after",
-        ),
-        "vented and shut and the event says why, or refused -240; gauge and thermometer tell the "
-        "rest",
-    ),
-    FaultKind(
-        19,
-        "camera: stale, lost, foreign or wrongly exposed frame, clock drift",
-        ("stale", "drop_frame", "wrong_camera", "wrong_exposure", "drift_ppm"),
-        "frame not accepted, step taken again",
-    ),
-    FaultKind(20, "disk full or torn, program killed", (), "session resumes"),
-)
+FAULT_CATALOG: Final = tuple(FaultKind(**kind) for kind in package_table("faults")["faults"])
