@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.light.led_light import lobe_exponent
 
 MAX_TILT_DEG: Final = 70.0
 """Tilt of normals up to which the table is used."""
@@ -103,12 +104,7 @@ def irradiance_share(
     square = np.einsum("ni,ni->n", way, way)
     to_light = way / np.sqrt(square)[:, None]
     off = np.clip(to_light @ (place / np.linalg.norm(place)), 0.0, 1.0)
-    half_deg = sphere.nominal.lights[led].half_intensity_deg
-    lobe = (
-        1.0
-        if half_deg is None
-        else off ** (math.log(0.5) / math.log(math.cos(math.radians(half_deg))))
-    )
+    lobe = off ** lobe_exponent(sphere.nominal.lights[led])
     return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
 
 

@@ -13,18 +13,8 @@ from typing import Any
 import numpy as np
 
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.light.olat import (
-    BARE_COLUMNS,
-    DISC_POINTS,
-    ETA_COLUMN,
-    MAX_FUZZ,
-    UINT16_FULL_SCALE,
-    Hits,
-    Lamp,
-    disc_points,
-    lift,
-    sum_rows,
-)
+from rigsim.light.olat import DISC_POINTS, Hits, Lamp, disc_points, lift, sum_rows
+from rigsim.light.olat_kernels import BARE_COLUMNS, ETA_COLUMN, MAX_FUZZ, UINT16_FULL_SCALE
 from rigsim.light.surface_brdf import (
     ETA_OIL,
     FUZZ_ALBEDO,

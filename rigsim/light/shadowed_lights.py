@@ -10,8 +10,9 @@ from numba import njit, prange
 
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.light.led_light import lobe_exponent
 from rigsim.light.lobe_moments import Surface
-from rigsim.shading import entry_one, specular_one
+from rigsim.shading_kernels import entry_one, specular_one
 
 
 class Elements(Protocol):
@@ -68,10 +69,7 @@ def remove_hidden(
     distance = float(np.linalg.norm(place))
     elevation = math.asin(min(max(float(place[2]) / distance, -1.0), 1.0))
     radius = float(sphere.radius_mm[led]) / distance
-    half_deg = sphere.nominal.lights[led].half_intensity_deg
-    exponent = (
-        0.0 if half_deg is None else math.log(0.5) / math.log(math.cos(math.radians(half_deg)))
-    )
+    exponent = lobe_exponent(sphere.nominal.lights[led])
     first, second, between = horizon
     _remove(
         packed.reshape(len(packed), -1),

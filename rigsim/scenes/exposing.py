@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from capture.rig import Rig, RigError, View
 from rigsim.needs.effects import EffectSelection, Noise, SceneEffects
@@ -13,6 +13,7 @@ from rigsim.render import Caster
 from rigsim.sensor import Sensor, sensor_of
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
+from rigsim.world.light_record import SwitchedLight
 
 KeyT = TypeVar("KeyT")
 ValueT = TypeVar("ValueT")
@@ -22,23 +23,7 @@ class SceneError(ValueError):
     """A scene is asked for something that it does not hold."""
 
 
-class LitLight(Protocol):
-    """A stretch of steady light, as the world reports it, clipped to the exposure."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
-
-
-def full_power_s(light: LitLight, name: str) -> float:
+def full_power_s(light: SwitchedLight, name: str) -> float:
     """Return for how long full power would give the light of a stretch, s.
 
     Parameters

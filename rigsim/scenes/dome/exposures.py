@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.scenes.exposing import Kept, LitLight, full_power_s
+from rigsim.boxes.dome import LedPulse
+from rigsim.scenes.exposing import Kept, full_power_s
 from rigsim.sensor import Sensor, expose
 
 LED_POWER_DEVIATION: Final = 0.001
@@ -20,14 +21,6 @@ LED_POWER_DEVIATION: Final = 0.001
 KEPT_FRAMES: Final = 16
 KEPT_FRAME_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
-
-
-class Pulse(LitLight, Protocol):
-    """A lit LED, as the world reports it, clipped to the exposure."""
-
-    @property
-    def led(self) -> int:
-        """Index of the light in the rig."""
 
 
 class Exposures:
@@ -55,7 +48,7 @@ class Exposures:
         sensor: Sensor,
         render: Callable[[View, int, float], Float32Array],
         *,
-        pops: Sequence[Pulse],
+        pops: Sequence[LedPulse],
         exposure_s: float,
         seed: int,
         instant: Callable[[float], float],

@@ -27,6 +27,7 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
+from rigsim.boxes.dome import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import interreflection_for
@@ -34,6 +35,7 @@ from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
 from rigsim.light.olat import Hits, Lamp
+from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
@@ -52,7 +54,7 @@ from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome import views as dome_views
-from rigsim.scenes.dome.exposures import Exposures, Pulse
+from rigsim.scenes.dome.exposures import Exposures
 from rigsim.scenes.dome.rows import DomeRows
 from rigsim.scenes.dome.subsurface_radiance import DomeSubsurfaceRadiance
 from rigsim.scenes.exposing import FaceScene, SceneError
@@ -242,7 +244,7 @@ class DomeScene(FaceScene):
         return out
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -397,11 +399,11 @@ class DomeScene(FaceScene):
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
         glow = None
-        if self._glow is not None and hits.kind == olat.SKIN_ROWS:
+        if self._glow is not None and hits.kind == SKIN_ROWS:
             glow = self._glow.on_rows(hits, lamp, view, light, t_s)
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
-        if hits.kind == olat.SKIN_ROWS and caster.scene is not None:
+        if hits.kind == SKIN_ROWS and caster.scene is not None:
             rows = self._rows.vector_light(view, t_s, hits, caster)
             return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
         visible = olat.seen_from(hits, caster, lamp)
@@ -409,9 +411,9 @@ class DomeScene(FaceScene):
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return which part of a light the texture's relief leaves to each row."""
-        if self._relief is None or hits.kind != olat.SKIN_ROWS:
+        if self._relief is None or hits.kind != SKIN_ROWS:
             return None
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
+        uv = hits.texture_uv()
         return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
 

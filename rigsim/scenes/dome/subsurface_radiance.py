@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from capture.rig import View
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import sample
-from rigsim.light import olat
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.olat import Hits, Lamp
 from rigsim.scenes.exposing import Kept
@@ -71,5 +70,5 @@ class DomeSubsurfaceRadiance:
             return unit, np.asarray(glow / unit, np.float16)
 
         unit, kept = self._kept.get((camera, light, t_s), lit)
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
+        uv = hits.texture_uv()
         return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
+from rigsim.boxes.dome import LedPulse
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
 from rigsim.package_data import package_table
-from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION, Pulse
+from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene
 from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate
@@ -140,7 +141,7 @@ class TargetScene(RigScene):
         self.pose = pose
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 

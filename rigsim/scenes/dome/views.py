@@ -12,6 +12,7 @@ from rigsim.arrays import Float32Array, Int32Array
 from rigsim.geometry.atlas import sample
 from rigsim.light import olat
 from rigsim.light.olat import Hits
+from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS
 from rigsim.render import Caster, GBuffer
 from rigsim.targets import Target
 
@@ -79,7 +80,7 @@ def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
         view,
         look_up,
         subpixels=how.subpixels,
-        kind=olat.METAL_ROWS if target.kind == "metal" else olat.MATT_ROWS,
+        kind=METAL_ROWS if target.kind == "metal" else MATT_ROWS,
         distortion=how.distortion,
         illuminant=how.illuminant if how.optics else None,
     )

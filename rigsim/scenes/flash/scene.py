@@ -12,7 +12,7 @@ behind crossed films, whatever stands there later.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
+from rigsim.boxes.flash import FlashPop
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral import line_spread_mm
@@ -68,26 +69,6 @@ FLAT_LEVEL: Final = 0.9
 
 POP_ENERGY_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy from pop to pop."""
-
-
-class Pop(Protocol):
-    """A fired flash, as the world reports it."""
-
-    @property
-    def token(self) -> object:
-        """What the host called it."""
-
-    @property
-    def power(self) -> float:
-        """Fraction of full energy, 0 to 1."""
-
-    @property
-    def polarizer(self) -> str:
-        """State of the analyser: "parallel" or "crossed"."""
-
-    @property
-    def analyser_deg(self) -> float | None:
-        """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
 
 
 class FlashScene(FaceScene):
@@ -221,7 +202,7 @@ class FlashScene(FaceScene):
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pop], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 

@@ -19,12 +19,13 @@ from numpy.typing import ArrayLike
 from capture.rig import load_rig
 from rigsim.arrays import Float64Array
 from rigsim.needs.effects import SceneEffects
-from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import PatchSurface, sample_grid, stand
 from rigsim.scenes.gradient.reference import NEUTRAL
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import Pose
 from rigsim.skin_patch.stretch import SurfaceSample
+from rigsim.world.taped_skin import GripState
 
 LONG_UM: Final = 240.0
 """Period of waves without lens and pixels that give the scale of the others."""
@@ -80,7 +81,7 @@ class WavyScene(GradientScene):
 
     def surface(
         self,
-        grip: Grip,
+        grip: GripState,
         *,
         subpixels: int = 1,
         border_px: int = 0,

@@ -13,38 +13,37 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
 from capture.rig import Rig
-from rigsim import shading
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
+from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.light.lobe_moments import Surface
 from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
-from rigsim.scenes.exposing import Kept, LitLight, RigScene, SceneError, full_power_s
+from rigsim.scenes.exposing import Kept, RigScene, SceneError, full_power_s
+from rigsim.scenes.gradient.analyser import GridAnalyser
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
-from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.target import target_moments
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
 from rigsim.skin_patch.stretch import StretchedSkin, deform
-from rigsim.targets.glass_ball import ball_center_mm, ball_stokes
 from rigsim.tissue.skin_layers import ETA
+from rigsim.world.taped_skin import GripState
 
 TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
 GRADIENT_METER_RATE_PER_S: Final = 100.0
 """Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
 full scale."""
-
-FLAT_REFLECTANCE: Final = 0.3
-"""Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
 
 PATTERN_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of the LEDs' common energy from pattern to pattern."""
@@ -64,22 +63,6 @@ FURROW_SECTORS: Final = 16
 
 KEPT_RELIEFS: Final = 4
 """Stretched patches that are kept."""
-
-
-class Pattern(LitLight, Protocol):
-    """A stretch of light, see `rigsim.boxes.gradient_sphere.PatternLight`."""
-
-    @property
-    def pattern(self) -> str:
-        """One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`."""
-
-    @property
-    def analyser_deg(self) -> float:
-        """Reading of the analyser's rotator, degrees."""
-
-    @property
-    def led_shares(self) -> tuple[float, ...]:
-        """What each LED gave of what the pattern asks of it; empty: all of it."""
 
 
 class GradientScene(RigScene):
@@ -156,7 +139,7 @@ class GradientScene(RigScene):
             lambda picture: KEPT_IMAGE_BYTES // picture.nbytes
         )
         self._reliefs: Kept[tuple[float, float], StretchedSkin] = Kept(lambda _: KEPT_RELIEFS)
-        self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
+        self._analyser = GridAnalyser(self.films, self._view)
         self.needs = gradient_needs(
             rig,
             subject,
@@ -185,7 +168,7 @@ class GradientScene(RigScene):
 
     # pictures -----------------------------------------------------------------------------------
 
-    def stokes(self, grip: Grip | None = None) -> Float32Array:
+    def stokes(self, grip: GripState | None = None) -> Float32Array:
         """Return the light on the sensor for each moment, before the analyser.
 
         Parameters
@@ -204,7 +187,7 @@ class GradientScene(RigScene):
         border = (wide.shape[1] - h) // 2
         return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
 
-    def moments(self, grip: Grip | None = None) -> dict[str, Float32Array]:
+    def moments(self, grip: GripState | None = None) -> dict[str, Float32Array]:
         """Return the four moments behind the parallel and the crossed analyser.
 
         Parameters
@@ -220,7 +203,7 @@ class GradientScene(RigScene):
         """
         stokes = self.stokes(grip)
         return {
-            name: np.stack([self._analysed(s, reading) for s in stokes])
+            name: np.stack([self._analyser.analyse(s, reading) for s in stokes])
             for name, reading in (("parallel", 0.0), ("crossed", 90.0))
         }
 
@@ -228,7 +211,7 @@ class GradientScene(RigScene):
         self,
         pattern: str,
         *,
-        grip: Grip | None = None,
+        grip: GripState | None = None,
         analyser_deg: float = 0.0,
         t_s: float | None = None,
         led_shares: tuple[float, ...] = (),
@@ -271,7 +254,7 @@ class GradientScene(RigScene):
         )
         for m in np.flatnonzero(weights):
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
-        image = self._analysed(stokes, analyser_deg, border_px=reach)
+        image = self._analyser.analyse(stokes, analyser_deg, border_px=reach)
         if reach:
             pixel_um = self.lens.pixel_on_subject_um
             image = shifted(image, drift, pixel_um=pixel_um, border_px=reach)
@@ -282,10 +265,10 @@ class GradientScene(RigScene):
         self,
         view_name: str,
         *,
-        pops: Sequence[Pattern],
+        pops: Sequence[PatternLight],
         exposure_s: float,
         seed: int,
-        grip: Grip | None = None,
+        grip: GripState | None = None,
     ) -> UInt16Array:
         """Expose the camera once.
 
@@ -331,7 +314,7 @@ class GradientScene(RigScene):
 
     def surface(
         self,
-        grip: Grip,
+        grip: GripState,
         *,
         subpixels: int = 1,
         border_px: int = 0,
@@ -352,13 +335,13 @@ class GradientScene(RigScene):
             alpha=float(np.median(skin.alpha)),
         )
 
-    def relief(self, grip: Grip) -> StretchedSkin:
+    def relief(self, grip: GripState) -> StretchedSkin:
         """Return the skin in a state, in its own frame."""
         skin = self.skin
         key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
         return self._reliefs.get(key, lambda: deform(skin, stretch=key[0], angle_deg=key[1]))
 
-    def pose(self, grip: Grip) -> Pose:
+    def pose(self, grip: GripState) -> Pose:
         """Return where the skin lies in a state, drift and jumps aside."""
         if self.motion is None:
             return Pose(0.0, 0.0, 0.0)
@@ -373,37 +356,9 @@ class GradientScene(RigScene):
             raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
         return self.subject
 
-    def _analysed(
-        self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
-    ) -> Float32Array:
-        """Apply the analyser to Stokes vectors of shape (3, H, W)."""
-        cos2, sin2 = self._frame(reading_deg, border_px)
-        leak = 1.0 / self.films.analyser_extinction
-        turned = stokes[1] * cos2 + stokes[2] * sin2
-        return np.asarray(
-            np.float32(0.5 * (1.0 + leak)) * stokes[0] + np.float32(0.5 * (1.0 - leak)) * turned
-        )
-
-    def _frame(self, reading_deg: float, border_px: int) -> tuple[Float32Array, Float32Array]:
-        key = (reading_deg, border_px)
-        if key not in self._frames:
-            if len(self._frames) >= 4:
-                self._frames.clear()
-            passes_deg = self.films.passes_deg(self._view, "parallel", reading_deg)
-            x, y = sample_grid(self._view, subpixels=1, border_px=border_px)
-            right, up, _ = self._view.axes
-            to_camera = np.empty((len(y), len(x), 3), np.float32)
-            to_camera[..., 0], to_camera[..., 1] = -x[None, :], -y[:, None]
-            to_camera[..., 2] = self._view.distance_mm
-            to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
-            self._frames[key] = shading.analyser_frame(
-                to_camera, passes_deg=passes_deg, image_right=right, image_up=up
-            )
-        return self._frames[key]
-
     def _picture(
         self,
-        grip: Grip | None,
+        grip: GripState | None,
         *,
         jump_mm: tuple[float, float] = (0.0, 0.0),
         shares: tuple[float, ...] = (),
@@ -414,8 +369,7 @@ class GradientScene(RigScene):
         if isinstance(self.subject, MicroSkin):
             if grip is None:
                 raise SceneError("grip: got none, expected what the caliper holds")
-            held = (grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch)
-            key: tuple[object, ...] = (*held, grip.attached, grip.buckled, *jump_mm, shares)
+            key: tuple[object, ...] = (grip, *jump_mm, shares)
         else:
             key = (self.subject, shares)
 
@@ -423,14 +377,19 @@ class GradientScene(RigScene):
             if isinstance(self.subject, MicroSkin) and grip is not None:
                 picture = self._render(grip, jump_mm, shares)
             else:
-                picture = self._target(shares)
+                sphere, extinction = self._lit(shares), self.films.light_extinction
+                picture = target_moments(
+                    str(self.subject), self._view, sphere, extinction, seed=self.seed
+                )
+                if self.subject == "ball" and self.optics:
+                    picture = blur(picture, self.lens, averaged=True)
             picture *= np.float32(self.unit)
             return picture
 
         return self._pictures.get(key, make)
 
     def _render(
-        self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
+        self, grip: GripState, jump_mm: tuple[float, float], shares: tuple[float, ...]
     ) -> Float32Array:
         s = self.subpixels
         margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
@@ -482,24 +441,6 @@ class GradientScene(RigScene):
         return Surface(
             alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
         )
-
-    def _target(self, shares: tuple[float, ...]) -> Float32Array:
-        sphere = self._lit(shares)
-        if self.subject == "ball":
-            raw = ball_stokes(
-                self._view,
-                sphere,
-                extinction=self.films.light_extinction,
-                center_mm=ball_center_mm(self.seed),
-            )
-            return blur(raw, self.lens, averaged=True) if self.optics else raw
-        out = np.zeros((12, self._view.height_px, self._view.width_px), np.float32)
-        if self.subject == "flat":
-            x, y = sample_grid(self._view, subpixels=1, border_px=0)
-            out[::3] = FLAT_REFLECTANCE * diffuser_radiance(
-                sphere, x[None, :], y[:, None], extinction=self.films.light_extinction
-            )
-        return out
 
 
 def _weights(pattern: str) -> tuple[float, float, float, float]:

@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -20,11 +20,12 @@ from capture.rig import Rig
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
+from rigsim.boxes.probe import SourceLight
 from rigsim.fiber.probe_profile import Profile, Profiles
 from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
 from rigsim.needs.effects import Noise
 from rigsim.needs.probe import probe_needs
-from rigsim.scenes.exposing import LitLight, RigScene, SceneError, full_power_s
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.world.suction import HeadState
 
@@ -52,14 +53,6 @@ CAP_SITE: Final = "cap"
 LENS_VIGNETTING: Final = 0.1
 PHOTONS_PER_ANGLE: Final = 200_000
 """Photons for each site and angle."""
-
-
-class Light(LitLight, Protocol):
-    """A stretch of light, see `rigsim.boxes.source_shutter.SourceLight`."""
-
-    @property
-    def fibre(self) -> int | None:
-        """Number of the only detection fibre that is not covered; None: none is covered."""
 
 
 class ProbeScene(RigScene):
@@ -192,7 +185,7 @@ class ProbeScene(RigScene):
         self,
         view_name: str,
         *,
-        pops: Sequence[Light],
+        pops: Sequence[SourceLight],
         exposure_s: float,
         seed: int,
         head: HeadState,
