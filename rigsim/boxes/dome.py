@@ -17,19 +17,12 @@ from dataclasses import dataclass
 
 from capture.devices.wire import Code
 from capture.rig import Rig
+from rigsim.boxes import led_table
 from rigsim.boxes.command import Act, Command, Refused, command_table, number, whole
 from rigsim.boxes.eye_guard import Lit
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import (
-    LEVEL_STEPS,
-    Row,
-    Switch,
-    lit_by,
-    parse_leds,
-    parse_rows,
-    switches,
-)
+from rigsim.boxes.led_table import LEVEL_STEPS, Row, Switch
 
 DEFAULT_LED_MS = 100.0
 
@@ -91,7 +84,7 @@ class DomeUnit(LedSequencer[Row]):
     # sequence ---------------------------------------------------------------------------------
 
     def _parse_rows(self, text: str) -> list[Row]:
-        return parse_rows(
+        return led_table.parse_rows(
             text,
             count=self.bank.count,
             at_once=self._limits.max_at_once,
@@ -100,11 +93,11 @@ class DomeUnit(LedSequencer[Row]):
         )
 
     def _lit_by(self, rows: Sequence[Row], now: float) -> list[Lit]:
-        return lit_by(rows, now, overlap_s=self._limits.overlap_s)
+        return led_table.lit_by(rows, now, overlap_s=self._limits.overlap_s)
 
     def _schedule(self, rows: Sequence[Row]) -> list[Switch]:
         limits = self._limits
-        return switches(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
+        return led_table.switches(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
 
     def _switch_light(self, run: Run[Row], switch: Switch, now: float) -> None:
         row = run.rows[switch.row]
@@ -133,7 +126,7 @@ class DomeUnit(LedSequencer[Row]):
     # single LEDs ------------------------------------------------------------------------------
 
     def _leds(self, text: str) -> tuple[int, ...]:
-        return parse_leds(text, count=self.bank.count, at_once=self._limits.max_at_once)
+        return led_table.parse_leds(text, count=self.bank.count, at_once=self._limits.max_at_once)
 
     def _light(self, arguments: str, now: float) -> None:
         self._require_still()

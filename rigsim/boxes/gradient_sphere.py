@@ -23,22 +23,12 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Rig
+from rigsim.boxes import led_table
 from rigsim.boxes.command import Act, Command, Refused, choice, command_table, number, whole
 from rigsim.boxes.eye_guard import Lit
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import (
-    ANALYZER_RANGE_DEG,
-    LEVEL_STEPS,
-    PatternRow,
-    Switch,
-    parse_patterns,
-    pattern_name,
-    pattern_shares,
-    schedule,
-    starts,
-    table_crc,
-)
+from rigsim.boxes.led_table import LEVEL_STEPS, Switch, table_crc
 
 DEFAULT_LED_MS = 100.0
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
@@ -63,7 +53,7 @@ class PatternLight:
     (0 when dead, less than 1 when weak); empty: 1 for all."""
 
 
-class GradientSphereUnit(LedSequencer[PatternRow]):
+class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     """State of the gradient sphere's box behind its controller.
 
     Parameters
@@ -89,7 +79,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
     ) -> None:
         self._on_pattern = on_pattern
         self._s_per_deg = rig.polarizer_move_s / 90.0
-        self._shares = pattern_shares(rig.lights)
+        self._shares = led_table.pattern_shares(rig.lights)
         health = np.ones(len(rig.lights))
         for led, share in faults.weak_leds.items():
             health[led] = share
@@ -113,8 +103,8 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         """Return limits and counts, units in the names."""
         return {
             **super().capabilities(),
-            "analyser_min_deg": ANALYZER_RANGE_DEG[0],
-            "analyser_max_deg": ANALYZER_RANGE_DEG[1],
+            "analyser_min_deg": led_table.ANALYZER_RANGE_DEG[0],
+            "analyser_max_deg": led_table.ANALYZER_RANGE_DEG[1],
             "move_s_per_deg": round(self._s_per_deg, 9),
         }
 
@@ -156,7 +146,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         self._set_angle(choice(arguments, ("0", "90")), now)
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        reading_deg = round(number(arguments, *ANALYZER_RANGE_DEG, "degrees"), 3)
+        reading_deg = round(number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
         self._require_still()
         if self.lit:
             raise Refused(Code.IGNORED, "a light is on; PATT DARK first")
@@ -216,7 +206,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         name, *more = arguments.split(",")
         if len(more) > 2:
             raise Refused(Code.SYNTAX, "expected PATTERN,MS,LEVEL")
-        pattern = pattern_name(name)
+        pattern = led_table.pattern_name(name)
         if pattern == "dark":
             if more:
                 raise Refused(Code.SYNTAX, "expected DARK")
@@ -241,28 +231,28 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     # scans ------------------------------------------------------------------------------------
 
-    def _parse_rows(self, text: str) -> list[PatternRow]:
-        return parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
+    def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
+        return led_table.parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
 
-    def _lit_by(self, rows: Sequence[PatternRow], now: float) -> list[Lit]:
+    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[Lit]:
         self._require_settled(now)
-        times = starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
+        times = led_table.starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
         found: list[Lit] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
             found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
         return found
 
-    def _schedule(self, rows: Sequence[PatternRow]) -> list[Switch]:
+    def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[Switch]:
         self._failed = set()
-        return schedule(
+        return led_table.schedule(
             rows,
             reading_deg=self.analyser_deg,
             s_per_deg=self._s_per_deg,
             settle_s=self._limits.settle_s,
         )
 
-    def _switch_light(self, run: Run[PatternRow], switch: Switch, now: float) -> None:
+    def _switch_light(self, run: Run[led_table.PatternRow], switch: Switch, now: float) -> None:
         row = run.rows[switch.row]
         if switch.what == "rotate":
             self.bank.all_off(now)

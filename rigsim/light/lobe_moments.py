@@ -244,17 +244,10 @@ class MomentTable:
             t = (alpha - np.float32(self.alphas[1])) / np.float32(self.alphas[1] - self.alphas[0])
             share[:, 0], share[:, 1], share[:, 2] = 0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)
         out = np.zeros((len(normals), MOMENT_CHANNELS), np.float32)
-        _lookup(
-            self.values,
-            np.float32(self.half_field_mm),
-            np.float32(self.reach),
-            np.float32(math.cos(math.radians(MAX_TILT_DEG))),
-            np.ascontiguousarray(normals, np.float32),
-            np.ascontiguousarray(x_mm, np.float32),
-            np.ascontiguousarray(y_mm, np.float32),
-            share,
-            out,
-        )
+        least_z = math.cos(math.radians(MAX_TILT_DEG))
+        limits = (np.float32(part) for part in (self.half_field_mm, self.reach, least_z))
+        at = (np.ascontiguousarray(part, np.float32) for part in (normals, x_mm, y_mm))
+        _lookup(self.values, *limits, *at, share, out)
         return out
 
 

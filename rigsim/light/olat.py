@@ -309,20 +309,9 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     start = np.empty((count[-1], 3), np.float32)
     way = np.empty((count[-1], 3), np.float32)
     length = np.empty(count[-1], np.float32)
-    kernels.aim(
-        hits.position_mm,
-        hits.normal,
-        hits.prim,
-        caster.mesh.vertices_mm,
-        caster.mesh.faces,
-        center,
-        targets,
-        count,
-        index,
-        start,
-        way,
-        length,
-    )
+    rows, mesh = (hits.position_mm, hits.normal, hits.prim), caster.mesh
+    rays = (index, start, way, length)
+    kernels.aim(*rows, mesh.vertices_mm, mesh.faces, center, targets, count, *rays)
     visible = np.zeros(len(hits.position_mm), np.bool_)
     visible[index] = ~caster.blocked(start, way, length)
     return visible
@@ -385,21 +374,10 @@ def light_up(
     extra = np.zeros((0, 3), np.float32) if glow is None else glow
     center = np.ascontiguousarray(lamp.position_mm, np.float64)
     axis = np.ascontiguousarray(lamp.axis, np.float64)
-    kernels.shade(
-        hits.position_mm,
-        hits.normal,
-        hits.surface,
-        hits.camera_mm,
-        hits.kind,
-        center,
-        axis,
-        float(lamp.exponent),
-        visible,
-        extra,
-        diffuse,
-        np.ones(0, np.float32) if relief is None else relief,
-        rows,
-    )
+    faded = np.ones(0, np.float32) if relief is None else relief
+    samples = (hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind)
+    light = (center, axis, float(lamp.exponent))
+    kernels.shade(*samples, *light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 

@@ -123,17 +123,9 @@ class ReliefShadow:
             Shape (n,), 0 to 1.
         """
         out = np.empty(len(uv), np.float32)
-        light = np.asarray(light_mm, np.float64)
-        _seen(
-            np.ascontiguousarray(uv, np.float32),
-            np.ascontiguousarray(position_mm, np.float32),
-            light,
-            radius_mm,
-            self._du,
-            self._dv,
-            self._horizon,
-            out,
-        )
+        points = (np.ascontiguousarray(part, np.float32) for part in (uv, position_mm))
+        light = (np.asarray(light_mm, np.float64), radius_mm)
+        _seen(*points, *light, self._du, self._dv, self._horizon, out)
         return out
 
     def on_texture(

@@ -9,20 +9,9 @@ import numpy as np
 from capture.rig import Rig, Vector, View
 from model import spectra
 from rigsim.arrays import FloatArray
+from rigsim.needs import face
 from rigsim.needs.effect_sizes import most_irradiance
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
-from rigsim.needs.face import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    UNMODELED_GLARE,
-    Scenery,
-    bands,
-    brightest_rgb,
-    face_effects,
-    hollows,
-    lens,
-    polarization,
-)
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -33,7 +22,7 @@ def dome_needs(
     rig: Rig,
     subject: SimulatedSubject | Target,
     state: str,
-    scenery: Scenery,
+    scenery: face.Scenery,
     *,
     white_rgb: FloatArray | None,
     movement: bool,
@@ -56,28 +45,32 @@ def dome_needs(
         Whether the face moves with its state, and how the head does.
     """
     view = scenery.view
-    made = [polarization(rig, view), bands(view)]
+    made = [face.polarization(rig, view), face.bands(view)]
     world = [
         ("ambient light", "the room is dark"),
         ("light from the dome's frame and from other LEDs' lenses", "they are black"),
     ]
     if isinstance(subject, Target):
-        size, because = hollows(scenery)
+        size, because = face.hollows(scenery)
         made += [
-            decide(INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because),
-            lens(scenery, 1.0),
+            decide(
+                face.INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because
+            ),
+            face.lens(scenery, 1.0),
         ]
-        opaque = [(LATERAL_EFFECT, f"{subject.name} is opaque")]
-        return EffectSelection((*made, *absent([*opaque, *world]), *unmodeled(UNMODELED_GLARE)))
+        opaque = [(face.LATERAL_EFFECT, f"{subject.name} is opaque")]
+        return EffectSelection(
+            (*made, *absent([*opaque, *world]), *unmodeled(face.UNMODELED_GLARE))
+        )
     skin = scenery.skin(subject, state)
-    brightest = brightest_rgb(skin)
+    brightest = face.brightest_rgb(skin)
     if white_rgb is None:
         white = spectra.camera_white(view.spectral_sensitivity, scenery.illuminant)
         level = white * brightest / (white * brightest).max()
     else:
         near = max(_nearness(scenery.caster, light.position_mm) for light in rig.lights)
         level = near * white_rgb * brightest
-    made += face_effects(
+    made += face.face_effects(
         skin, scenery, brightest, level=level, peak=1.0, finer=False, lateral_switch="subsurface"
     )
     made += _movement(subject, movement, motion, view)
@@ -121,13 +114,13 @@ def _nearness(caster: Caster, place_mm: Vector) -> float:
 
 def _limits(made: list[Effect]) -> list[Effect]:
     out = [
-        *UNMODELED_GLARE,
+        *face.UNMODELED_GLARE,
         ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
     ]
     built = {effect.name for effect in made if effect.built}
-    if INTERREFLECTION_EFFECT in built:
+    if face.INTERREFLECTION_EFFECT in built:
         out.append(("highlights of skin on skin", "only light from inside goes on"))
-    if LATERAL_EFFECT in built:
+    if face.LATERAL_EFFECT in built:
         out.append(("lateral kernels that vary over the face", "one, of its median skin"))
     return unmodeled(out)
 

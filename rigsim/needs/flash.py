@@ -5,23 +5,9 @@ from __future__ import annotations
 from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import FloatArray
+from rigsim.needs import face
 from rigsim.needs.effect_sizes import highlight, most_irradiance
 from rigsim.needs.effects import Effect, EffectSelection, absent, decide, unmodeled
-from rigsim.needs.face import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    LENS_EFFECT,
-    SHADOW_EFFECT,
-    UNMODELED_GLARE,
-    WRINKLE_SHADOW_EFFECT,
-    Scenery,
-    bands,
-    brightest_rgb,
-    face_effects,
-    hollows,
-    lens,
-    polarization,
-)
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
@@ -30,7 +16,7 @@ def flash_needs(
     rig: Rig,
     subject: SimulatedSubject | Target,
     state: str,
-    scenery: Scenery,
+    scenery: face.Scenery,
     *,
     white_rgb: FloatArray,
     weights_mm2: FloatArray,
@@ -54,37 +40,37 @@ def flash_needs(
         Whether the face moves with its state.
     """
     view, mesh = scenery.view, scenery.caster.mesh
-    made = [polarization(rig, view), bands(view)]
+    made = [face.polarization(rig, view), face.bands(view)]
     dark = [("ambient light", "the room is dark and the flash is short")]
     if isinstance(subject, Target):
         made += _of_target(subject, scenery)
         if subject.kind not in ("source", "cap"):
-            made += [lens(scenery, float(white_rgb.max())), *unmodeled(UNMODELED_GLARE)]
+            made += [face.lens(scenery, float(white_rgb.max())), *unmodeled(face.UNMODELED_GLARE)]
         else:
             made.append(
-                Effect(LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
+                Effect(face.LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
             )
-        made.append(Effect(WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
+        made.append(Effect(face.WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
         return EffectSelection((*made, *absent(dark)))
     skin = scenery.skin(subject, state)
-    brightest = brightest_rgb(skin)
+    brightest = face.brightest_rgb(skin)
     places = [light.position_mm for light in rig.lights]
     # not cut at full scale: light of pixels that are full goes on to others all the same
     level = most_irradiance(mesh, places, weights_mm2) * white_rgb * brightest
     rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
     shine = highlight(mesh, places, weights_mm2, view.position_mm, rough)
     peak = float((level + white_rgb * shine).max())
-    made += face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
+    made += face.face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
     return EffectSelection((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 
 
-def _of_target(target: Target, scenery: Scenery) -> list[Effect]:
+def _of_target(target: Target, scenery: face.Scenery) -> list[Effect]:
     """Return what flat targets need: no effect of depth."""
-    size, because = hollows(scenery)
+    size, because = face.hollows(scenery)
     return [
-        decide(SHADOW_EFFECT, size, None, switch="", because=because),
-        decide(INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because),
-        Effect(LATERAL_EFFECT, "absent", f"{target.name} is opaque"),
+        decide(face.SHADOW_EFFECT, size, None, switch="", because=because),
+        decide(face.INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because),
+        Effect(face.LATERAL_EFFECT, "absent", f"{target.name} is opaque"),
     ]
 
 
@@ -109,7 +95,7 @@ def _limits() -> list[Effect]:
         ),
         *unmodeled(
             [
-                *UNMODELED_GLARE,
+                *face.UNMODELED_GLARE,
                 ("highlights of skin on skin", "only light from inside goes on to other skin"),
                 ("lateral kernels that vary over the face", "one profile, of its median skin"),
                 ("polarized single scattering", "light from inside is taken as depolarized"),

@@ -30,28 +30,30 @@ class Exposures:
     ----------
     dome
         Whose LEDs answer as they are wired.
+    render
+        The light on a camera, (H, W, 3), of a light alone, by index, at a time.
+    instant
+        World time, s, to the time that decides how the scene stands.
     seed
         Seeds what differs from pulse to pulse.
     """
 
-    def __init__(self, dome: BuiltDome, *, seed: int) -> None:
-        self._dome = dome
-        self._seed = seed
+    def __init__(
+        self,
+        dome: BuiltDome,
+        render: Callable[[View, int, float], Float32Array],
+        instant: Callable[[float], float],
+        *,
+        seed: int,
+    ) -> None:
+        self._dome, self._render, self._instant, self._seed = dome, render, instant, seed
         # a capture comes back to each light in its next pass
         self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
             lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
         )
 
     def expose(
-        self,
-        view: View,
-        sensor: Sensor,
-        render: Callable[[View, int, float], Float32Array],
-        *,
-        pops: Sequence[LedPulse],
-        exposure_s: float,
-        seed: int,
-        instant: Callable[[float], float],
+        self, view: View, sensor: Sensor, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -59,16 +61,12 @@ class Exposures:
         ----------
         view, sensor
             The camera and what it sees with.
-        render
-            The light on it, (H, W, 3), of a light alone, by index, at a world time in s.
         pops
             The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
         exposure_s
             Exposure time, s.
         seed
             Seed of this exposure's noise.
-        instant
-            World time, s, to the time that decides how the scene stands.
 
         Returns
         -------
@@ -81,9 +79,8 @@ class Exposures:
             on_s = full_power_s(pulse, f"LED {pulse.led}")
             energy = on_s * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
             if energy > 0.0:
-                middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
+                middle = self._instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
                 led = self._dome.answering(pulse.led)
-                light += np.float32(energy) * self._frames.get(
-                    (view.name, led, middle), partial(render, view, led, middle)
-                )
+                frame = partial(self._render, view, led, middle)
+                light += np.float32(energy) * self._frames.get((view.name, led, middle), frame)
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)

@@ -15,7 +15,7 @@ from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.olat_vector import VectorLight
 from rigsim.render import Caster
-from rigsim.scenes.dome import views as dome_views
+from rigsim.scenes.dome.views import Looking, at_skin, at_target
 from rigsim.scenes.exposing import Kept, SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -35,12 +35,8 @@ class DomeRows:
         Its mesh at rest.
     motion
         How the head moves; None holds it still. Targets stand still.
-    illuminant
-        Spectrum of the lights, a name known to `model.spectra`.
-    optics
-        Whether lenses blur what is out of focus, and diffract.
-    subpixels
-        Rays along each side of a pixel.
+    how
+        How cameras look.
     """
 
     def __init__(
@@ -50,13 +46,11 @@ class DomeRows:
         caster: Caster,
         *,
         motion: HeadMotion | None,
-        illuminant: str,
-        optics: bool,
-        subpixels: int,
+        how: Looking,
     ) -> None:
         self._dome, self._subject, self._caster = dome, subject, caster
         self._motion = motion if isinstance(subject, SimulatedSubject) else None
-        self._illuminant, self._optics, self._subpixels = illuminant, optics, subpixels
+        self._how = how
         most = len(dome.rig.views) if self._motion is None else 2
         self._hits: Kept[tuple[str, float], tuple[Hits, Caster]] = Kept(lambda _: most)
         self._vector: Kept[tuple[str, float], VectorLight] = Kept(lambda _: most)
@@ -109,14 +103,12 @@ class DomeRows:
             target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
             up=_vector(np.asarray(view.up) @ rotation),
         )
-        how = dome_views.Looking(
-            self._subpixels, self._dome.distortion.get(view.name), self._illuminant, self._optics
-        )
+        how, distortion = self._how, self._dome.distortion.get(view.name)
         subject, caster = self._subject, self._caster
         if isinstance(subject, Target):
             if subject.kind == "source":
                 raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
-            return dome_views.at_target(caster, moved, subject, how), caster
+            return at_target(caster, moved, subject, how, distortion), caster
         amount = 0.0 if self._motion is None else self._motion.twitch(t_s)
         texture = texture_of(view)
         if amount > 0.0 and self._motion is not None:
@@ -125,7 +117,7 @@ class DomeRows:
             # The relief turns with the surface below it.
             turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
             texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-        return dome_views.at_skin(caster, moved, texture, how), caster
+        return at_skin(caster, moved, texture, how, distortion), caster
 
 
 def _vector(values: Float64Array) -> tuple[float, float, float]:

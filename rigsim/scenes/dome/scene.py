@@ -39,24 +39,18 @@ from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
+from rigsim.needs import face as face_needs
 from rigsim.needs.dome import dome_needs, least_noise
 from rigsim.needs.effect_sizes import exchange_share
 from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
-from rigsim.needs.face import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    LENS_EFFECT,
-    SPECTRAL_EFFECT,
-    WRINKLE_SHADOW_EFFECT,
-)
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
-from rigsim.scenes.dome import views as dome_views
 from rigsim.scenes.dome.exposures import Exposures
 from rigsim.scenes.dome.rows import DomeRows
 from rigsim.scenes.dome.subsurface_radiance import DomeSubsurfaceRadiance
+from rigsim.scenes.dome.views import Looking, unit
 from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -140,7 +134,6 @@ class DomeScene(FaceScene):
         self._caster = Caster(self.subject.mesh, choice=choice)
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
-        self._exposures = Exposures(dome, seed=seed)
         noise = least_noise([Noise.of(sensor) for sensor in self._sensors.values()])
         share = exchange_share(self._caster)
         self.needs = dome_needs(
@@ -152,32 +145,29 @@ class DomeScene(FaceScene):
             movement=movement,
             motion=motion,
         )
-        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-        self.subsurface = self.needs.builds(LATERAL_EFFECT)
-        self.optics = self.needs.builds(LENS_EFFECT)
+        self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
+        self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
+        self.optics = self.needs.builds(face_needs.LENS_EFFECT)
         self._relief: ReliefShadow | None = None
         self._glow: DomeSubsurfaceRadiance | None = None
         if isinstance(self.subject, SimulatedSubject):
-            if self.needs.builds(WRINKLE_SHADOW_EFFECT):
+            if self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT):
                 self._relief = ReliefShadow(self.subject)
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
-        self._rows = DomeRows(
-            dome,
-            self.subject,
-            self._caster,
-            motion=motion,
-            illuminant=self._illuminant,
-            optics=self.optics,
-            subpixels=subpixels,
-        )
+        how = Looking(subpixels, self._illuminant, self.optics)
+        self._rows = DomeRows(dome, self.subject, self._caster, motion=motion, how=how)
+        self._exposures = Exposures(dome, self._render, self._rows.instant, seed=seed)
 
     def _scattering(self, view: View) -> LateralScattering:
         """Return the face, ready to be lit from within for a camera."""
         skin = SeenSkin(self._face(), "neutral", view.spectral_sensitivity, self._illuminant)
         bounces = None
         if self.interreflections:
-            spectral, enough = self.needs.builds(SPECTRAL_EFFECT), self._last_bounce(self._effects)
+            spectral, enough = (
+                self.needs.builds(face_needs.SPECTRAL_EFFECT),
+                self._last_bounce(self._effects),
+            )
             bounces = Bounces(interreflection_for(self._caster), spectral, enough=enough)
         return LateralScattering(
             skin,
@@ -265,15 +255,8 @@ class DomeScene(FaceScene):
             Raw DN, shape (H, W).
         """
         view = self._camera(view_name)
-        return self._exposures.expose(
-            view,
-            self._sensors[view.name],
-            self._render,
-            pops=pops,
-            exposure_s=exposure_s,
-            seed=seed,
-            instant=self._rows.instant,
-        )
+        sensor = self._sensors[view.name]
+        return self._exposures.expose(view, sensor, pops=pops, exposure_s=exposure_s, seed=seed)
 
     # truth ------------------------------------------------------------------------------------
 
@@ -364,9 +347,7 @@ class DomeScene(FaceScene):
         texture = self._texture(self._camera(view_name))
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
-        return surface_brdf.evaluate(
-            values[:, :-3], dome_views.unit(values[:, -3:]), to_light, to_camera
-        )
+        return surface_brdf.evaluate(values[:, :-3], unit(values[:, -3:]), to_light, to_camera)
 
     # inside -----------------------------------------------------------------------------------
 

@@ -201,16 +201,9 @@ class TargetScene(RigScene):
         else:
             rotation, place = self.plate_pose()
             plate = self._plate
+            paper = (plate.reflectance, CELL_MM, plate.waviness)
             gray = printed_plate.plate_light(
-                rays,
-                eye,
-                rotation,
-                place,
-                plate.reflectance,
-                CELL_MM,
-                plate.waviness,
-                *lamps,
-                EDGE_SUBPIXELS,
+                rays, eye, rotation, place, *paper, *lamps, EDGE_SUBPIXELS
             )
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
@@ -287,33 +280,18 @@ class TargetScene(RigScene):
         lit: NDArray[np.intp],
         lamps: tuple[Float64Array, Float64Array, Float64Array, Float64Array],
     ) -> Float32Array:
-        ball = self.ball_mm()
+        place = self.ball_mm()
+        ball = (place, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE)
         cloth = mirror_ball.light_on_cloth(*lamps)
-        image = mirror_ball.surroundings(
-            rays, eye, ball, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE, cloth, EDGE_SUBPIXELS
-        )
+        image = mirror_ball.surroundings(rays, eye, *ball, cloth, EDGE_SUBPIXELS)
         for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
             radius = self.rig.lights[index].radius_mm
             for reflected in (True, False):
-                box = self._box(view, eye, ball, lamp, axis, radius, reflected=reflected)
+                box = self._box(view, eye, place, lamp, axis, radius, reflected=reflected)
                 if box is None:
                     continue
-                mirror_ball.add_lamp(
-                    image,
-                    rays,
-                    box,
-                    eye,
-                    ball,
-                    BALL_RADIUS_MM,
-                    mirror_ball.CHROMIUM_REFLECTANCE,
-                    lamp,
-                    axis,
-                    float(exponent),
-                    radius,
-                    float(strength),
-                    reflected,
-                    SPOT_SUBPIXELS,
-                )
+                led = (lamp, axis, float(exponent), radius, float(strength))
+                mirror_ball.add_lamp(image, rays, box, eye, *ball, *led, reflected, SPOT_SUBPIXELS)
         return np.asarray(image)
 
     def _box(

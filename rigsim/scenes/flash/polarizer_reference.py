@@ -128,10 +128,7 @@ def closed_forms(
 ) -> dict[str, Float32Array]:
     """Return both images by closed forms, shape (H, W), in radiance."""
     buffers = g_buffer(caster, view, subpixels=subpixels)
-    inside = np.flatnonzero(buffers.mask.reshape(-1))
-    position = buffers.position_mm.reshape(-1, 3)[inside]
-    normal = buffers.normal.reshape(-1, 3)[inside]
-    to_camera = buffers.to_camera.reshape(-1, 3)[inside]
+    inside, _, position, normal, to_camera = buffers.inside()
     right, up, _ = view.axes
     leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
     stokes = np.zeros_like(leaving)

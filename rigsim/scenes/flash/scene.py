@@ -34,20 +34,13 @@ from rigsim.light.subsurface_radiance import (
     light_skin,
     light_surface,
 )
+from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
     EFFECTS_BY_SIZE,
     EffectSelection,
     Noise,
     SceneEffects,
     merge_selections,
-)
-from rigsim.needs.face import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    LENS_EFFECT,
-    SPECTRAL_EFFECT,
-    WRINKLE_SHADOW_EFFECT,
-    spectral_step,
 )
 from rigsim.needs.flash import flash_needs
 from rigsim.render import camera_rays
@@ -142,9 +135,9 @@ class FlashScene(FaceScene):
         self._spreads: dict[str, Mapping[str, Float32Array]] = {}
         self._effects = effects
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
-        self.lateral = self.needs.builds(LATERAL_EFFECT)
-        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-        self.optics = self.needs.builds(LENS_EFFECT)
+        self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
+        self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
+        self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
         noise, share = Noise.of(self._sensors[view.name]), self._stage.share()
@@ -354,13 +347,13 @@ class FlashScene(FaceScene):
     def _bounces(self, skin: SeenSkin) -> Bounces | None:
         if not self.interreflections:
             return None
-        step, spectral = self._effects.spectral_step, self.needs.builds(SPECTRAL_EFFECT)
+        step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
         if step is None:
-            step, _ = spectral_step(skin, self.needs[INTERREFLECTION_EFFECT])
+            step, _ = face_needs.spectral_step(skin, self.needs[face_needs.INTERREFLECTION_EFFECT])
         return Bounces(self._stage.exchange(), spectral, step, self._last_bounce(self._effects))
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceLight:
-        wrinkled = self.needs.builds(WRINKLE_SHADOW_EFFECT)
+        wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
         key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
         known = self._stage.light
         if key not in known:
