@@ -137,7 +137,9 @@ class Member:
         flat = self._flat(size)
         points, regions = flat.perfusion.points_mm, flat.perfusion.regions
         old = (self.age_years - 15.0) / 60.0
-        height = relief.height_um(points, regions, texel_mm=_texel_mm(flat.atlas), seed=self.seed)
+        height = relief.height_um(
+            points, regions, texel_mm=flat.atlas.typical_texel_mm(), seed=self.seed
+        )
         height = np.asarray(height * np.float32(0.7 + 0.75 * old), np.float32)
         roughness = relief.roughness_map(points, regions, seed=self.seed)
         rougher = np.clip(roughness * np.float32(0.95 + 0.17 * old), 0.15, 0.5)
@@ -163,7 +165,9 @@ class Member:
             height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
             normal=atlas.normal,
-            beard=relief.stubble_map(points, regions, self.beard, _texel_mm(atlas), seed=self.seed),
+            beard=relief.stubble_map(
+                points, regions, self.beard, atlas.typical_texel_mm(), seed=self.seed
+            ),
             oiliness=self.oil,
         )
 
@@ -412,11 +416,6 @@ def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> M
 def _nearest_preset(melanin: float) -> str:
     presets = pigment.MELANIN_PRESETS
     return min(presets, key=lambda name: abs(np.log(presets[name] / melanin)))
-
-
-def _texel_mm(atlas: Atlas) -> float:
-    along_u, along_v = atlas.texel_mm()
-    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
 
 
 @lru_cache(maxsize=HEAD_SHAPES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capture.rig import View
+from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh
 from rigsim.render.renderer import RenderError, load
@@ -175,6 +176,14 @@ def perspective(
         },
     }
     return description | ({"sampler": {"type": sampler, "sample_count": 4}} if sampler else {})
+
+
+def point_rig(rig: Rig) -> Rig:
+    """Return a rig whose lights are points that shine evenly, as Mitsuba's point light does."""
+    lights = tuple(
+        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
+    )
+    return dataclasses.replace(rig, lights=lights)
 
 
 def rough_metal(distribution: str, eta: float, alpha: Any) -> dict[str, Any]:

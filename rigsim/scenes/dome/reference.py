@@ -21,7 +21,13 @@ from rigsim.geometry.atlas import dilate_texture
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.needs.effects import SceneEffects
 from rigsim.render import MovedLight, radiance
-from rigsim.render.scene_radiance import matt_plastic, perspective, plastic_scale, rough_metal
+from rigsim.render.scene_radiance import (
+    matt_plastic,
+    perspective,
+    plastic_scale,
+    point_rig,
+    rough_metal,
+)
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.tissue.skin_layers import ETA
@@ -185,14 +191,6 @@ def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
     """Return an image of the first view under a light of intensity 1 per steradian."""
     image = scene.radiance(scene.rig.views[0].name, [light])[0]
     return np.asarray(image / scene.intensity(light) / np.float32(math.pi), np.float32)
-
-
-def point_rig(rig: Rig) -> Rig:
-    """Return a dome whose lights are points that shine evenly, as Mitsuba's point light does."""
-    lights = tuple(
-        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
-    )
-    return dataclasses.replace(rig, lights=lights)
 
 
 def mitsuba_image(

@@ -19,7 +19,7 @@ from capture.rig import Rig, View, load_rig
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.polarizers import absorbing_axis
-from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
 from rigsim.light.subsurface_radiance import toward
 from rigsim.render import Caster, g_buffer, look_at, radiance
 from rigsim.render.scene_radiance import perspective
@@ -223,12 +223,7 @@ def sphere_mesh(*, columns: int = 480, rows: int = 240) -> Mesh:
     t, p = np.meshgrid(theta, phi, indexing="ij")
     unit = np.stack([-np.sin(t) * np.sin(p), np.cos(t), -np.sin(t) * np.cos(p)], axis=-1)
     uv = np.stack([p / (2.0 * np.pi), 1.0 - t / np.pi], axis=-1).reshape(-1, 2)
-    at = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
-    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
-    faces = np.concatenate(
-        [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)]
-    )
-    flat = unit.reshape(-1, 3)
+    flat, faces = unit.reshape(-1, 3), grid_faces(rows + 1, columns + 1)
     return build_mesh(SPHERE_RADIUS_MM * flat, faces, np.clip(uv, 0.0, 1.0), flat)
 
 

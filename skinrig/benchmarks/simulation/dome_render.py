@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capture.rig import load_rig
-from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
+from rigsim.render.scene_radiance import point_rig
+from rigsim.scenes.dome.reference import PlainScene, compare, plain_face
 from skinrig.benchmarks.measurement import BandError, Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.resampling import tiled_rms
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
