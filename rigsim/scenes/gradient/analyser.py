@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from capture.rig import View
@@ -10,7 +12,7 @@ from rigsim.arrays import Float32Array
 from rigsim.as_built.polarizers import Polarizers
 from rigsim.scenes.gradient.patch import sample_grid
 
-MAX_KEPT_FRAMES = 4
+MAX_KEPT_FRAMES: Final = 4
 
 
 class GridAnalyser:
