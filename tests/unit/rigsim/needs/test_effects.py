@@ -12,6 +12,7 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.light.interreflection_color import WAVELENGTH_STEPS, step_error
 from rigsim.light.lateral import scatter_laterally
 from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.needs import effect_sizes
 from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
@@ -228,8 +229,9 @@ def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
     assert coarse.verdict == "negligible"
     bounces = scene.needs[face_needs.INTERREFLECTION_EFFECT].over_noise
     changes = []
+    skin = SeenSkin(face, "neutral", view.spectral_sensitivity, "D55")
     for step in WAVELENGTH_STEPS:
-        error = step_error(face, "neutral", view.spectral_sensitivity, "D55", step)
+        error = step_error(skin, step)
         lack = FlashScene(flash, face, effects=SceneEffects(spectral_step=step)).radiance()
         changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
         assert 0.0 < changes[-1] <= bounces * error.max()
